@@ -1,0 +1,30 @@
+# `make demo` and `make test` do all the set-up themselves; they need Python >= 3.11 and make.
+PYTHON ?= python3
+PY := .venv/bin/python
+WORKERS ?= 2
+# One thread a test worker: two workers on two cores do not fight over them.
+ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
+
+.PHONY: demo test test-slow lint clean
+
+.venv/installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
+	$(PYTHON) -m venv .venv
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@touch $@
+
+demo: .venv/installed
+	MPLBACKEND=Agg $(PY) train/demo.py
+
+lint: .venv/installed
+	$(PY) -m ruff check .
+	$(PY) -m pyright
+
+test: lint
+	$(ENV) $(PY) -m pytest -q -n $(WORKERS)
+
+test-slow: .venv/installed
+	$(ENV) $(PY) -m pytest -q -m slow
+
+clean:
+	rm -rf .venv runs build dist .pytest_cache .ruff_cache

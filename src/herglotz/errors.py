@@ -1,0 +1,5 @@
+"""The one exception a user's mistake raises; the command line turns it into one line and exit code 2."""
+
+
+class InputError(ValueError):
+    """Something the user gave is wrong. The message names what, where, the value and the remedy."""

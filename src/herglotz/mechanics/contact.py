@@ -1,0 +1,60 @@
+"""The contact form η = ds − p·dq and what a map does to it.
+
+Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's derivative is a (2n+1, 2n+1) matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+Flow = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+
+
+def contact_form(p: Tensor) -> Tensor:
+    """Components of η = ds − p·dq at a point with momentum p.
+
+    Parameters
+    ----------
+    p
+        (..., n) momentum.
+
+    Returns
+    -------
+    Tensor
+        (..., 2n+1): (−p, 0, 1).
+    """
+    return torch.cat([-p, torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
+
+
+def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+    """Value and derivative of a map (q, p, s) → (q1, p1, s1), by autograd, batched.
+
+    Returns
+    -------
+    tuple
+        ((q1, p1, s1), DΦ) with DΦ of shape (..., 2n+1, 2n+1).
+    """
+    n = q.shape[-1]
+    with torch.enable_grad():
+        x = torch.cat([q, p, s[..., None]], -1).detach().requires_grad_()
+        q1, p1, s1 = flow(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
+        y = torch.cat([q1, p1, s1[..., None]], -1)
+        rows = [
+            torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
+            for i in range(2 * n + 1)
+        ]
+    return (q1.detach(), p1.detach(), s1.detach()), torch.stack(rows, -2)
+
+
+def contact_defect(
+    derivative: Tensor,  # (..., 2n+1, 2n+1) DΦ
+    p0: Tensor,  # (..., n)
+    p1: Tensor,  # (..., n)
+    c: Tensor,  # (...)
+) -> Tensor:
+    """DΦᵀ η(x1) − c η(x0), shape (..., 2n+1): zero for a contact map with conformal factor c."""
+    pulled_back = (derivative.mT @ contact_form(p1)[..., None])[..., 0]
+    return pulled_back - c[..., None] * contact_form(p0)

@@ -1,0 +1,76 @@
+"""The generating function S^k and the discrete Hamilton–Jacobi equation.
+
+S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 along the discrete solution that joins q̂0 to q_k in k steps. It generates Φ̃^k:
+
+    D2 S^k = p_k,    1 + D3 S^k = σ_k,    D1 S^k = −σ_k p̂0.
+
+Both functions below take S through the flow, never through those identities, so that the identities can be checked.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics.contact import Flow, flow_derivative
+
+
+@dataclass(frozen=True)
+class GeneratingFunction:
+    """S^k and its derivatives at (q̂0, q_k, ŝ0), for a batch of solutions."""
+
+    S: Tensor  # (...)
+    D1: Tensor  # (..., n) ∂S/∂q̂0
+    D2: Tensor  # (..., n) ∂S/∂q_k
+    D3: Tensor  # (...) ∂S/∂ŝ0
+    q: Tensor  # (..., n) q_k
+    p: Tensor  # (..., n) p_k as the flow carries it
+    s: Tensor  # (...) s_k
+    spread: Tensor  # (...) smallest singular value of ∂q_k/∂p̂0; zero at a caustic, where S^k is not defined
+
+
+def generating_function(
+    flow_k: Flow,  # the k-step map Φ̃^k
+    q: Tensor,  # (..., n) q̂0
+    p: Tensor,  # (..., n) p̂0, which labels the solution
+    s: Tensor,  # (...) ŝ0
+) -> GeneratingFunction:
+    """S^k and its three derivatives along the solutions that start at (q̂0, p̂0, ŝ0).
+
+    The chain rule through the endpoint map (q̂0, p̂0, ŝ0) ↦ q_k gives D2 S = (∂s_k/∂p̂0)(∂q_k/∂p̂0)⁻¹ and, with it,
+    D1 and D3.
+
+    Returns
+    -------
+    GeneratingFunction
+        `spread` tells how far each sample is from a caustic.
+
+    Source: generating functions of the paper, with the sign of erratum E1.
+    """
+    n = q.shape[-1]
+    (q_k, p_k, s_k), D = flow_derivative(flow_k, q, p, s)
+    Y_q, Y_p, Y_s = D[..., :n, :n], D[..., :n, n : 2 * n], D[..., :n, 2 * n]
+    G_q, G_p, G_s = D[..., 2 * n, :n], D[..., 2 * n, n : 2 * n], D[..., 2 * n, 2 * n]
+    D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
+    D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
+    D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
+    spread = torch.linalg.svdvals(Y_p)[..., -1]
+    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, spread)
+
+
+def hamilton_jacobi_residual(
+    S1: Tensor,  # (...) S^{k+1}(q_{k+1})
+    S0: Tensor,  # (...) S^k(q_k)
+    dS1: Tensor,  # (..., n) dS^{k+1}(q_{k+1})
+    q1: Tensor,  # (..., n) q_{k+1}
+    H_plus: Tensor,  # (...) H⁺(q_k, dS^{k+1}(q_{k+1}), s_k), s_k = ŝ0 + S^k
+) -> Tensor:
+    """S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k), shape (...).
+
+    Zero on an open set of q_k when q_{k+1} = Φ̃^γ(q_k), and only there (erratum E7).
+
+    Source: right discrete contact Hamilton–Jacobi equation of the paper.
+    """
+    return S1 - S0 - (dS1 * q1).sum(-1) + H_plus

@@ -1,0 +1,91 @@
+"""Discrete Legendre transforms FL⁻, FL⁺ and the discrete Herglotz equation."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
+
+
+def momentum_minus(P: Partials) -> Tensor:
+    """p_k = −D1 L_d / c, the momentum of FL⁻ at (q_k, q_{k+1}, s_k); shape (..., n)."""
+    return -P.D1 / P.c[..., None]
+
+
+def legendre_minus(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    h: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """FL⁻(q0, q1, s0) = (q0, −D1 L_d / c, s0).
+
+    Returns
+    -------
+    tuple of Tensor
+        (q0, p0, s0) with shapes (..., n), (..., n), (...).
+
+    Source: discrete Legendre transforms of the paper.
+    """
+    return q0, momentum_minus(partials(L_d, q0, q1, s0, h)), s0
+
+
+def legendre_plus(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    h: Tensor | float,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """FL⁺(q0, q1, s0) = (q1, D2 L_d, s0 + L_d); the s argument is s0, not s1 (erratum E3).
+
+    Returns
+    -------
+    tuple of Tensor
+        (q1, p1, s1) with shapes (..., n), (..., n), (...).
+    """
+    P = partials(L_d, q0, q1, s0, h)
+    return q1, P.D2, s0 + P.L
+
+
+def herglotz_residual(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n) q_{k−1}
+    q1: Tensor,  # (..., n) q_k
+    q2: Tensor,  # (..., n) q_{k+1}
+    s0: Tensor,  # (...) s_{k−1}
+    h0: Tensor | float,  # t_k − t_{k−1}
+    h1: Tensor | float,  # t_{k+1} − t_k
+) -> Tensor:
+    """R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), with s_k = s_{k−1} + L_d.
+
+    Returns
+    -------
+    Tensor
+        Shape (..., n), in units of momentum. Zero along discrete trajectories.
+
+    Source: discrete Herglotz equations; indices by erratum E3.
+    """
+    _, p, s1 = legendre_plus(L_d, q0, q1, s0, h0)
+    P = partials(L_d, q1, q2, s1, h1)
+    return momentum_residual(P, p)
+
+
+def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
+    """F = D1 + c p0, the equation that a step solves for q1; shape (..., n)."""
+    return P.D1 + P.c[..., None] * p0
+
+
+def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
+    """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3, shape (..., n, n). Equal to M where F = 0. Needs order 2."""
+    assert P.D12 is not None and P.D23 is not None
+    return P.D12 + p0[..., :, None] * P.D23[..., None, :]
+
+
+def mixed_hessian(P: Partials) -> Tensor:
+    """M = D1D2 − D1 ⊗ D3D2 / c, shape (..., n, n). Needs order 2.
+
+    FL⁻ and FL⁺ are local diffeomorphisms exactly where c ≠ 0 and det M ≠ 0 (erratum E4).
+    """
+    return momentum_jacobian(P, momentum_minus(P))

@@ -1,0 +1,137 @@
+"""Derivatives of a discrete contact Lagrangian, through one door.
+
+A discrete Lagrangian is any callable `L_d(q0, q1, s0, h) -> (...)`. One that also has a method
+`partials(q0, q1, s0, h, order)` (every learnable model has) supplies closed forms; for the others `partials`
+differentiates with autograd. No other module calls autograd on a Lagrangian.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+
+class DiscreteLagrangian(Protocol):
+    """L_d(q0, q1, s0, h): the increment of the action variable s over one step."""
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, /) -> Tensor:
+        """Return L_d, shape (...)."""
+        ...
+
+
+@runtime_checkable
+class ClosedForm(Protocol):
+    """A discrete Lagrangian that knows its own derivatives."""
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """Return the value and the derivatives up to `order`."""
+        ...
+
+
+@dataclass(frozen=True)
+class Partials:
+    """Value and partial derivatives of L_d at (q0, q1, s0); second derivatives only when order 2 was asked for."""
+
+    L: Tensor  # (...)
+    D1: Tensor  # (..., n)    ∂L/∂q0
+    D2: Tensor  # (..., n)    ∂L/∂q1
+    D3: Tensor  # (...)       ∂L/∂s0
+    D11: Tensor | None = None  # (..., n, n)
+    D12: Tensor | None = None  # (..., n, n) [i, j] = ∂²L/∂q0_i ∂q1_j
+    D22: Tensor | None = None  # (..., n, n)
+    D13: Tensor | None = None  # (..., n)
+    D23: Tensor | None = None  # (..., n)
+    D33: Tensor | None = None  # (...)
+
+    @property
+    def c(self) -> Tensor:
+        """One-step conformal factor c = 1 + D3, shape (...)."""
+        return 1.0 + self.D3
+
+
+def partials(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n) position
+    q1: Tensor,  # (..., n) next position
+    s0: Tensor,  # (...) action variable
+    h: Tensor | float,  # () or (...) time step
+    order: int = 1,
+) -> Partials:
+    """Value, gradient and (order 2) Hessian blocks of L_d.
+
+    Uses the closed form of L_d where it has one and autograd where it has not; both are differentiable again with
+    respect to the arguments and the parameters.
+
+    Returns
+    -------
+    Partials
+        Second derivatives are None at order 1.
+
+    Raises
+    ------
+    ValueError
+        If `order` is neither 1 nor 2.
+    """
+    if order not in (1, 2):
+        raise ValueError(f"order must be 1 or 2, got {order}")
+    h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    if isinstance(L_d, ClosedForm):
+        return L_d.partials(q0, q1, s0, h, order)
+    return autograd_partials(L_d, q0, q1, s0, h, order)
+
+
+def autograd_partials(
+    L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1
+) -> Partials:
+    """The same as `partials`, always by autograd: the slow twin that closed forms are tested against.
+
+    Batched by the batch-sum trick: samples do not interact, so the gradient of the sum is the batch of gradients.
+    """
+    h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    keep_graph = torch.is_grad_enabled()
+    with torch.enable_grad():
+        q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
+        s0 = s0[..., 0]
+        q0, q1, s0 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1, s0))
+        # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
+        a, b, s = q0 * 1, q1 * 1, s0 * 1
+        L = L_d(a, b, s, h)
+        D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)
+        if order == 1:
+            return _detach(Partials(L, D1, D2, D3), keep_graph)
+        n = q0.shape[-1]
+        rows0 = [_grad(D1[..., i], (a, b, s), keep_graph, retain=True) for i in range(n)]
+        rows1 = [_grad(D2[..., i], (b, s), keep_graph, retain=True) for i in range(n)]
+        (D33,) = _grad(D3, (s,), keep_graph, retain=True)
+        second = Partials(
+            L,
+            D1,
+            D2,
+            D3,
+            D11=torch.stack([r[0] for r in rows0], -2),
+            D12=torch.stack([r[1] for r in rows0], -2),
+            D22=torch.stack([r[0] for r in rows1], -2),
+            D13=torch.stack([r[2] for r in rows0], -1),
+            D23=torch.stack([r[1] for r in rows1], -1),
+            D33=D33,
+        )
+        return _detach(second, keep_graph)
+
+
+def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = False) -> tuple[Tensor, ...]:
+    """Gradient of y.sum(); zeros where y does not depend on an argument."""
+    if not y.requires_grad:
+        return tuple(torch.zeros_like(x) for x in xs)
+    grads = torch.autograd.grad(
+        y.sum(), xs, create_graph=create_graph, retain_graph=create_graph or retain, allow_unused=True
+    )
+    return tuple(torch.zeros_like(x) if g is None else g for g, x in zip(grads, xs, strict=True))
+
+
+def _detach(P: Partials, keep_graph: bool) -> Partials:
+    if keep_graph:
+        return P
+    return Partials(**{k: None if v is None else v.detach() for k, v in vars(P).items()})
