@@ -19,6 +19,7 @@ from herglotz.mechanics.legendre import (
     momentum_residual,
 )
 from herglotz.mechanics.partials import ClosedForm, DiscreteLagrangian, Partials, autograd_partials, partials
+from herglotz.mechanics.tangent import step_derivative
 
 __all__ = [
     "ClosedForm",
@@ -44,4 +45,5 @@ __all__ = [
     "right_hamiltonian",
     "right_hamiltonian_on_flow",
     "solve_right_position",
+    "step_derivative",
 ]

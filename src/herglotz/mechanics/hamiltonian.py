@@ -34,7 +34,6 @@ def solve_right_position(
     q1 = guess
     for _ in range(iterations):
         P = partials(L_d, q0, q1, s0, h, order=2)
-        assert P.D22 is not None
         dq = torch.linalg.solve_ex(P.D22, (p1 - P.D2)[..., None])[0][..., 0]
         q1 = q1 + dq
         if bool((dq.abs() <= 4 * torch.finfo(q0.dtype).eps * (1 + q1.abs())).all()):

@@ -8,7 +8,7 @@ differentiates with autograd. No other module calls autograd on a Lagrangian.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -31,6 +31,10 @@ class ClosedForm(Protocol):
         ...
 
 
+# Stands for a derivative that was not asked for: None, which fails at first use.
+ABSENT: Tensor = cast(Tensor, None)
+
+
 @dataclass(frozen=True)
 class Partials:
     """Value and partial derivatives of L_d at (q0, q1, s0); second derivatives only when order 2 was asked for."""
@@ -39,12 +43,12 @@ class Partials:
     D1: Tensor  # (..., n)    ∂L/∂q0
     D2: Tensor  # (..., n)    ∂L/∂q1
     D3: Tensor  # (...)       ∂L/∂s0
-    D11: Tensor | None = None  # (..., n, n)
-    D12: Tensor | None = None  # (..., n, n) [i, j] = ∂²L/∂q0_i ∂q1_j
-    D22: Tensor | None = None  # (..., n, n)
-    D13: Tensor | None = None  # (..., n)
-    D23: Tensor | None = None  # (..., n)
-    D33: Tensor | None = None  # (...)
+    D11: Tensor = ABSENT  # (..., n, n)
+    D12: Tensor = ABSENT  # (..., n, n) [i, j] = ∂²L/∂q0_i ∂q1_j
+    D22: Tensor = ABSENT  # (..., n, n)
+    D13: Tensor = ABSENT  # (..., n)
+    D23: Tensor = ABSENT  # (..., n)
+    D33: Tensor = ABSENT  # (...)
 
     @property
     def c(self) -> Tensor:

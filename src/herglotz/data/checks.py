@@ -1,0 +1,147 @@
+"""What a set of trajectories must satisfy before anything is learned from it; every failure is an `InputError`."""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.data.trajectories import Trajectories
+
+ARRAYS = ("t", "q", "s", "p", "u")
+MIN_SAMPLES = 3  # a discrete Herglotz residual joins q_{k-1}, q_k, q_{k+1}
+DTYPES = (torch.float32, torch.float64)
+
+
+def check(trajectories: Trajectories) -> None:
+    """Check types, shapes, labels and values, in this order; return nothing when all is well.
+
+    Raises
+    ------
+    InputError
+        Naming the field, the trajectory and the sample (both counted from 0), the value and the remedy.
+    """
+    where = trajectories.source or "trajectories"
+    arrays = {name: x for name in ARRAYS if (x := getattr(trajectories, name)) is not None}
+    _check_tensors(where, arrays)
+    _check_shapes(where, arrays)
+    _check_lengths(where, trajectories.lengths, len(trajectories.t))
+    _check_labels(where, trajectories)
+    for name, x in arrays.items():
+        _check_finite(where, trajectories, name, x)
+    _check_time(where, trajectories)
+
+
+def check_fraction(fraction: float) -> None:
+    """Raise unless 0 < fraction < 1."""
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
+
+
+def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
+    """Return (trajectory, sample) of a row of the concatenation, both counted from 0."""
+    trajectory = bisect_right(offsets, row) - 1
+    return trajectory, row - offsets[trajectory]
+
+
+def _check_tensors(where: str, arrays: dict[str, Tensor]) -> None:
+    for name, x in arrays.items():
+        if not isinstance(x, Tensor):
+            kind = type(x).__name__
+            raise InputError(f"{where}: {name} must be a torch.Tensor, got {kind}; use Trajectories.of(...)")
+        if x.dtype not in DTYPES:
+            raise InputError(f"{where}: {name} has dtype {x.dtype}; convert it to torch.float64 (or torch.float32)")
+        first = arrays["t"]
+        if x.dtype != first.dtype or x.device != first.device:
+            raise InputError(
+                f"{where}: {name} is {x.dtype} on {x.device} but t is {first.dtype} on {first.device}; use the same"
+            )
+
+
+def _check_shapes(where: str, arrays: dict[str, Tensor]) -> None:
+    t, q = arrays["t"], arrays["q"]
+    if t.ndim != 1:
+        raise InputError(f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it")
+    if q.ndim != 2 or q.shape[0] != len(t) or q.shape[1] < 1:
+        raise InputError(f"{where}: q must have shape ({len(t)}, n), one row a sample of t, got {tuple(q.shape)}")
+    wanted = {"s": f"({len(t)},)", "p": f"({len(t)}, {q.shape[1]})", "u": f"({len(t)}, m)"}
+    fits = {
+        "s": lambda x: x.shape == t.shape,
+        "p": lambda x: x.shape == q.shape,
+        "u": lambda x: x.ndim == 2 and x.shape[0] == len(t) and x.shape[1] >= 1,
+    }
+    for name in wanted:
+        if name in arrays and not fits[name](arrays[name]):
+            raise InputError(f"{where}: {name} must have shape {wanted[name]}, got {tuple(arrays[name].shape)}")
+
+
+def _check_lengths(where: str, lengths: tuple[int, ...], samples: int) -> None:
+    if not lengths:
+        raise InputError(f"{where}: there is no trajectory; give at least one of {MIN_SAMPLES} samples")
+    for b, length in enumerate(lengths):
+        if isinstance(length, bool) or not isinstance(length, int):
+            raise InputError(f"{where}: lengths[{b}] is {length!r}, not an int; count the samples of each trajectory")
+        if length < MIN_SAMPLES:
+            plural = "" if length == 1 else "s"
+            raise InputError(
+                f"{where}: trajectory {b} has {length} sample{plural}, at least {MIN_SAMPLES} are needed; leave it out"
+            )
+    if sum(lengths) != samples:
+        raise InputError(f"{where}: lengths add up to {sum(lengths)} but t has {samples} samples; correct the lengths")
+
+
+def _check_labels(where: str, trajectories: Trajectories) -> None:
+    n = trajectories.q.shape[1]
+    for field in ("names", "units", "angles"):
+        labels = getattr(trajectories, field)
+        if len(labels) != n:
+            raise InputError(f"{where}: {field} has {len(labels)} entries for {n} coordinates; give one a coordinate")
+    if len(set(trajectories.names)) != n or not all(trajectories.names):
+        raise InputError(f"{where}: names {trajectories.names} must differ and not be empty; rename a coordinate")
+    if not all(trajectories.units) or not trajectories.time_unit:
+        raise InputError(
+            f"{where}: a unit is empty ({trajectories.units}, {trajectories.time_unit!r}); write '1' for none"
+        )
+    for name, unit, angle in zip(trajectories.names, trajectories.units, trajectories.angles, strict=True):
+        if angle and unit != "rad":
+            raise InputError(
+                f"{where}: the angle {name!r} is in {unit!r}; convert it to radians and give it the unit 'rad'"
+            )
+
+
+def _check_finite(where: str, trajectories: Trajectories, name: str, x: Tensor) -> None:
+    bad = ~torch.isfinite(x.detach())
+    if not bad.any():
+        return
+    place = bad.nonzero()[0].tolist()
+    b, k = locate(trajectories.offsets, place[0])
+    value = float(x[tuple(place)])
+    column = f"{name}[{place[1]}]" if len(place) > 1 else name
+    raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+
+
+def _check_time(where: str, trajectories: Trajectories) -> None:
+    steps = trajectories.steps()
+    bad = (~(steps.h > 0)).nonzero()
+    if not len(bad):
+        return
+    row = int(steps.index[bad[0, 0]])
+    b, k = locate(trajectories.offsets, row)
+    before, after = float(trajectories.t[row]), float(trajectories.t[row + 1])
+    hint = "" if trajectories.t.dtype == torch.float64 else " (times may coincide in float32: use float64)"
+    raise InputError(
+        f"{where}: t of trajectory {b} does not increase from sample {k} to {k + 1} ({before!r} then {after!r}); "
+        f"sort the samples or delete one{hint}"
+    )
+
+
+def check_positive(name: str, value: float) -> None:
+    """Raise unless `value` is finite and greater than 0."""
+    if not (math.isfinite(value) and value > 0):
+        raise InputError(f"{name} must be finite and > 0, got {value}")

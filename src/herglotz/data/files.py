@@ -1,0 +1,75 @@
+"""Reading and writing whole files: every failure is an `InputError`, and no file is ever half written."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from herglotz.errors import InputError
+
+PathLike = str | os.PathLike[str]
+
+
+def read_bytes(path: PathLike) -> bytes:
+    """Return the contents of a file.
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is a directory, empty or not readable.
+    """
+    path = Path(path)
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file; check the name and the folder") from None
+    except IsADirectoryError:
+        raise InputError(f"{path}: is a folder, not a file; name one file in it") from None
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); check its name and permissions") from error
+    if not content:
+        raise InputError(f"{path}: the file is empty; check how it was written")
+    return content
+
+
+def read_lines(path: PathLike) -> list[str]:
+    r"""Return the lines of a UTF-8 text file, without their ends (\n, \r\n or \r).
+
+    Raises
+    ------
+    InputError
+        As `read_bytes`, and if the file is not UTF-8.
+    """
+    content = read_bytes(path)
+    try:
+        text = content.decode("utf-8-sig")  # spreadsheets put a byte-order mark first
+    except UnicodeDecodeError as error:
+        row = content.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            f"{Path(path)}, row {row}: not UTF-8 text (byte 0x{content[error.start]:02x}); save the file as UTF-8"
+        ) from None
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+
+
+def write_atomically(path: PathLike, content: bytes) -> None:
+    """Write a file under a temporary name in the same folder, then rename it: a crash leaves the old file whole.
+
+    Raises
+    ------
+    InputError
+        If the folder does not exist or is not writable, or the path is a folder.
+    """
+    path = Path(path)
+    try:
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        try:
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"{path}: cannot be written ({reason}); check that its folder exists, writable") from error

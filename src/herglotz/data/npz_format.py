@@ -1,0 +1,115 @@
+"""Trajectories as a NumPy archive: exact, compact, and read without pickle."""
+
+from __future__ import annotations
+
+import io
+import json
+import tokenize
+import zipfile
+import zlib
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from herglotz.data.checks import ARRAYS
+from herglotz.data.files import PathLike, read_bytes, write_atomically
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError
+
+LABELS = ("names", "units", "angles", "time_unit", "source")
+# What numpy and zipfile raise on a damaged archive.
+DAMAGE = (
+    *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
+    *(OverflowError, TypeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
+)
+
+
+def read_npz(path: PathLike) -> Trajectories:
+    """Read trajectories from a .npz archive.
+
+    Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and
+    `metadata` (a JSON object with names, units, angles, time_unit, source) may follow. Integer arrays become float64.
+
+    Raises
+    ------
+    InputError
+        Naming the file, the array, what is wrong with it and the remedy.
+    """
+    path = Path(path)
+    arrays = _arrays(path, read_bytes(path))
+    for name in ("t", "q"):
+        if name not in arrays:
+            found = ", ".join(sorted(arrays)) or "none"
+            raise InputError(f"{path}: there is no array {name!r}, only {found}; add it: numpy.savez(..., {name}=...)")
+    labels = _labels(path, arrays.get("metadata"))
+    numbers = {name: _floating(path, name, arrays[name]) for name in ARRAYS if name in arrays}
+    lengths = arrays.get("lengths")
+    if lengths is not None and (lengths.dtype.kind not in "iu" or lengths.ndim != 1):
+        raise InputError(f"{path}: array 'lengths' must hold integers in one row, got {lengths.dtype} {lengths.shape}")
+    return Trajectories.of(
+        **numbers, lengths=None if lengths is None else lengths.tolist(), **{"source": path.name, **labels}
+    )
+
+
+def write_npz(path: PathLike, trajectories: Trajectories) -> None:
+    """Write every array and label; `read_npz` returns a set with the same digest. The file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be written.
+    """
+    arrays = {name: x.detach().cpu().numpy() for name in ARRAYS if (x := getattr(trajectories, name)) is not None}
+    metadata = json.dumps({label: getattr(trajectories, label) for label in LABELS})
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, lengths=np.array(trajectories.lengths), metadata=np.array(metadata), **arrays)
+    write_atomically(path, buffer.getvalue())
+
+
+def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
+    if not content.startswith(b"PK"):
+        raise InputError(f"{path}: is not a .npz archive; write it with numpy.savez or herglotz.data.save")
+    arrays: dict[str, np.ndarray] = {}
+    name = ""
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            for name in archive.files:
+                arrays[name] = np.asarray(archive[name])
+    except DAMAGE as error:
+        if "allow_pickle" in str(error):
+            raise InputError(
+                f"{path}: array {name!r} holds Python objects, which are never loaded; save plain numbers"
+            ) from error
+        what = f"array {name!r}" if name else "the archive"
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"{path}: {what} is damaged ({reason}); write the file again") from error
+    return arrays
+
+
+def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
+    """Return float32 and float64 as they are, integers as float64."""
+    if x.dtype.kind in "iu":
+        return torch.from_numpy(x.astype(np.float64))
+    if x.dtype.kind != "f" or x.dtype.itemsize not in (4, 8):
+        raise InputError(f"{path}: array {name!r} has dtype {x.dtype}; save it as float64")
+    return torch.from_numpy(x.astype(x.dtype.newbyteorder("=")))
+
+
+def _labels(path: Path, metadata: np.ndarray | None) -> dict:
+    """Return the labels that are there, with the types that `Trajectories` wants."""
+    if metadata is None:
+        return {}
+    try:
+        labels = json.loads(str(metadata))
+    except (ValueError, RecursionError):
+        labels = None
+    kinds = {"names": str, "units": str, "angles": bool}
+    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else {"names": None}
+    if not all(
+        isinstance(x, list) and all(isinstance(y, kinds[k]) for y in x) if k in kinds else isinstance(x, str)
+        for k, x in known.items()
+    ):
+        raise InputError(f"{path}: 'metadata' must be a JSON object of {', '.join(LABELS)}; write it again or drop it")
+    return known

@@ -1,0 +1,149 @@
+"""Trajectories of a scene with known answers: sampled, noisy, with gaps, the same for the same seed."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError
+
+LONGEST_GAP = 3  # consecutive samples deleted at most
+Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
+
+
+class Scene(Protocol):
+    """What `simulate` needs of a scene; those of `herglotz.systems` have it."""
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def dof(self) -> int: ...  # noqa: D102
+    @property
+    def coordinates(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def units(self) -> tuple[str, ...]: ...  # noqa: D102
+    @property
+    def angles(self) -> tuple[bool, ...]: ...  # noqa: D102
+    @property
+    def q_range(self) -> Range: ...  # noqa: D102
+    @property
+    def v_range(self) -> Range: ...  # noqa: D102
+
+    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, /) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (q, p, s) a time h later."""
+        ...
+
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor, /) -> Tensor:
+        """Return p = ∂L/∂v."""
+        ...
+
+
+def simulate(
+    scene: Scene,
+    *,
+    trajectories: int,
+    steps: int,  # of each trajectory: steps + 1 samples before gaps
+    h: float,  # in the scene's unit of time
+    noise: float = 0.0,  # standard deviation of the Gaussian noise on q, in its units
+    gaps: int = 0,  # runs of 1 to 3 consecutive interior samples deleted from each trajectory
+    seed: int = 0,
+    q_range: Range | None = None,  # (lowest, highest) initial position; left out: the scene's
+    v_range: Range | None = None,  # (lowest, highest) initial velocity; left out: the scene's
+    keep_state: bool = False,  # also store s and p, without noise
+    dtype: torch.dtype = torch.float64,
+) -> Trajectories:
+    """Sample motions of a scene from uniform random initial positions and velocities and s = 0.
+
+    Everything is drawn and computed in float64 from one `torch.Generator`; `dtype` only converts the result.
+
+    Raises
+    ------
+    InputError
+        If an argument is out of range, or the motion leaves the finite numbers.
+    """
+    _check_counts(trajectories, steps, gaps, seed)
+    check_positive("h", h)
+    if not 0.0 <= noise < float("inf"):
+        raise InputError(f"noise must be finite and >= 0, got {noise}")
+    if dtype not in DTYPES:
+        raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+    generator = torch.Generator().manual_seed(seed)
+    shape = (trajectories, scene.dof)
+    q0 = _uniform("q_range", scene.q_range if q_range is None else q_range, shape, generator)
+    v0 = _uniform("v_range", scene.v_range if v_range is None else v_range, shape, generator)
+    q, p, s = _roll(scene, q0, v0, steps, h)
+    q = q + noise * torch.randn(q.shape, generator=generator, dtype=q.dtype)
+    keep = torch.stack([_kept(steps + 1, gaps, generator) for _ in range(trajectories)])  # (B, steps + 1) bool
+    t = (h * torch.arange(steps + 1, dtype=torch.float64)).expand(trajectories, -1)
+    found = Trajectories(
+        t[keep],
+        q[keep],
+        tuple(keep.sum(1).tolist()),
+        names=tuple(scene.coordinates),
+        units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
+        angles=tuple(scene.angles),
+        time_unit=getattr(scene, "time_unit", "s"),
+        source=f"simulate({scene.name}, h={h:g}, seed={seed})",
+    )
+    return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
+
+
+def _roll(scene: Scene, q: Tensor, v: Tensor, steps: int, h: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Apply the flow `steps` times; return q, p (B, steps + 1, n) and s (B, steps + 1)."""
+    s = torch.zeros(len(q), dtype=q.dtype)
+    p, step = scene.momentum(q, v, s), torch.tensor(h, dtype=q.dtype)
+    states = [(q, p, s)]
+    with torch.no_grad():
+        for k in range(steps):
+            q, p, s = scene.flow(q, p, s, step)
+            bad = ~(torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s))
+            if bad.any():
+                raise InputError(
+                    f"{scene.name}: trajectory {int(bad.nonzero()[0])} is not finite after step {k + 1} of h={h:g}; "
+                    "narrow q_range or v_range, or take fewer or shorter steps"
+                )
+            states.append((q, p, s))
+    qs, ps, ss = zip(*states, strict=True)
+    return torch.stack(qs, 1), torch.stack(ps, 1), torch.stack(ss, 1)
+
+
+def _kept(samples: int, gaps: int, generator: torch.Generator) -> Tensor:
+    """Delete `gaps` separate runs of 1 to 3 interior samples; return which samples stay, (samples,) bool."""
+    runs = torch.randint(1, LONGEST_GAP + 1, (gaps,), generator=generator)
+    left = samples - int(runs.sum())
+    # Runs go into different slots between neighbours that stay: never at an end, never two together.
+    slots = torch.randperm(left - 1, generator=generator)[:gaps]
+    missing_before = torch.zeros(left, dtype=torch.long)
+    missing_before[slots + 1] = runs
+    keep = torch.zeros(samples, dtype=torch.bool)
+    keep[torch.arange(left) + missing_before.cumsum(0)] = True
+    return keep
+
+
+def _uniform(name: str, limits: Range, shape: tuple[int, int], generator: torch.Generator) -> Tensor:
+    try:
+        low, high = (torch.as_tensor(x, dtype=torch.float64).expand(shape) for x in limits)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{name} must be (low, high), numbers or {shape[1]} numbers each, got {limits!r}") from error
+    if not bool(((low <= high) & torch.isfinite(high - low)).all()):
+        raise InputError(f"{name} must be finite with low <= high, got {limits!r}")
+    return low + (high - low) * torch.rand(shape, generator=generator, dtype=torch.float64)
+
+
+def _check_counts(trajectories: int, steps: int, gaps: int, seed: int) -> None:
+    least_of = {"trajectories": (trajectories, 1), "steps": (steps, 2), "gaps": (gaps, 0), "seed": (seed, 0)}
+    for name, (value, least) in least_of.items():
+        if isinstance(value, bool) or not isinstance(value, int) or value < least:
+            raise InputError(f"{name} must be a whole number >= {least}, got {value!r}")
+    shortest = steps + 1 - LONGEST_GAP * gaps
+    if shortest < max(MIN_SAMPLES, gaps + 1):
+        raise InputError(
+            f"{gaps} gaps of up to {LONGEST_GAP} samples do not fit into {steps + 1} samples; "
+            "take fewer gaps or more steps"
+        )

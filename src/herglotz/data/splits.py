@@ -1,0 +1,93 @@
+"""Training and test parts, and which sets may be joined."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from herglotz.data.checks import ARRAYS, MIN_SAMPLES, check_fraction
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.data.trajectories import Trajectories
+
+Part = tuple[Tensor, tuple[int, ...]]  # rows of the concatenation, and how many of each trajectory
+
+
+def time_split(
+    lengths: Sequence[int],  # samples of each trajectory
+    fraction: float,  # of every trajectory that trains
+    source: str = "",
+) -> tuple[Part, Part]:
+    """Cut each trajectory after its first `round(fraction * length)` samples.
+
+    Raises
+    ------
+    InputError
+        If the fraction is not inside (0, 1), or a part of any trajectory would have fewer than three samples.
+    """
+    check_fraction(fraction)
+    train, test = [], []
+    cuts = tuple(round(fraction * length) for length in lengths)
+    rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True))
+    start = 0
+    for b, (cut, left) in enumerate(zip(cuts, rest, strict=True)):
+        if min(cut, left) < MIN_SAMPLES:
+            raise InputError(
+                f"{source or 'trajectories'}: fraction {fraction:g} cuts trajectory {b} into {cut} and {left} "
+                f"samples, each part needs {MIN_SAMPLES}; change the fraction or leave the trajectory out"
+            )
+        train.append(torch.arange(start, start + cut))
+        test.append(torch.arange(start + cut, start + cut + left))
+        start += cut + left
+    return (torch.cat(train), cuts), (torch.cat(test), rest)
+
+
+def trajectory_split(
+    count: int,  # B
+    fraction: float,  # of the trajectories that train
+    generator: torch.Generator,
+    source: str = "",
+) -> tuple[list[int], list[int]]:
+    """Draw `round(fraction * count)` trajectories to train; the others test, both in their old order.
+
+    Raises
+    ------
+    InputError
+        If the fraction is not inside (0, 1) or leaves a part without a trajectory.
+    """
+    check_fraction(fraction)
+    train = round(fraction * count)
+    if not 0 < train < count:
+        raise InputError(
+            f"{source or 'trajectories'}: fraction {fraction:g} of {count} trajectories leaves {train} to train and "
+            f"{count - train} to test; change the fraction, or split in time"
+        )
+    order = torch.randperm(count, generator=generator).tolist()
+    return sorted(order[:train]), sorted(order[train:])
+
+
+def check_alike(sets: Sequence[Trajectories]) -> None:
+    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined.
+
+    Raises
+    ------
+    InputError
+        Naming what differs.
+    """
+    if not sets:
+        raise InputError("cat needs at least one set of trajectories, got none")
+    for other in sets[1:]:
+        for what in ("names", "units", "angles", "time_unit"):
+            one, two = getattr(sets[0], what), getattr(other, what)
+            if one != two:
+                raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")
+    for name in ARRAYS:
+        arrays = [x for one in sets if (x := getattr(one, name)) is not None]
+        if len(arrays) not in (0, len(sets)):
+            raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
+        if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
+            raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")

@@ -1,0 +1,245 @@
+"""`Trajectories`: a ragged set of sampled motions, irregular steps and gaps welcome."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import accumulate
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from herglotz.data.checks import ARRAYS, DTYPES, check
+from herglotz.data.splits import check_alike, time_split, trajectory_split
+from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
+from herglotz.errors import InputError
+
+GAP = 1.5  # a longer step, in typical steps, is a gap
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectories:
+    """B trajectories of n coordinates, stored one after the other.
+
+    Checked on construction: finite values, time strictly increasing inside each trajectory, at least three samples
+    each, consistent shapes, one floating dtype. Two sets are equal when their `digest()` is.
+
+    Raises
+    ------
+    InputError
+        Naming the field, the trajectory, the sample and the remedy.
+    """
+
+    t: Tensor  # (N,) time
+    q: Tensor  # (N, n) position
+    lengths: tuple[int, ...]  # samples of each trajectory, adding up to N
+    names: tuple[str, ...]  # of the coordinates
+    units: tuple[str, ...]  # "rad", "m", "pixel", "1", ...
+    angles: tuple[bool, ...]  # a coordinate that is 2π-periodic; its unit is "rad"
+    s: Tensor | None = None  # (N,) action variable, where known
+    p: Tensor | None = None  # (N, n) momentum, where known
+    u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
+    time_unit: str = "s"
+    source: str = ""  # where it came from, for messages
+
+    def __post_init__(self) -> None:
+        check(self)
+
+    @classmethod
+    def of(
+        cls,
+        t: Tensor | np.ndarray | Sequence,
+        q: Tensor | np.ndarray | Sequence,
+        lengths: Sequence[int] | Tensor | np.ndarray | None = None,
+        *,
+        names: Sequence[str] | None = None,
+        units: Sequence[str] | None = None,
+        angles: Sequence[bool] | None = None,
+        s: Tensor | np.ndarray | None = None,
+        p: Tensor | np.ndarray | None = None,
+        u: Tensor | np.ndarray | None = None,
+        time_unit: str = "s",
+        source: str = "",
+    ) -> Trajectories:
+        """Build a set from tensors, arrays or lists, filling in what is left out.
+
+        Arrays and lists become float64; tensors keep their dtype. `q`, `p` and `u` of shape (N,) become (N, 1).
+        Left out: one trajectory, names q (or q0, q1, ...), unit "rad" for an angle and "1" otherwise, no angles.
+        """
+        t, q = _tensor("t", t), _column(_tensor("q", q))
+        counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
+        n = q.shape[-1]
+        angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
+        default_names = ("q",) if n == 1 else tuple(f"q{i}" for i in range(n))
+        return cls(
+            t,
+            q,
+            (len(t),) if counts is None else tuple(counts),
+            names=default_names if names is None else tuple(names),
+            units=tuple("rad" if a else "1" for a in angles) if units is None else tuple(units),
+            angles=angles,
+            s=None if s is None else _tensor("s", s),
+            p=None if p is None else _column(_tensor("p", p)),
+            u=None if u is None else _column(_tensor("u", u)),
+            time_unit=time_unit,
+            source=source,
+        )
+
+    def __len__(self) -> int:
+        """Return B, the number of trajectories."""
+        return len(self.lengths)
+
+    def __getitem__(self, i: int) -> Trajectories:
+        """Return trajectory i alone (negative i counts from the end)."""
+        if not -len(self) <= i < len(self):
+            raise IndexError(f"trajectory {i} of {len(self)}")
+        return self.select([i % len(self)])
+
+    def __iter__(self) -> Iterator[Trajectories]:
+        return (self[i] for i in range(len(self)))
+
+    @property
+    def dof(self) -> int:
+        """Number of coordinates n."""
+        return self.q.shape[1]
+
+    @property
+    def samples(self) -> int:
+        """Number of samples N of all trajectories together."""
+        return self.q.shape[0]
+
+    @cached_property
+    def offsets(self) -> tuple[int, ...]:
+        """Row of the concatenation at which each trajectory starts."""
+        return (0, *accumulate(self.lengths[:-1]))
+
+    @cached_property
+    def trajectory(self) -> Tensor:
+        """Trajectory of every sample, (N,) long."""
+        return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
+
+    def steps(self) -> Steps:
+        """Return all N - B steps, with their trajectory and the row they start from."""
+        return steps(self.t, self.trajectory)
+
+    def triples(self, max_step: float | None = None) -> Triples:
+        """Return all three-sample windows; those with a step longer than `max_step` are left out.
+
+        Angles should be `unwrapped()` first: a jump of 2π between two samples would read as a motion.
+        """
+        return triples(self.t, self.q, self.trajectory, max_step)
+
+    @property
+    def typical_step(self) -> float:
+        """Median step."""
+        return float(self.steps().h.median())
+
+    @property
+    def gaps(self) -> int:
+        """Number of steps longer than 1.5 typical steps: samples are missing there."""
+        return int((self.steps().h > GAP * self.typical_step).sum())
+
+    def split_time(self, fraction: float) -> tuple[Trajectories, Trajectories]:
+        """Cut every trajectory in time: its first `round(fraction * length)` samples train, the others test."""
+        (train, train_lengths), (test, test_lengths) = time_split(self.lengths, fraction, self.source)
+        device = self.t.device
+        return self._rows(train.to(device), train_lengths), self._rows(test.to(device), test_lengths)
+
+    def split_trajectories(self, fraction: float, generator: torch.Generator) -> tuple[Trajectories, Trajectories]:
+        """Draw `round(fraction * B)` whole trajectories for training; the others test."""
+        train, test = trajectory_split(len(self), fraction, generator, self.source)
+        return self.select(train), self.select(test)
+
+    def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
+        """Return these trajectories, in this order; an index may come twice."""
+        chosen = [int(i) for i in indices]
+        for i in chosen:
+            if not 0 <= i < len(self):
+                where = self.source or "trajectories"
+                raise InputError(f"{where}: there is no trajectory {i}; select from 0 to {len(self) - 1}")
+        spans = [torch.arange(self.offsets[i], self.offsets[i] + self.lengths[i]) for i in chosen]
+        rows = torch.cat(spans) if spans else torch.arange(0)
+        return self._rows(rows.to(self.t.device), tuple(self.lengths[i] for i in chosen))
+
+    @classmethod
+    def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
+        """Join sets of the same coordinates, units and optional arrays."""
+        sets = list(sets)
+        check_alike(sets)
+        present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
+        columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
+        lengths = tuple(length for one in sets for length in one.lengths)
+        source = ", ".join(dict.fromkeys(one.source for one in sets if one.source))
+        return replace(sets[0], **columns, lengths=lengths, source=source)
+
+    def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Trajectories:
+        """Return the set in another dtype (float32 or float64) or on another device."""
+        if dtype is not None and dtype not in DTYPES:
+            raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        return replace(self, **self._map(lambda x: x.to(device=device, dtype=dtype or x.dtype)))
+
+    def unwrapped(self) -> Trajectories:
+        """Return the set with every angle continuous: jumps longer than π lose their multiple of 2π.
+
+        Right as long as no angle truly turns by more than π between two samples.
+        """
+        turning = torch.tensor(self.angles, device=self.q.device)
+        if not turning.any():
+            return self
+        return replace(self, q=unwrap(self.q, self.trajectory, turning))
+
+    def with_angles(self, angles: str | Iterable[str]) -> Trajectories:
+        """Return the set with exactly these coordinates marked as angles; a unit "1" among them becomes "rad"."""
+        wanted = (angles,) if isinstance(angles, str) else tuple(angles)
+        for name in wanted:
+            if name not in self.names:
+                raise InputError(
+                    f"{self.source or 'trajectories'}: angles names {name!r}, but the coordinates are {self.names}"
+                )
+        flags = tuple(name in wanted for name in self.names)
+        units = tuple("rad" if a and unit == "1" else unit for a, unit in zip(flags, self.units, strict=True))
+        return replace(self, angles=flags, units=units)
+
+    def digest(self) -> str:
+        """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
+        arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
+        labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
+        shapes = {name: list(x.shape) for name, x in arrays.items()}
+        sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
+        for x in arrays.values():
+            sha.update(x.detach().cpu().contiguous().numpy().tobytes())
+        return sha.hexdigest()
+
+    def summary(self) -> str:
+        """Return one line for people."""
+        coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(self.names, self.units, strict=True))
+        known = "".join(f", {name}" for name in ("s", "p", "u") if getattr(self, name) is not None)
+        plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
+        gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
+        return (
+            f"{self.source or 'trajectories'}: {len(self)} trajector{plural}, {self.samples} samples of "
+            f"{coordinates}{known}; step {self.typical_step:.4g}{unit}{gaps}"
+        )
+
+    def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
+        return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}
+
+    def _rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
+        return replace(self, **self._map(lambda x: x[rows]), lengths=lengths)
+
+
+def _tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
+    if isinstance(x, Tensor):
+        return torch.atleast_1d(x)
+    try:
+        return torch.from_numpy(np.array(x, dtype=np.float64, ndmin=1))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name} is not an array of numbers ({error}); give a tensor, an array or a list") from error
+
+
+def _column(x: Tensor) -> Tensor:
+    return x[:, None] if x.ndim == 1 else x

@@ -1,0 +1,77 @@
+"""Windows on a concatenation of trajectories: steps, three-sample windows and continuous angles.
+
+`trajectory` (N,) says which trajectory each row belongs to; no window joins two of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.data.checks import check_positive
+
+
+@dataclass(frozen=True)
+class Steps:
+    """All steps inside trajectories; none joins two trajectories."""
+
+    h: Tensor  # (N-B,) t_{k+1} - t_k
+    trajectory: Tensor  # (N-B,) long
+    index: Tensor  # (N-B,) long, row of the concatenation where the step starts
+
+
+@dataclass(frozen=True)
+class Triples:
+    """Three consecutive samples of one trajectory: what one discrete Herglotz residual joins."""
+
+    q0: Tensor  # (T, n)
+    q1: Tensor  # (T, n)
+    q2: Tensor  # (T, n)
+    h0: Tensor  # (T,) from q0 to q1
+    h1: Tensor  # (T,) from q1 to q2
+    trajectory: Tensor  # (T,) long
+    index: Tensor  # (T,) long, row of q0 in the concatenation
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+
+def steps(
+    t: Tensor,  # (N,) time
+    trajectory: Tensor,  # (N,) long
+) -> Steps:
+    """Return every step from one sample to the next."""
+    index = (trajectory[1:] == trajectory[:-1]).nonzero()[:, 0]
+    return Steps(t[index + 1] - t[index], trajectory[index], index)
+
+
+def triples(
+    t: Tensor,  # (N,) time
+    q: Tensor,  # (N, n) position
+    trajectory: Tensor,  # (N,) long
+    max_step: float | None = None,  # leave out windows with a longer step
+) -> Triples:
+    """Return every window of three consecutive samples."""
+    index = (trajectory[2:] == trajectory[:-2]).nonzero()[:, 0]
+    h0, h1 = t[index + 1] - t[index], t[index + 2] - t[index + 1]
+    if max_step is not None:
+        check_positive("max_step", max_step)
+        keep = (h0 <= max_step) & (h1 <= max_step)
+        index, h0, h1 = index[keep], h0[keep], h1[keep]
+    return Triples(q[index], q[index + 1], q[index + 2], h0, h1, trajectory[index], index)
+
+
+def unwrap(
+    q: Tensor,  # (N, n) position
+    trajectory: Tensor,  # (N,) long
+    angles: Tensor,  # (n,) bool, the columns to make continuous
+) -> Tensor:
+    """Remove the multiple of 2π from every jump longer than π; each trajectory keeps its first value."""
+    inside = (trajectory[1:] == trajectory[:-1])[:, None] & angles
+    turns = torch.zeros_like(q)
+    turns[1:] = torch.where(inside, torch.round((q[1:] - q[:-1]) / (2 * torch.pi)), 0.0)
+    total = turns.cumsum(0)
+    first = torch.searchsorted(trajectory, trajectory)  # row at which each row's trajectory starts
+    return q - 2 * torch.pi * (total - total[first])

@@ -1,0 +1,73 @@
+"""A small multilayer perceptron whose derivatives are closed-form jets, and the features it reads."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.models.jet import Jet, affine, concatenate, coordinates
+
+
+class Network(nn.Module):
+    """tanh perceptron R^m → R with a zero-initialised last layer, so that a new model equals its baseline.
+
+    Parameters
+    ----------
+    inputs
+        Number of features m.
+    width, depth
+        Hidden units a layer, hidden layers.
+    generator
+        Source of the initial weights.
+    """
+
+    def __init__(self, inputs: int, width: int, depth: int, generator: torch.Generator):
+        super().__init__()
+        sizes = [inputs] + [width] * depth
+        self.weights = nn.ParameterList()
+        self.biases = nn.ParameterList()
+        for a, b in pairwise(sizes):
+            self.weights.append(nn.Parameter(torch.randn(b, a, generator=generator, dtype=torch.float64) / a**0.5))
+            self.biases.append(nn.Parameter(torch.randn(b, generator=generator, dtype=torch.float64)))
+        self.weights.append(nn.Parameter(torch.zeros(1, width, dtype=torch.float64)))
+
+    def forward(self, x: Jet) -> Jet:
+        """The network of a jet of features (..., m); the result is a scalar jet, shape (...)."""
+        hidden = list(self.weights)[:-1]
+        for weight, bias in zip(hidden, self.biases, strict=True):
+            x = x.linear(weight, bias).tanh()
+        return x.linear(self.weights[len(hidden)]).select(0)
+
+
+def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]) -> Jet:
+    """(sin q, cos q) of every angle and q / scale of every other coordinate."""
+    columns = []
+    for i, angle in enumerate(angles):
+        x = q.select(slice(i, i + 1))
+        columns += [x.sin(), x.cos()] if angle else [x / scale[i]]
+    return concatenate(columns)
+
+
+def feature_count(angles: tuple[bool, ...]) -> int:
+    """How many features `position_features` makes."""
+    return sum(2 if angle else 1 for angle in angles)
+
+
+def position_jet(q: Tensor, order: int) -> Jet:
+    """Q as a jet over its own n components."""
+    return coordinates(q, order)
+
+
+def midpoint_velocity_jets(q0: Tensor, q1: Tensor, h: Tensor, order: int) -> tuple[Jet, Jet]:
+    """q̄ = (q0 + q1)/2 and v = (q1 − q0)/h as jets over the 2n components of (q0, q1)."""
+    n = q0.shape[-1]
+    eye = torch.eye(n, dtype=q0.dtype, device=q0.device)
+    shape = torch.broadcast_shapes(q0.shape[:-1], h.shape)
+    q0, q1 = q0.expand(*shape, n), q1.expand(*shape, n)
+    rate = 1 / h.expand(shape)[..., None]  # (..., 1)
+    eye_v = eye.reshape(n, *(1,) * len(shape), n) * rate  # (n, ..., n)
+    mean = affine((q0 + q1) / 2, torch.cat([eye, eye]) / 2, order)
+    velocity = affine((q1 - q0) * rate, torch.cat([-eye_v, eye_v]), order)
+    return mean, velocity

@@ -1,0 +1,188 @@
+"""The terms a model is a sum of; each knows its own closed-form derivatives through jets.
+
+    L_d = (c − 1)(s0 − h/2 V0) + √c K − h/2 (V0 + V1) + N,    c = e^g
+
+V0 = V(q0), V1 = V(q1). Strang's splitting of kinetic, dissipative and potential parts: order 2 in h for every g(q, v),
+and exact for linear drag up to a constant factor on K.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.models.jet import Jet, pairs
+from herglotz.models.network import (
+    Network,
+    feature_count,
+    midpoint_velocity_jets,
+    position_features,
+    position_jet,
+)
+
+
+class Kinetic(nn.Module):
+    """K = Δᵀ m Δ / 2h with Δ = q1 − q0 and a constant mass matrix m = C Cᵀ, C₁₁ = 1.
+
+    Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1.
+    """
+
+    def __init__(self, dof: int):
+        super().__init__()
+        self.dof = dof
+        self.log_diagonal = nn.Parameter(torch.zeros(dof - 1, dtype=torch.float64))
+        self.off_diagonal = nn.Parameter(torch.zeros(dof * (dof - 1) // 2, dtype=torch.float64))
+
+    def mass(self) -> Tensor:
+        """The mass matrix, shape (n, n)."""
+        d = self.log_diagonal
+        if self.dof == 1:
+            return torch.ones(1, 1, dtype=d.dtype, device=d.device)
+        C = torch.diag_embed(torch.cat([torch.ones(1, dtype=d.dtype, device=d.device), d.exp()]))
+        i, j = torch.tril_indices(self.dof, self.dof, -1, device=d.device)
+        C = C.index_put((i, j), self.off_diagonal)
+        return C @ C.T
+
+    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
+        """K as a jet over (q0, q1)."""
+        n = self.dof
+        delta = q1 - q0
+        m = self.mass()
+        momentum = delta @ m / h[..., None]  # (..., n)
+        value = (momentum * delta).sum(-1) / 2
+        gradient = torch.cat([-momentum, momentum], -1).movedim(-1, 0)
+        rows = [value[None], gradient]
+        if order == 2:
+            i, j = pairs(2 * n, q0.device)
+            block = torch.cat([torch.cat([m, -m], 1), torch.cat([-m, m], 1)])[i, j]
+            rows.append(block.reshape(-1, *(1,) * value.ndim) / h.expand(value.shape))
+        return Jet(torch.cat(rows), 2 * n, order)
+
+
+class Potential(nn.Module):
+    """V(q) = Σ kᵢ (1 − cos(qᵢ − aᵢ)) (angles) or Σ kᵢ (qᵢ − aᵢ)²/2 (others), plus a zero-initialised network of q.
+
+    The rest position a is learned: a sensor's zero is seldom the equilibrium. The network is multiplied by an energy
+    scale, so that its output is a relative departure from the baseline.
+    """
+
+    def __init__(
+        self,
+        angles: tuple[bool, ...],
+        scale: tuple[float, ...],
+        stiffness: tuple[float, ...],
+        width: int,
+        depth: int,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.angles = angles
+        self.scale = scale
+        self.energy = sum(k * (1.0 if a else x * x) for k, a, x in zip(stiffness, angles, scale, strict=True))
+        self.stiffness = nn.Parameter(torch.tensor(stiffness, dtype=torch.float64))
+        self.rest = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
+        self.network = Network(feature_count(angles), width, depth, generator) if width else None
+
+    def baseline(self, q: Jet) -> Jet:
+        """The part of V that no network is needed for."""
+        columns = []
+        for i, angle in enumerate(self.angles):
+            x = q.select(i) - self.rest[i]
+            columns.append((1.0 - x.cos() if angle else x * x * 0.5) * self.stiffness[i])
+        return sum(columns[1:], columns[0])
+
+    def departure(self, q: Jet) -> Jet | None:
+        """The network's part of V, or None where the model has no network."""
+        if self.network is None:
+            return None
+        return self.network(position_features(q, self.angles, self.scale)) * self.energy
+
+    def forward(self, q: Tensor, order: int) -> Jet:
+        """V as a jet over the n components of q."""
+        x = position_jet(q, order)
+        V = self.baseline(x)
+        departure = self.departure(x)
+        return V if departure is None else V + departure
+
+
+class LinearDamping(nn.Module):
+    """g = −γ h, so c = e^{−γh} exactly; γ is a plain parameter of either sign (a logarithm collapses to 0)."""
+
+    constant = True
+
+    def __init__(self, rate: float):
+        super().__init__()
+        self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
+
+    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Tensor:  # noqa: ARG002  one signature for all
+        """The exponent g, independent of position."""
+        return -self.rate * h
+
+
+class AffineDamping(nn.Module):
+    """g = −γ h + λ·Δ − h G(q̄, v) with a zero-initialised network G; c = e^g > 0 by construction.
+
+    λ alone is the parachute (c = e^{2λΔ}); G adds any drag that depends on position and velocity.
+    """
+
+    constant = False
+
+    def __init__(
+        self,
+        rate: float,
+        angles: tuple[bool, ...],
+        scale: tuple[float, ...],
+        speed: tuple[float, ...],
+        width: int,
+        depth: int,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.angles, self.scale, self.speed = angles, scale, speed
+        self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
+        self.drag = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
+        self.network = Network(feature_count(angles) + len(angles), width, depth, generator) if width else None
+
+    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
+        """The exponent g as a jet over (q0, q1)."""
+        mean, velocity = midpoint_velocity_jets(q0, q1, h, order)
+        g = (velocity * self.drag).sum() - self.rate
+        if self.network is not None:
+            g = g - self.network(_phase_features(mean, velocity, self.angles, self.scale, self.speed))
+        return g * h
+
+
+class Correction(nn.Module):
+    """Big-step correction N = h E G(q̄, v[, h]): a zero-initialised network that removes the rule's step error.
+
+    With `step_input` the network also reads h (for irregular steps); E is a fixed energy scale.
+    """
+
+    def __init__(
+        self,
+        angles: tuple[bool, ...],
+        scale: tuple[float, ...],
+        speed: tuple[float, ...],
+        width: int,
+        depth: int,
+        generator: torch.Generator,
+    ):
+        super().__init__()
+        self.angles, self.scale, self.speed = angles, scale, speed
+        self.energy = sum(v * v for v in speed)
+        self.network = Network(feature_count(angles) + len(angles), width, depth, generator)
+
+    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
+        """N as a jet over (q0, q1)."""
+        mean, velocity = midpoint_velocity_jets(q0, q1, h, order)
+        x = _phase_features(mean, velocity, self.angles, self.scale, self.speed)
+        return self.network(x) * (h * self.energy)
+
+
+def _phase_features(
+    mean: Jet, velocity: Jet, angles: tuple[bool, ...], scale: tuple[float, ...], speed: tuple[float, ...]
+) -> Jet:
+    """Features of the position, then v / speed: what a network of (q̄, v) reads."""
+    x = position_features(mean, angles, scale)
+    v = Jet(velocity.data / velocity.data.new_tensor(speed), velocity.tangents, velocity.order)
+    return Jet(torch.cat([x.data, v.data], -1), x.tangents, x.order)

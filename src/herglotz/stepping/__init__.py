@@ -1,0 +1,6 @@
+"""Time steppers: batched Newton, steps, rollouts."""
+
+from herglotz.stepping.newton import Solution, Status, solve, solve_step
+from herglotz.stepping.stepper import Rollout, State, Step, StepError, Stepper
+
+__all__ = ["Rollout", "Solution", "State", "Status", "Step", "StepError", "Stepper", "solve", "solve_step"]

@@ -1,0 +1,62 @@
+"""The damped pendulum, θ̈ = −sin θ − γθ̇: nonlinear, no closed form, so its answer is the reference flow.
+
+L = v²/2 − (1 − cos q) − γs and H = p²/2 + (1 − cos q) + γs, in units where m = ℓ = g = 1.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.systems.reference import reference_flow
+from herglotz.systems.rules import all_rules
+from herglotz.systems.scene import Scene, State, Step
+
+
+def damped_pendulum(gamma: float = 0.2) -> Scene:
+    """The damped pendulum θ̈ = −sin θ − γθ̇.
+
+    Parameters
+    ----------
+    gamma
+        Damping rate γ, per unit of time √(ℓ/g).
+    """
+
+    def potential(q: Tensor) -> Tensor:
+        return 2.0 * torch.sin(0.5 * q[..., 0]) ** 2  # 1 − cos q, without its cancellation
+
+    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        return 0.5 * v[..., 0] ** 2 - potential(q) - gamma * s
+
+    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        return 0.5 * p[..., 0] ** 2 + potential(q) + gamma * s
+
+    def vector_field(q: Tensor, p: Tensor, s: Tensor) -> State:
+        """X_H written out, so that the flow is differentiable; a test holds it to `contact_vector_field`."""
+        return p, -torch.sin(q) - gamma * p, lagrangian(q, p, s)
+
+    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        return reference_flow(vector_field, q, p, s, h)
+
+    rules = all_rules(lagrangian)
+    return Scene(
+        name="damped_pendulum",
+        description="damped pendulum, θ̈ = −sin θ − γθ̇; no closed form, reference flow to about 1e-13",
+        dof=1,
+        coordinates=("theta",),
+        units=("rad",),
+        time_unit="s",
+        angles=(True,),
+        parameters={"gamma": gamma},
+        hamiltonian=hamiltonian,
+        lagrangian=lagrangian,
+        momentum=lambda q, v, s: v,  # noqa: ARG005
+        velocity=lambda q, p, s: p,  # noqa: ARG005
+        flow=flow,
+        L_d=rules["midpoint_heun"],
+        exact=False,
+        L_d_rules=rules,
+        q_range=(-2.5, 2.5),
+        v_range=(-1.5, 1.5),
+        h=0.5,
+    )

@@ -1,0 +1,43 @@
+"""Scenes by name."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+
+from herglotz.errors import InputError
+from herglotz.systems.oscillator import damped_oscillator
+from herglotz.systems.parachute import parachute
+from herglotz.systems.pendulum import damped_pendulum
+from herglotz.systems.scene import Scene
+
+SCENES: dict[str, Callable[..., Scene]] = {
+    "damped_oscillator": damped_oscillator,
+    "damped_pendulum": damped_pendulum,
+    "parachute": parachute,
+}
+
+
+def scene_names() -> tuple[str, ...]:
+    """The names that `scene` knows, sorted."""
+    return tuple(sorted(SCENES))
+
+
+def scene(name: str, **parameters: float) -> Scene:
+    """The scene called `name`, with its default parameters overridden by `parameters`.
+
+    Raises
+    ------
+    InputError
+        If there is no such scene or parameter, or a value is not a finite number.
+    """
+    if name not in SCENES:
+        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(scene_names())}")
+    known = tuple(inspect.signature(SCENES[name]).parameters)
+    for key, value in parameters.items():
+        if key not in known:
+            raise InputError(f"scene {name!r} has no parameter {key!r}; it takes {', '.join(known)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"parameter {key!r} of scene {name!r} must be a finite number, got {value!r}")
+    return SCENES[name](**parameters)

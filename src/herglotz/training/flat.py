@@ -1,0 +1,66 @@
+"""A model seen as a function of one flat parameter vector, for Gauss–Newton."""
+
+from __future__ import annotations
+
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call
+
+from herglotz.mechanics import Partials
+from herglotz.models import ContactLagrangian
+
+
+class FlatModel:
+    """Partials of a model at any flat parameter vector, without touching the model; usable inside vmap and jacrev."""
+
+    def __init__(self, model: ContactLagrangian):
+        self.model = model
+        named = dict(model.named_parameters())
+        self.names = list(named)
+        self.shapes = [p.shape for p in named.values()]
+        self.sizes = [p.numel() for p in named.values()]
+
+    def get(self) -> Tensor:
+        """The current parameters as one vector (P,)."""
+        return nn.utils.parameters_to_vector(self.model.parameters()).detach().clone()
+
+    def set(self, theta: Tensor) -> None:
+        """Write a vector back into the model."""
+        nn.utils.vector_to_parameters(theta.detach(), self.model.parameters())
+
+    def unflatten(self, theta: Tensor) -> dict[str, Tensor]:
+        """Named parameter tensors."""
+        parts = theta.split(self.sizes)
+        return {n: p.reshape(shape) for n, p, shape in zip(self.names, parts, self.shapes, strict=True)}
+
+    def partials(self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
+        """`herglotz.mechanics.partials` of the model with parameters theta."""
+        return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order)))
+
+    def at(self, theta: Tensor) -> FixedModel:
+        """The discrete Lagrangian with parameters theta."""
+        return FixedModel(self, theta)
+
+    def index(self, prefix: str) -> Tensor:
+        """Positions in the flat vector of the parameters whose name starts with `prefix`."""
+        ends = torch.tensor(self.sizes).cumsum(0).tolist()
+        spans = zip(self.names, ends, self.sizes, strict=True)
+        chosen = [torch.arange(end - size, end) for name, end, size in spans if name.startswith(prefix)]
+        return torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long)
+
+
+class FixedModel:
+    """A discrete Lagrangian with closed-form partials: the model at one parameter vector."""
+
+    def __init__(self, flat: FlatModel, theta: Tensor):
+        self.flat, self.theta = flat, theta
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """L_d, shape (...)."""
+        return self.partials(q0, q1, s0, h).L
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """See `herglotz.mechanics.partials`."""
+        return self.flat.partials(self.theta, q0, q1, s0, h, order)

@@ -1,0 +1,75 @@
+"""Recorded samples laid on a grid of model steps, cut into segments: the bookkeeping of trajectory fitting."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+
+
+@dataclass(frozen=True)
+class SegmentGrid:
+    """S segments of at most K model steps each; shorter ones are padded at the end and the padding is never read.
+
+    A recorded step longer than `max_step` is crossed in several equal model steps (nodes without an observation), so
+    that a gap does not cost accuracy.
+    """
+
+    h: Tensor  # (S, K) model steps
+    node: Tensor  # (N',) flat index s·(K+1) + k of every observed node
+    sample: Tensor  # (N',) row of the data observed there
+    start_sample: Tensor  # (S,) row of the data at the start of each segment
+    joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
+    end: Tensor  # (S,) last node of each segment
+
+    @property
+    def segments(self) -> int:
+        """Number of segments S."""
+        return self.h.shape[0]
+
+
+def substeps(h: float, max_step: float) -> int:
+    """In how many equal model steps a recorded step is crossed (a hair of tolerance for rounded time stamps)."""
+    return max(1, math.ceil(h / max_step - 1e-6))
+
+
+def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGrid:
+    """Cut each trajectory into segments of about `length` recorded steps.
+
+    Segments of one trajectory have equal lengths up to one step, so that none is a stub. The last sample of a segment
+    is the first of the next; it is observed once, by the earlier segment.
+    """
+    steps: list[list[float]] = []
+    nodes: list[list[tuple[int, int]]] = []  # (k, sample) of the observed nodes
+    starts: list[int] = []
+    joined: list[int] = []
+    times = data.t.tolist()
+    for first, count in zip(data.offsets, data.lengths, strict=True):
+        pieces = max(1, round((count - 1) / length))
+        bounds = [first + round(i * (count - 1) / pieces) for i in range(pieces + 1)]
+        for i, (a, b) in enumerate(pairwise(bounds)):
+            joined.append(-1 if i == 0 else len(starts) - 1)
+            starts.append(a)
+            line, seen = [], [(0, a)] if i == 0 else []
+            for j in range(a, b):
+                m = substeps(times[j + 1] - times[j], max_step)
+                line += [(times[j + 1] - times[j]) / m] * m
+                seen.append((len(line), j + 1))
+            steps.append(line)
+            nodes.append(seen)
+    K = max(len(line) for line in steps)
+    padded = [line + [line[-1]] * (K - len(line)) for line in steps]
+    device = data.t.device
+    return SegmentGrid(
+        h=torch.tensor(padded, dtype=data.t.dtype, device=device),
+        node=torch.tensor([s * (K + 1) + k for s, seen in enumerate(nodes) for k, _ in seen], device=device),
+        sample=torch.tensor([j for seen in nodes for _, j in seen], device=device),
+        start_sample=torch.tensor(starts, device=device),
+        joined_to=torch.tensor(joined, device=device),
+        end=torch.tensor([len(line) for line in steps], device=device),
+    )

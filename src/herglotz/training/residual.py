@@ -1,0 +1,162 @@
+"""The residual objective: how far each recorded q_{k+1} is from the position the model predicts.
+
+r_k = J⁻¹R_k with R_k the discrete Herglotz residual and J = ∂R_k/∂q_{k+1}, which is M where R = 0. To first order r_k
+is the error of the predicted position, it does not change under a gauge transformation, and it cannot be made small
+by shrinking M. The raw residual R_k can, and does: it is offered only so that this can be seen (trap 2).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.data.trajectories import Trajectories
+from herglotz.data.windows import Triples
+from herglotz.mechanics import momentum_jacobian, momentum_residual
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import solve
+from herglotz.training.flat import FlatModel
+from herglotz.training.prior import Prior
+
+OBJECTIVES = ("position", "raw")
+
+
+class ResidualProblem:
+    """½ Σ |r_k|² / σ² + prior over parameters and, where s enters the motion, one latent s per trajectory.
+
+    Parameters
+    ----------
+    model
+        Its current parameters are not changed.
+    data
+        Trajectories; s is integrated along each of them from its latent start.
+    metric
+        "position" for J⁻¹R, "raw" for R.
+    max_step
+        Leave out triples that span a longer step (gaps).
+    sigma
+        Scale of r: a standard deviation, in units of q.
+    prior
+        Penalty on the parameters.
+    chunk
+        Triples whose Jacobian is held in memory at once.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        *,
+        metric: str = "position",
+        max_step: float | None = None,
+        sigma: float = 1.0,
+        prior: Prior | None = None,
+        chunk: int = 4096,
+    ):
+        self.flat = FlatModel(model)
+        self.data, self.metric, self.sigma, self.prior, self.chunk = data, metric, sigma, prior, chunk
+        self.triples: Triples = data.triples(max_step)
+        self.coupled = model.s_enters_motion
+        self.latents = len(data) if self.coupled else 0
+
+    def start(self) -> Tensor:
+        """The flat unknowns: parameters, then the latents (zero)."""
+        theta = self.flat.get()
+        return torch.cat([theta, theta.new_zeros(self.latents)])
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """r, shape (T, n), in units of q (or of p for the raw metric)."""
+        theta, latent = self._split(x)
+        t = self.triples
+        with torch.no_grad():
+            return self._local(theta, t.q0, t.q1, t.q2, self._action(theta, latent)[t.index], t.h0, t.h1)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½ Σ |r|²/σ² + prior."""
+        cost = self.residuals(x).square().sum() / (2 * self.sigma**2)
+        return cost if self.prior is None else cost + self.prior.cost(self._split(x)[0])
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr), accumulated over chunks of triples."""
+        theta, latent = self._split(x)
+        s = self._action(theta, latent)
+        ds = self._action_derivative(theta, s) if self.coupled else None
+        A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+        cost = x.new_zeros(())
+        t = self.triples
+        for part in torch.arange(len(t.q0), device=x.device).split(self.chunk):
+            arguments = (t.q0[part], t.q1[part], t.q2[part], s[t.index[part]], t.h0[part], t.h1[part])
+            r = self._local(theta, *arguments)
+            J = vmap(jacrev(self._local), (None, 0, 0, 0, 0, 0, 0))(theta, *arguments)
+            if ds is not None:
+                r_s = vmap(jacrev(self._local, 4), (None, 0, 0, 0, 0, 0, 0))(theta, *arguments)
+                J = torch.cat([J, torch.zeros_like(J[..., :1]).expand(*J.shape[:-1], self.latents)], -1)
+                J = J + r_s[..., None] * ds[t.index[part]][:, None, :]
+            J = J.reshape(-1, len(x)) / self.sigma
+            r = r.reshape(-1) / self.sigma
+            A += J.T @ J
+            b += J.T @ r
+            cost += r.square().sum() / 2
+        if self.prior is not None:
+            prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
+            P = len(theta)
+            A[:P, :P] += prior_A
+            b[:P] += prior_b
+            cost = cost + prior_cost
+        return cost, A, b
+
+    def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        P = len(x) - self.latents
+        return x[:P], x[P:]
+
+    def _local(
+        self, theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, s0: Tensor, h0: Tensor, h1: Tensor
+    ) -> Tensor:
+        """J⁻¹R (or R) of one triple or of a batch of them."""
+        before = self.flat.partials(theta, q0, q1, s0, h0, 1)
+        after = self.flat.partials(theta, q1, q2, s0 + before.L, h1, 2)
+        R = momentum_residual(after, before.D2)
+        return R if self.metric == "raw" else solve(momentum_jacobian(after, before.D2), R)
+
+    def _action(self, theta: Tensor, latent: Tensor) -> Tensor:
+        """S at every sample, (N,): integrated along the recorded positions; zero where it does not matter."""
+        s = torch.zeros_like(self.data.t)
+        if not self.coupled:
+            return s
+        h = self.data.t.diff()
+        for k, (now, live) in enumerate(self._columns()):
+            if k == 0:
+                s[now] = latent[live]
+            else:
+                P = self.flat.partials(theta, self.data.q[now - 1], self.data.q[now], s[now - 1], h[now - 1], 1)
+                s[now] = s[now - 1] + P.L.detach()
+        return s
+
+    def _action_derivative(self, theta: Tensor, s: Tensor) -> Tensor:
+        """ds/dx at every sample, (N, P + B), by the recurrence ds_{k+1} = c_k ds_k + ∂L_d/∂θ."""
+        q, h = self.data.q, self.data.t.diff()
+
+        def increment(theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
+            P = self.flat.partials(theta, q0, q1, s0, h, 1)
+            return P.L, P.c.detach()
+
+        L_theta, c = vmap(jacrev(increment, has_aux=True), (None, 0, 0, 0, 0))(theta, q[:-1], q[1:], s[:-1], h)
+        ds = s.new_zeros(len(s), len(theta) + self.latents)
+        for k, (now, live) in enumerate(self._columns()):
+            if k == 0:
+                ds[now, len(theta) + live] = 1.0
+            else:
+                ds[now] = c[now - 1, None] * ds[now - 1]
+                ds[now, : len(theta)] += L_theta[now - 1]
+        return ds
+
+    def _columns(self) -> list[tuple[Tensor, Tensor]]:
+        """For k = 0, 1, …: sample numbers of the k-th samples, and which trajectories are that long."""
+        lengths = torch.tensor(self.data.lengths, device=self.data.t.device)
+        offsets = lengths.cumsum(0) - lengths
+        columns = []
+        for k in range(int(lengths.max())):
+            live = (lengths > k).nonzero()[:, 0]
+            columns.append((offsets[live] + k, live))
+        return columns

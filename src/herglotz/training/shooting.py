@@ -1,0 +1,202 @@
+"""Trajectory fitting by multiple shooting: what to do with noise (trap 5).
+
+Unknowns are the parameters and the state (q, p[, s]) at the start of every segment. Residuals are
+
+    (q_model − q_data) / σ     at every sample,
+    (end of a segment − start of the next) / weight     between segments,
+
+and the prior. Derivatives run through every implicit step by the implicit-function theorem: with
+F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ. Segments grow until each trajectory is one.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.data import Trajectories
+from herglotz.mechanics import momentum_jacobian, partials
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+from herglotz.training.flat import FlatModel
+from herglotz.training.grid import SegmentGrid
+from herglotz.training.lifted import Path, solve_path
+from herglotz.training.prior import Prior
+
+
+class ShootingProblem:
+    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states.
+
+    Parameters
+    ----------
+    model
+        Its current parameters are not changed.
+    data
+        Trajectories of positions.
+    grid
+        The segments.
+    sigma
+        Standard deviation of the noise on q.
+    prior
+        Penalty on the parameters.
+    chunk
+        Steps whose parameter Jacobian is held in memory at once.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        grid: SegmentGrid,
+        *,
+        sigma: float,
+        prior: Prior | None = None,
+        chunk: int = 4096,
+    ):
+        self.flat, self.grid, self.data = FlatModel(model), grid, data
+        self.sigma, self.prior, self.chunk = sigma, prior, chunk
+        self.n = data.dof
+        # s is an unknown only where the positions depend on it.
+        self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
+        self.P = len(self.flat.get())
+        speed = data.q.new_tensor(model.config.speed)
+        scale = data.q.new_tensor(model.config.scale)
+        # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
+        relative = sigma / scale
+        action = (speed * scale * relative)[: self.d - 2 * self.n]
+        self.joint_weight = torch.cat([scale * relative, speed * relative, action])
+        self.path: Path | None = None  # the last trajectory solved: where the next solve starts
+
+    def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
+        """Join states (S, n), (S, n), (S,) into the unknowns' layout (S, d)."""
+        parts = [q, p] if self.d == 2 * self.n else [q, p, (torch.zeros_like(q[:, 0]) if s is None else s)[:, None]]
+        return torch.cat(parts, -1)
+
+    def pack(self, theta: Tensor, states: Tensor) -> Tensor:
+        """Flat unknowns from parameters (P,) and segment states (S, d)."""
+        return torch.cat([theta, states.reshape(-1)])
+
+    def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Inverse of `pack`."""
+        return x[: self.P], x[self.P :].reshape(-1, self.d)
+
+    def solve(self, x: Tensor) -> Path | None:
+        """The trajectories of all segments at x, or None where a step has no solution."""
+        theta, states = self.unpack(x)
+        start = torch.cat([states, states.new_zeros(len(states), 2 * self.n + 1 - self.d)], -1)
+        tol = 1e3 * torch.finfo(x.dtype).eps
+        with torch.no_grad():
+            path = None
+            if self.path is not None:
+                path = solve_path(self.flat, theta, start, self.grid.h, self.path.x, tol)
+            if path is None:
+                path = self._step_through(theta, start, tol)
+        return path
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|²; infinite where a step fails."""
+        path = self.solve(x)
+        if path is None:
+            return x.new_full((), torch.inf)
+        fit, joints = self._residuals(path.x)
+        cost = (fit.square().sum() + joints.square().sum()) / 2
+        return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr); remembers the trajectory for the next solve."""
+        theta, _ = self.unpack(x)
+        path = self.solve(x)
+        if path is None:
+            return x.new_full((), torch.inf), x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+        self.path = path
+        grid, n, d, P = self.grid, self.n, self.d, self.P
+        Z = self._sensitivities(theta, path)  # (S, K+1, d, P + d)
+        fit, joints = self._residuals(path.x)
+        S = grid.segments
+        A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+        segment = grid.node // (grid.h.shape[1] + 1)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] / self.sigma  # (N', n, P + d)
+        for k in range(S):
+            own = segment == k
+            self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, x))
+        for k in (grid.joined_to >= 0).nonzero()[:, 0].tolist():
+            before = int(grid.joined_to[k])
+            J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
+            columns = torch.cat([self._columns(before, x), self._columns(k, x)[P:]])
+            self._add(A, b, J / self.joint_weight[:, None], joints[k], columns)
+        cost = (fit.square().sum() + joints.square().sum()) / 2
+        if self.prior is not None:
+            prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
+            A[:P, :P] += prior_A
+            b[:P] += prior_b
+            cost = cost + prior_cost
+        return cost, A, b
+
+    def misfit(self, path: Path) -> Tensor:
+        """q_model − q_data at every sample, (N', n), in units of q."""
+        return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+
+    def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
+        fit = (x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]) / self.sigma
+        before = self.grid.joined_to.clamp_min(0)
+        ends = x[before, self.grid.end[before], : self.d]
+        joints = (ends - x[:, 0, : self.d]) / self.joint_weight
+        return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+
+    def _columns(self, segment: int, x: Tensor) -> Tensor:
+        """Columns of the unknowns that a segment's trajectory depends on: parameters, then its own state."""
+        own = torch.arange(self.P + segment * self.d, self.P + (segment + 1) * self.d, device=x.device)
+        return torch.cat([torch.arange(self.P, device=x.device), own])
+
+    @staticmethod
+    def _add(A: Tensor, b: Tensor, J: Tensor, r: Tensor, columns: Tensor) -> None:
+        A[columns[:, None], columns[None, :]] += J.T @ J
+        b[columns] += J.T @ r
+
+    def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
+        """Solve by stepping, when there is no nearby trajectory to start from."""
+        n = self.n
+        out = Stepper(self.flat.at(theta)).rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h)
+        if not bool(out.ok.all()):
+            return None
+        guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
+        return solve_path(self.flat, theta, start, self.grid.h, guess, tol)
+
+    def _sensitivities(self, theta: Tensor, path: Path) -> Tensor:
+        """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
+        S, K = self.grid.h.shape
+        d = self.d
+        B = self._parameter_derivatives(theta, path)[..., :d, :]
+        eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
+        Z = [torch.cat([theta.new_zeros(S, d, self.P), eye], -1)]
+        pad = theta.new_zeros(S, d, d)
+        for k in range(K):
+            Z.append(path.A[:, k, :d, :d] @ Z[-1] + torch.cat([B[:, k], pad], -1))
+        return torch.stack(Z, 1)
+
+    def _parameter_derivatives(self, theta: Tensor, path: Path) -> Tensor:
+        """B_k = ∂Φ̃(x_k)/∂θ of every step, (S, K, 2n+1, P), by the implicit-function theorem."""
+        n = self.n
+        x, S, K = path.x, *self.grid.h.shape
+        q0, p0, s0 = (x[:, :-1, :n].flatten(0, 1), x[:, :-1, n : 2 * n].flatten(0, 1), x[:, :-1, 2 * n].flatten())
+        q1, h = x[:, 1:, :n].flatten(0, 1), self.grid.h.flatten()
+
+        def step_functions(theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+            P = self.flat.partials(theta, q0, q1, s0, h, 1)
+            return torch.cat([P.D1 + P.c[..., None] * p0, P.D2, P.L[..., None]], -1)
+
+        per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0))
+        out = []
+        for part in torch.arange(S * K, device=x.device).split(self.chunk):
+            here = q0[part], q1[part], p0[part], s0[part], h[part]
+            G = per_step(theta, *here)  # (chunk, 2n+1, P)
+            with torch.no_grad():
+                P = partials(self.flat.at(theta), here[0], here[1], here[3], here[4], order=2)
+                J = momentum_jacobian(P, here[2])
+                dq1 = -torch.linalg.solve_ex(J, G[:, :n])[0]
+                dp1 = G[:, n : 2 * n] + P.D22 @ dq1
+                ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
+            out.append(torch.cat([dq1, dp1, ds1], 1))
+        return torch.cat(out).reshape(S, K, 2 * n + 1, self.P)

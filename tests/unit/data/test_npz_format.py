@@ -1,0 +1,118 @@
+"""The npz format: exact round trips, messages, damaged files."""
+
+import io
+import json
+import tempfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from test_csv_format import rich
+
+from herglotz.data import Trajectories, read_npz, write_npz
+from herglotz.errors import InputError
+
+T3, Q3 = np.arange(3.0), np.zeros((3, 1))
+
+
+def read(folder: Path, **arrays) -> Trajectories:
+    np.savez(folder / "d.npz", **arrays)
+    return read_npz(folder / "d.npz")
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_round_trip_is_exact(tmp_path, dtype):  # fails if an array, a label or the dtype is lost
+    data = rich().select([0]).to(dtype)
+    write_npz(tmp_path / "a.npz", data)
+    back = read_npz(tmp_path / "a.npz")
+    assert back.digest() == data.digest()
+    assert [x.name for x in tmp_path.iterdir()] == ["a.npz"]
+
+
+def test_source_comes_along(tmp_path):  # fails if the provenance is dropped
+    write_npz(tmp_path / "a.npz", Trajectories.of(T3, Q3, source="lab 7"))
+    assert read_npz(tmp_path / "a.npz").source == "lab 7"
+
+
+def test_arrays_alone_are_enough(tmp_path):  # fails if metadata or lengths are demanded, or integers refused
+    data = read(tmp_path, t=np.array([0, 1, 2, 0, 1, 2]), q=np.arange(6), lengths=np.array([3, 3], dtype=np.uint8))
+    assert (data.lengths, data.names, data.source, data.q.dtype) == ((3, 3), ("q",), "d.npz", torch.float64)
+    big = read(tmp_path, t=T3.astype(">f8"), q=Q3.astype(">f8"))  # fails if another byte order is refused
+    assert big.t.tolist() == [0, 1, 2]
+
+
+# Each line fails if that check is dropped.
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"q": Q3}, r"d.npz: there is no array 't', only q; add it: numpy.savez"),
+        ({"t": T3}, r"d.npz: there is no array 'q', only t;"),
+        ({}, r"d.npz: there is no array 't', only none"),
+        ({"t": T3, "q": np.array([{}, 1, 2])}, r"d.npz: array 'q' holds Python objects, which are never loaded"),
+        ({"t": T3, "q": Q3 + 1j}, r"d.npz: array 'q' has dtype complex128; save it as float64"),
+        ({"t": T3, "q": np.array(["a", "b", "c"])}, r"d.npz: array 'q' has dtype <U1; save it as float64"),
+        ({"t": T3, "q": Q3, "lengths": np.array([3.0])}, r"array 'lengths' must hold integers in one row, got float64"),
+        ({"t": T3, "q": Q3, "lengths": np.array(3)}, r"array 'lengths' must hold integers in one row, got int64 \(\)"),
+        ({"t": T3, "q": Q3, "lengths": np.array([4])}, r"d.npz: lengths add up to 4 but t has 3 samples"),
+        ({"t": T3, "q": Q3, "metadata": np.array("{")}, r"d.npz: 'metadata' must be a JSON object of names, units"),
+        ({"t": T3, "q": Q3, "metadata": np.array("[]")}, r"d.npz: 'metadata' must be a JSON object"),
+        ({"t": T3, "q": Q3, "metadata": np.array('{"names": "q"}')}, r"d.npz: 'metadata' must be a JSON object"),
+        ({"t": T3, "q": Q3, "metadata": np.array('{"angles": [1]}')}, r"d.npz: 'metadata' must be a JSON object"),
+        ({"t": T3[:1], "q": Q3[:1]}, r"d.npz: trajectory 0 has 1 sample, at least 3 are needed"),
+        ({"t": T3[::-1], "q": Q3}, r"d.npz: t of trajectory 0 does not increase from sample 0 to 1"),
+        ({"t": T3, "q": Q3 * np.nan}, r"d.npz: q\[0\] of trajectory 0, sample 0, is nan"),
+    ],
+)
+def test_every_mistake_has_its_message(tmp_path, arrays, message):
+    with pytest.raises(InputError, match=message) as caught:
+        read(tmp_path, **arrays)
+    assert "\n" not in str(caught.value)
+
+
+def test_not_an_archive(tmp_path):  # fails if numpy's advice to allow pickle reaches the user
+    (tmp_path / "a.npz").write_bytes(b"hello")
+    with pytest.raises(InputError, match=r"a.npz: is not a .npz archive; write it with numpy.savez"):
+        read_npz(tmp_path / "a.npz")
+    with pytest.raises(InputError, match="there is no such file"):
+        read_npz(tmp_path / "b.npz")
+
+
+def test_truncated(tmp_path):  # fails if a cut download raises BadZipFile
+    write_npz(tmp_path / "a.npz", rich())
+    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-30])
+    with pytest.raises(InputError, match=r"a.npz: the archive is damaged \(.*\); write the file again"):
+        read_npz(tmp_path / "a.npz")
+
+
+def test_unknown_labels_are_ignored(tmp_path):  # fails if a newer file with more metadata is refused
+    data = read(tmp_path, t=T3, q=Q3, metadata=np.array(json.dumps({"names": ["z"], "camera": "red"})))
+    assert data.names == ("z",)
+
+
+def _archive() -> bytes:
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, t=T3, q=Q3, lengths=np.array([3]), metadata=np.array('{"names": ["z"]}'))
+    return buffer.getvalue()
+
+
+ARCHIVE = _archive()
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, len(ARCHIVE) - 1), st.integers(0, 255)), max_size=4), st.integers(0, 40))
+def test_damaged_bytes_raise_nothing_but_input_error(changes, cut):  # fails if zipfile's or zlib's errors escape
+    content = bytearray(ARCHIVE)
+    for place, value in changes:
+        content[place] = value
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "x.npz"
+        path.write_bytes(content[: len(content) - cut])
+        message = "fine"
+        try:
+            read_npz(path)
+        except InputError as error:
+            message = str(error)
+        assert len(message.splitlines()) == 1

@@ -1,0 +1,63 @@
+"""`load` and `save`: the right format, angles continuous, unknown formats explained."""
+
+import numpy as np
+import pytest
+from test_csv_format import rich
+
+from herglotz.data import Trajectories, load, save
+from herglotz.errors import InputError
+
+WRAPPED = "t,q[rad]\n0,3.0\n1,-3.0\n2,-2.5\n"
+
+
+@pytest.mark.parametrize("name", ["a.csv", "a.npz", "A.CSV", "b.NPZ"])
+def test_save_then_load(tmp_path, name):  # fails if an extension goes to the wrong format
+    save(tmp_path / name, rich())
+    assert load(str(tmp_path / name)).digest() == rich().digest()
+
+
+def test_text_of_schmidt_and_lipson(tmp_path):  # fails if .txt is not looked into
+    (tmp_path / "a.txt").write_text("% o v\n0 0 3 1\n0 1 -3 1\n0 2 -2.5 1\n")
+    data = load(tmp_path / "a.txt")
+    assert data.names == ("theta",)
+    np.testing.assert_allclose(data.q[:, 0], [3, 2 * np.pi - 3, 2 * np.pi - 2.5], atol=1e-15)
+
+
+def test_angles_are_unwrapped_unless_told(tmp_path):  # fails if unwrapping or either option is dropped
+    (tmp_path / "a.csv").write_text(WRAPPED)
+    np.testing.assert_allclose(load(tmp_path / "a.csv").q[:, 0], [3, 2 * np.pi - 3, 2 * np.pi - 2.5], atol=1e-15)
+    assert load(tmp_path / "a.csv", unwrap=False).q[:, 0].tolist() == [3, -3, -2.5]
+    assert load(tmp_path / "a.csv", angles=()).q[:, 0].tolist() == [3, -3, -2.5]
+    (tmp_path / "b.csv").write_text(WRAPPED.replace("[rad]", ""))
+    assert load(tmp_path / "b.csv").q[1, 0] == -3
+    assert load(tmp_path / "b.csv", angles="q").q[1, 0] == pytest.approx(2 * np.pi - 3)
+    np.savez(tmp_path / "c.npz", t=[0, 1, 2], q=[3, -3, -2.5])
+    assert load(tmp_path / "c.npz", angles=["q"]).q[1, 0] == pytest.approx(2 * np.pi - 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.mat", "x", r"a.mat: .mat is not read here; what is read: .csv .*\.npz .*Schmidt & Lipson .txt"),
+        ("a", "x", r"a: no extension is not read here"),
+        ("a.txt", "t,q\n", r"a.txt: .txt whose first line does not start with % is not read here"),
+        ("a.npz", "t,q\n", r"a.npz: is not a .npz archive"),
+    ],
+)
+def test_unknown_formats(tmp_path, name, text, message):  # fails if the list of what is read is not shown
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / name)
+
+
+def test_absent(tmp_path):  # fails if an absent .dat is reported as an unknown format
+    with pytest.raises(InputError, match="there is no such file"):
+        load(tmp_path / "a.dat")
+
+
+def test_save_elsewhere(tmp_path):  # fails if a format is guessed
+    data = Trajectories.of([0, 1, 2], [0, 1, 2])
+    with pytest.raises(InputError, match=r"a.mat: cannot write .mat; written are .csv and .npz"):
+        save(tmp_path / "a.mat", data)
+    with pytest.raises(InputError, match=r"cannot write a file without extension"):
+        save(tmp_path / "a", data)

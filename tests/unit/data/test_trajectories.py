@@ -1,0 +1,326 @@
+"""Ragged sets: validation, windows, splits, angles, digests."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+
+
+def ragged() -> Trajectories:
+    """Three trajectories of 4, 3 and 6 samples with irregular steps; q encodes (trajectory, sample)."""
+    t = torch.tensor([0.0, 0.1, 0.2, 0.5, 7.0, 7.1, 7.2, 1.0, 1.1, 1.2, 1.3, 1.4, 1.9], dtype=torch.float64)
+    b = torch.tensor([0] * 4 + [1] * 3 + [2] * 6, dtype=torch.float64)
+    k = torch.tensor([*range(4), *range(3), *range(6)], dtype=torch.float64)
+    return Trajectories.of(t, torch.stack([10 * b + k, -k], 1), (4, 3, 6), names=("x", "y"), source="set")
+
+
+def full() -> Trajectories:
+    """A ragged set with s, p and u."""
+    base = ragged()
+    rows = torch.arange(13, dtype=torch.float64)
+    return replace(base, s=rows, p=torch.stack([rows, 2 * rows], 1), u=rows[:, None] + 0.5)
+
+
+def build(**changes):
+    fields = {
+        "t": [0.0, 1.0, 2.0, 0.0, 1.0, 2.0],
+        "q": [0.0, 1.0, 2.0, 3.0, 4.0, 5.0],
+        "lengths": (3, 3),
+        "source": "f",
+    }
+    return Trajectories.of(**{**fields, **changes})
+
+
+INF, NAN = math.inf, math.nan
+SIX = torch.zeros(6, dtype=torch.float64)
+
+
+# Each line fails if that check is dropped or its message loses the place, the value or the remedy.
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"t": torch.arange(6)}, r"f: t has dtype torch.int64; convert it to torch.float64"),
+        ({"q": SIX.to(torch.complex128)}, r"f: q has dtype torch.complex128; convert"),
+        ({"q": SIX.half()}, r"f: q has dtype torch.float16; convert"),
+        ({"q": SIX.float()}, r"f: q is torch.float32 on cpu but t is torch.float64 on cpu; use the same"),
+        ({"q": [[0.0, 1.0], [2.0]]}, r"q is not an array of numbers .*; give a tensor"),
+        ({"q": ["a"] * 6}, r"q is not an array of numbers .*; give a tensor"),
+        ({"t": SIX[:, None]}, r"f: t must have shape \(N,\), got \(6, 1\); flatten it"),
+        ({"q": [0.0] * 5}, r"f: q must have shape \(6, n\), .*got \(5, 1\)"),
+        ({"q": torch.zeros(6, 0, dtype=torch.float64)}, r"f: q must have shape \(6, n\), .*got \(6, 0\)"),
+        ({"s": SIX[:5]}, r"f: s must have shape \(6,\), got \(5,\)"),
+        ({"p": torch.zeros(6, 2, dtype=torch.float64)}, r"f: p must have shape \(6, 1\), got \(6, 2\)"),
+        ({"u": SIX[:5]}, r"f: u must have shape \(6, m\), got \(5, 1\)"),
+        ({"lengths": ()}, r"f: there is no trajectory; give at least one of 3 samples"),
+        ({"lengths": (5, 1)}, r"f: trajectory 1 has 1 sample, at least 3 are needed; leave it out"),
+        ({"lengths": (2, 4)}, r"f: trajectory 0 has 2 samples, at least 3 are needed"),
+        ({"lengths": (3, 4)}, r"f: lengths add up to 7 but t has 6 samples; correct the lengths"),
+        ({"lengths": (3, 3.0)}, r"f: lengths\[1\] is 3.0, not an int"),
+        ({"names": ("a", "b")}, r"f: names has 2 entries for 1 coordinates"),
+        ({"units": ()}, r"f: units has 0 entries for 1 coordinates"),
+        ({"angles": (True, False), "units": ("rad",)}, r"f: angles has 2 entries for 1 coordinates"),
+        ({"units": ("",)}, r"f: a unit is empty \(\('',\), 's'\); write '1' for none"),
+        ({"time_unit": ""}, r"f: a unit is empty \(\('1',\), ''\); write '1'"),
+        ({"names": ("",)}, r"f: names \(''\,\) must differ and not be empty; rename"),
+        ({"angles": (True,), "units": ("deg",)}, r"f: the angle 'q' is in 'deg'; convert it to radians"),
+        ({"q": [0.0, 1.0, 2.0, 3.0, NAN, 5.0]}, r"f: q\[0\] of trajectory 1, sample 1, is nan; delete that sample"),
+        ({"t": [0.0, 1.0, INF, 0.0, 1.0, 2.0]}, r"f: t of trajectory 0, sample 2, is inf; delete that sample"),
+        ({"s": SIX + INF}, r"f: s of trajectory 0, sample 0, is inf"),
+        ({"u": SIX * NAN}, r"f: u\[0\] of trajectory 0, sample 0, is nan"),
+        (
+            {"t": [0.0, 1.0, 2.0, 0.0, 1.0, 1.0]},
+            r"f: t of trajectory 1 does not increase from sample 1 to 2 \(1.0 then 1.0\); sort the samples or delete",
+        ),
+        (
+            {"t": [0.0, 1.0, 0.5, 0.0, 1.0, 2.0]},
+            r"t of trajectory 0 does not increase from sample 1 to 2 \(1.0 then 0.5\)",
+        ),
+    ],
+)
+def test_every_mistake_has_its_message(changes, message):
+    with pytest.raises(InputError, match=message) as caught:
+        build(**changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_constructor_wants_tensors():  # fails if an array slips through to torch operations
+    with pytest.raises(InputError, match=r"s: q must be a torch.Tensor, got ndarray; use Trajectories.of"):
+        replace(ragged(), q=np.zeros((13, 2)), source="s")  # pyright: ignore[reportArgumentType]
+
+
+def test_times_of_different_trajectories_may_overlap():  # fails if increase is asked across a border
+    assert len(build(t=[5.0, 6.0, 7.0, 0.0, 1.0, 2.0])) == 2
+
+
+def test_defaults():  # fails if lists become float32 or an angle keeps the unit 1
+    one = Trajectories.of([0, 1, 2], [0, 1, 2])
+    assert (one.names, one.units, one.angles, one.lengths) == (("q",), ("1",), (False,), (3,))
+    assert one.t.dtype == one.q.dtype == torch.float64
+    assert one.q.shape == (3, 1)
+    two = Trajectories.of(SIX[:3] + torch.arange(3), torch.zeros(3, 2, dtype=torch.float64), angles=(False, True))
+    assert (two.names, two.units) == (("q0", "q1"), ("1", "rad"))
+    assert Trajectories.of([0, 1, 2], [0, 1, 2], np.array([3])).lengths == (3,)  # fails if numpy integers are refused
+
+
+def test_scalars_are_refused_as_one_sample():  # fails if a 0-d input escapes as a TypeError
+    with pytest.raises(InputError, match="trajectory 0 has 1 sample"):
+        Trajectories.of(1.0, 2.0)  # pyright: ignore[reportArgumentType]
+
+
+def test_counts_and_indexing():  # fails if offsets are off by a trajectory or optional arrays are not cut along
+    data = full()
+    assert (len(data), data.dof, data.samples, data.offsets) == (3, 2, 13, (0, 4, 7))
+    assert data.trajectory.tolist() == [0] * 4 + [1] * 3 + [2] * 6
+    last = data[-1]
+    assert last.lengths == (6,)
+    assert last.q[:, 0].tolist() == [20, 21, 22, 23, 24, 25]
+    assert last.s is not None
+    assert last.u is not None
+    assert last.s.tolist() == [7, 8, 9, 10, 11, 12]
+    assert last.u[:, 0].tolist() == [7.5, 8.5, 9.5, 10.5, 11.5, 12.5]
+    assert [one.samples for one in data] == [4, 3, 6]
+    with pytest.raises(IndexError):
+        data[3]
+
+
+def test_steps_stay_inside_trajectories():  # fails if a step joins two trajectories
+    steps = ragged().steps()
+    assert len(steps.h) == 13 - 3
+    torch.testing.assert_close(
+        steps.h, torch.tensor([0.1, 0.1, 0.3, 0.1, 0.1, 0.1, 0.1, 0.1, 0.1, 0.5], dtype=torch.float64)
+    )
+    assert steps.index.tolist() == [0, 1, 2, 4, 5, 7, 8, 9, 10, 11]
+    assert steps.trajectory.tolist() == [0, 0, 0, 1, 1, 2, 2, 2, 2, 2]
+
+
+def test_triples():  # fails if a window crosses a border, if h0 and h1 are exchanged, or q's are shifted
+    data = ragged()
+    triples = data.triples()
+    assert triples.index.tolist() == [0, 1, 4, 7, 8, 9, 10]
+    assert triples.trajectory.tolist() == [0, 0, 1, 2, 2, 2, 2]
+    assert triples.q0[:, 0].tolist() == [0, 1, 10, 20, 21, 22, 23]
+    assert triples.q1[:, 0].tolist() == [1, 2, 11, 21, 22, 23, 24]
+    assert triples.q2[:, 1].tolist() == [-2, -3, -2, -2, -3, -4, -5]
+    assert triples.h0[1].item() == pytest.approx(0.1)
+    assert triples.h1[1].item() == pytest.approx(0.3)
+
+
+def test_triples_leave_out_long_steps():  # fails if only h0 or only h1 is looked at
+    data = Trajectories.of([0, 1, 2, 5, 6, 7.0], [0, 1, 2, 3, 4, 5.0])
+    assert data.triples(1.5).index.tolist() == [0, 3]
+    assert data.triples(3.0).index.tolist() == [0, 1, 2, 3]  # a step equal to the limit stays
+    assert len(data.triples(0.5)) == 0
+    for bad in (0.0, -1.0, NAN):
+        with pytest.raises(InputError, match="max_step must be finite and > 0"):
+            data.triples(bad)
+
+
+def test_typical_step_and_gaps():  # fails if the mean is taken for the median
+    assert ragged().typical_step == pytest.approx(0.1)
+    assert ragged().gaps == 2
+
+
+def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
+    data = full().select([0, 2])  # 4 and 6 samples
+    with pytest.raises(
+        InputError, match=r"set: fraction 0.5 cuts trajectory 0 into 2 and 2 samples, each part needs 3"
+    ):
+        data.split_time(0.5)
+    long = Trajectories.of(
+        torch.arange(20.0).double(), torch.arange(20.0).double(), (8, 12), s=torch.arange(20).double()
+    )
+    with pytest.raises(InputError, match=r"fraction 0.7 cuts trajectory 0 into 6 and 2 samples"):
+        long.split_time(0.7)
+    with pytest.raises(InputError, match=r"fraction 0.2 cuts trajectory 0 into 2 and 6 samples"):
+        long.split_time(0.2)
+    train, test = long.split_time(0.6)
+    assert (train.lengths, test.lengths) == ((5, 7), (3, 5))
+    assert train.q[:, 0].tolist() == [0, 1, 2, 3, 4, 8, 9, 10, 11, 12, 13, 14]
+    assert test.q[:, 0].tolist() == [5, 6, 7, 15, 16, 17, 18, 19]
+    assert test.s is not None
+    assert test.s.tolist() == test.q[:, 0].tolist()
+    for bad in (0.0, 1.0, -0.5, 2.0, NAN):
+        with pytest.raises(InputError, match="fraction must lie between 0 and 1"):
+            long.split_time(bad)
+
+
+def test_split_trajectories():  # fails if parts overlap, the seed is ignored, or the global generator is drawn from
+    t = torch.arange(30.0).double()
+    data = Trajectories.of(t, t, (3,) * 10)
+    torch.manual_seed(0)
+    state = torch.get_rng_state()
+    train, test = data.split_trajectories(0.7, torch.Generator().manual_seed(3))
+    assert torch.equal(state, torch.get_rng_state())
+    assert (len(train), len(test)) == (7, 3)
+    assert sorted(train.q[:, 0].tolist() + test.q[:, 0].tolist()) == list(range(30))
+    again, _ = data.split_trajectories(0.7, torch.Generator().manual_seed(3))
+    other, _ = data.split_trajectories(0.7, torch.Generator().manual_seed(4))
+    assert train.digest() == again.digest() != other.digest()
+    with pytest.raises(InputError, match=r"fraction 0.01 of 10 trajectories leaves 0 to train and 10 to test"):
+        data.split_trajectories(0.01, torch.Generator())
+    with pytest.raises(InputError, match=r"leaves 10 to train and 0 to test"):
+        data.split_trajectories(0.99, torch.Generator())
+
+
+def test_select():  # fails if order or repetition is lost, or a wrong index wraps round
+    data = ragged()
+    assert data.select([2, 0, 2]).lengths == (6, 4, 6)
+    assert data.select([2, 0, 2]).q[:, 0].tolist()[6:10] == [0, 1, 2, 3]
+    assert data.select(torch.tensor([1])).q[:, 0].tolist() == [10, 11, 12]
+    for bad in (3, -1):
+        with pytest.raises(InputError, match=rf"set: there is no trajectory {bad}; select from 0 to 2"):
+            data.select([bad])
+    with pytest.raises(InputError, match="there is no trajectory; give at least one"):
+        data.select([])
+
+
+def test_cat():  # fails if the lengths or an optional array of the second set are lost
+    data = full()
+    both = Trajectories.cat([data.select([2]), data.select([0, 1])])
+    assert both.lengths == (6, 4, 3)
+    assert both.digest() == data.select([2, 0, 1]).digest()
+    with pytest.raises(InputError, match=r"1 of the 2 sets to join have s; drop it or add it to all"):
+        Trajectories.cat([data, ragged()])
+    with pytest.raises(InputError, match=r"different names cannot be joined: \('x', 'y'\) and \('a', 'y'\)"):
+        Trajectories.cat([data, replace(data, names=("a", "y"))])
+    with pytest.raises(InputError, match="different time_unit"):
+        Trajectories.cat([data, replace(data, time_unit="ms")])
+    with pytest.raises(InputError, match="differ in the dtype, device or width of t"):
+        Trajectories.cat([data, data.to(torch.float32)])
+    with pytest.raises(InputError, match="at least one set"):
+        Trajectories.cat([])
+
+
+def test_to():  # fails if an array is left in the old dtype
+    small = full().to(torch.float32)
+    assert small.s is not None
+    assert small.p is not None
+    assert small.u is not None
+    assert {x.dtype for x in (small.t, small.q, small.s, small.p, small.u)} == {torch.float32}
+    assert small.to(torch.float64).lengths == (4, 3, 6)
+    assert full().to(device="cpu").t.dtype == torch.float64  # fails if a device alone changes the dtype
+    with pytest.raises(InputError, match=r"dtype must be torch.float32 or torch.float64, got torch.int32"):
+        full().to(torch.int32)
+
+
+def test_times_that_float32_cannot_tell_apart():  # fails if a unix time stamp silently gives h = 0
+    with pytest.raises(InputError, match=r"does not increase .*times may coincide in float32: use float64"):
+        Trajectories.of([1.7e9, 1.7e9 + 0.01, 1.7e9 + 0.02], [0, 1, 2]).to(torch.float32)
+
+
+def test_unwrapped():  # fails if turns leak into the next trajectory or another column, or the sign is wrong
+    angle = torch.linspace(0, 20, 41, dtype=torch.float64)
+    true = torch.cat([angle, -angle])
+    wrapped = torch.atan2(true.sin(), true.cos())
+    t = torch.cat([angle, angle])
+    data = Trajectories.of(
+        t, torch.stack([wrapped, wrapped], 1), (41, 41), names=("theta", "x"), units=("rad", "m"), angles=(True, False)
+    )
+    smooth = data.unwrapped()
+    torch.testing.assert_close(smooth.q[:, 0], true, rtol=0, atol=1e-13)
+    assert torch.equal(smooth.q[:, 1], wrapped)
+    np.testing.assert_allclose(smooth.q[:41, 0].numpy(), np.unwrap(wrapped[:41].numpy()), atol=1e-13)
+    assert torch.equal(smooth.unwrapped().q, smooth.q)  # fails if it is not idempotent
+    steady = Trajectories.of([0, 1, 2], [0, 3, 6], angles=(True,))
+    assert torch.equal(steady.unwrapped().q, steady.q)  # fails if jumps of less than π are touched
+
+
+def test_each_trajectory_keeps_its_first_angle():  # fails if unwrapping starts at 0 or at the last trajectory's end
+    data = Trajectories.of([0, 1, 2, 0, 1, 2.0], [9.0, 9.1, 9.2, 0.1, 0.2, 0.3], (3, 3), angles=(True,))
+    assert torch.equal(data.unwrapped().q, data.q)
+
+
+def test_huge_values_in_other_columns_survive_unwrapping():  # fails if inf · False = nan reaches a plain column
+    big = [[0.0, 1e308], [0.1, -1e308], [0.2, 1e308]]
+    data = Trajectories.of([0, 1, 2], big, angles=(True, False))
+    assert torch.equal(data.unwrapped().q, data.q)
+
+
+def test_with_angles():  # fails if the unit or the other flags are not updated
+    data = ragged().with_angles("y")
+    assert (data.angles, data.units) == ((False, True), ("1", "rad"))
+    assert data.with_angles(()).angles == (False, False)
+    with pytest.raises(InputError, match=r"set: angles names 'z', but the coordinates are \('x', 'y'\)"):
+        data.with_angles(["z"])
+    with pytest.raises(InputError, match="the angle 'y' is in 'deg'; convert it to radians"):
+        replace(ragged(), units=("1", "deg")).with_angles(["y"])
+
+
+def test_digest_sees_contents_only():  # fails if a field does not enter the digest, or the source does
+    data = full()
+    assert data.digest() == replace(data, source="elsewhere").digest() == full().digest()
+    assert data.s is not None
+    assert data.p is not None
+    assert data.u is not None
+    others = [
+        replace(data, t=data.t + 1e-9),
+        replace(data, q=data.q + 1e-9),
+        replace(data, s=None),
+        replace(data, s=data.s + 1),
+        replace(data, p=data.p + 1),
+        replace(data, u=data.u + 1),
+        replace(data, u=torch.cat([data.u, data.u], 1)),
+        replace(data, s=None, p=None, u=data.s[:, None]),
+        replace(data, p=None, u=None),
+        replace(data, names=("x", "z")),
+        replace(data, units=("1", "m")),
+        replace(data, time_unit="ms"),
+        data.with_angles("x"),
+        data.to(torch.float32),
+        data.select([0, 2, 1]),
+        Trajectories.cat([data.select([0, 1]), data.select([2])]),  # the same set again
+    ]
+    digests = [other.digest() for other in others]
+    assert digests.pop() == data.digest()
+    assert len({data.digest(), *digests}) == len(digests) + 1
+
+
+def test_summary():  # fails if a count, a unit or the gaps are missing
+    assert full().summary() == "set: 3 trajectories, 13 samples of x [1], y [1], s, p, u; step 0.1 s, 2 gaps"
+    one = Trajectories.of([0, 1, 2], [0, 1, 2], time_unit="1", names=("x",), units=("m",))
+    assert one.summary() == "trajectories: 1 trajectory, 3 samples of x [m]; step 1"
