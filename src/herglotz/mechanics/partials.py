@@ -95,7 +95,7 @@ def autograd_partials(
     Batched by the batch-sum trick: samples do not interact, so the gradient of the sum is the batch of gradients.
     """
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
-    keep_graph = torch.is_grad_enabled()
+    keep_graph = torch.is_grad_enabled() and _differentiable(L_d, q0, q1, s0, h)
     with torch.enable_grad():
         q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
         s0 = s0[..., 0]
@@ -123,6 +123,11 @@ def autograd_partials(
             D33=D33,
         )
         return _detach(second, keep_graph)
+
+
+def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
+    """Whether a result should carry a graph: an argument wants a gradient, or a parameter inside L_d does."""
+    return q0.requires_grad or q1.requires_grad or s0.requires_grad or L_d(q0, q1, s0, h).requires_grad
 
 
 def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = False) -> tuple[Tensor, ...]:

@@ -20,7 +20,8 @@ LEVELS = ("linear", "affine")
 class ModelConfig:
     """Everything that is needed to build a model; plain numbers, so that it can be stored as JSON.
 
-    `scale` and `speed` are typical sizes of q and v (data units); `stiffness` and `rate` start the baseline.
+    `scale` and `speed` are typical sizes of q and v (data units); `stiffness`, `tilt` and `rate` start the
+    baseline.
     A width of 0 leaves that network out.
     """
 
@@ -29,6 +30,7 @@ class ModelConfig:
     scale: tuple[float, ...] = (1.0,)
     speed: tuple[float, ...] = (1.0,)
     stiffness: tuple[float, ...] = (1.0,)
+    tilt: tuple[float, ...] = (0.0,)
     rate: float = 0.1
     potential_width: int = 8
     potential_depth: int = 1
@@ -40,7 +42,7 @@ class ModelConfig:
     def __post_init__(self):
         if self.level not in LEVELS:
             raise InputError(f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}")
-        for name in ("scale", "speed", "stiffness"):
+        for name in ("scale", "speed", "stiffness", "tilt"):
             if len(getattr(self, name)) != len(self.angles):
                 given = getattr(self, name)
                 raise InputError(f"{name} needs one number a coordinate ({len(self.angles)}), got {given}")
@@ -92,7 +94,9 @@ class ContactLagrangian(nn.Module):
         make = torch.Generator().manual_seed(config.seed)
         c = config
         self.kinetic = Kinetic(c.dof)
-        self.potential = Potential(c.angles, c.scale, c.stiffness, c.potential_width, c.potential_depth, make)
+        self.potential = Potential(
+            c.angles, c.scale, c.speed, c.stiffness, c.tilt, c.potential_width, c.potential_depth, make
+        )
         if c.level == "linear":
             self.damping: LinearDamping | AffineDamping = LinearDamping(c.rate)
         else:

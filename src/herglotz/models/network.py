@@ -19,18 +19,21 @@ class Network(nn.Module):
         Number of features m.
     width, depth
         Hidden units a layer, hidden layers.
+    gain
+        Size of the initial weights relative to 1/√inputs: below 1 the network starts smooth.
     generator
         Source of the initial weights.
     """
 
-    def __init__(self, inputs: int, width: int, depth: int, generator: torch.Generator):
+    def __init__(self, inputs: int, width: int, depth: int, gain: float, generator: torch.Generator):
         super().__init__()
         sizes = [inputs] + [width] * depth
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for a, b in pairwise(sizes):
-            self.weights.append(nn.Parameter(torch.randn(b, a, generator=generator, dtype=torch.float64) / a**0.5))
-            self.biases.append(nn.Parameter(torch.randn(b, generator=generator, dtype=torch.float64)))
+            weight, bias = (torch.randn(b, k, generator=generator, dtype=torch.float64) for k in (a, 1))
+            self.weights.append(nn.Parameter(weight * (gain / a**0.5)))
+            self.biases.append(nn.Parameter(bias[:, 0] * gain))
         self.weights.append(nn.Parameter(torch.zeros(1, width, dtype=torch.float64)))
 
     def forward(self, x: Jet) -> Jet:

@@ -60,17 +60,19 @@ class Kinetic(nn.Module):
 
 
 class Potential(nn.Module):
-    """V(q) = Σ kᵢ (1 − cos(qᵢ − aᵢ)) (angles) or Σ kᵢ (qᵢ − aᵢ)²/2 (others), plus a zero-initialised network of q.
+    """V(q) = Σ kᵢ (1 − cos qᵢ) + bᵢ sin qᵢ (angles) or Σ kᵢ qᵢ²/2 + bᵢ qᵢ (others), plus a zero-initialised network of q.
 
-    The rest position a is learned: a sensor's zero is seldom the equilibrium. The network is multiplied by an energy
-    scale, so that its output is a relative departure from the baseline.
+    The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
+    network is multiplied by the energy scale Σ speed², so that its weights are of order one.
     """
 
     def __init__(
         self,
         angles: tuple[bool, ...],
         scale: tuple[float, ...],
+        speed: tuple[float, ...],
         stiffness: tuple[float, ...],
+        tilt: tuple[float, ...],
         width: int,
         depth: int,
         generator: torch.Generator,
@@ -78,17 +80,18 @@ class Potential(nn.Module):
         super().__init__()
         self.angles = angles
         self.scale = scale
-        self.energy = sum(k * (1.0 if a else x * x) for k, a, x in zip(stiffness, angles, scale, strict=True))
+        self.energy = sum(v * v for v in speed)
         self.stiffness = nn.Parameter(torch.tensor(stiffness, dtype=torch.float64))
-        self.rest = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
-        self.network = Network(feature_count(angles), width, depth, generator) if width else None
+        self.tilt = nn.Parameter(torch.tensor(tilt, dtype=torch.float64))
+        self.network = Network(feature_count(angles), width, depth, 1.0, generator) if width else None
 
     def baseline(self, q: Jet) -> Jet:
         """The part of V that no network is needed for."""
         columns = []
         for i, angle in enumerate(self.angles):
-            x = q.select(i) - self.rest[i]
+            x = q.select(i)
             columns.append((1.0 - x.cos() if angle else x * x * 0.5) * self.stiffness[i])
+            columns.append((x.sin() if angle else x) * self.tilt[i])
         return sum(columns[1:], columns[0])
 
     def departure(self, q: Jet) -> Jet | None:
@@ -141,7 +144,7 @@ class AffineDamping(nn.Module):
         self.angles, self.scale, self.speed = angles, scale, speed
         self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
         self.drag = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
-        self.network = Network(feature_count(angles) + len(angles), width, depth, generator) if width else None
+        self.network = Network(feature_count(angles) + len(angles), width, depth, 0.3, generator) if width else None
 
     def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
         """The exponent g as a jet over (q0, q1)."""
@@ -153,9 +156,10 @@ class AffineDamping(nn.Module):
 
 
 class Correction(nn.Module):
-    """Big-step correction N = h E G(q̄, v[, h]): a zero-initialised network that removes the rule's step error.
+    """Big-step correction N = h E G(q̄, v): a zero-initialised network that removes the rule's error at one step size.
 
-    With `step_input` the network also reads h (for irregular steps); E is a fixed energy scale.
+    E = Σ speed² is a fixed energy scale. The network starts smooth (gain 0.1): where the data leave a hole, near a
+    separatrix say, it then fills it in smoothly, which lowers the worst rollout errors by one to two orders.
     """
 
     def __init__(
@@ -170,7 +174,7 @@ class Correction(nn.Module):
         super().__init__()
         self.angles, self.scale, self.speed = angles, scale, speed
         self.energy = sum(v * v for v in speed)
-        self.network = Network(feature_count(angles) + len(angles), width, depth, generator)
+        self.network = Network(feature_count(angles) + len(angles), width, depth, 0.1, generator)
 
     def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
         """N as a jet over (q0, q1)."""

@@ -1,0 +1,24 @@
+"""Objectives, optimisers and the fit."""
+
+from herglotz.training.adam import adam
+from herglotz.training.config import FitConfig
+from herglotz.training.fit import fit
+from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
+from herglotz.training.prior import Prior
+from herglotz.training.residual import ResidualProblem
+from herglotz.training.run import Run, load_run, save_run
+from herglotz.training.shooting import ShootingProblem
+
+__all__ = [
+    "FitConfig",
+    "OptimiserResult",
+    "Prior",
+    "ResidualProblem",
+    "Run",
+    "ShootingProblem",
+    "adam",
+    "fit",
+    "levenberg_marquardt",
+    "load_run",
+    "save_run",
+]

@@ -106,8 +106,9 @@ def _floored(scale: Tensor) -> Tensor:
 
 
 def _damped_step(A: Tensor, b: Tensor, diagonal: Tensor) -> Tensor | None:
-    factor, info = torch.linalg.cholesky_ex(A + torch.diag(diagonal))
+    matrix = (A + torch.diag(diagonal)).double()  # squared condition numbers need float64
+    factor, info = torch.linalg.cholesky_ex(matrix)
     if int(info) != 0:
         return None
-    step = -torch.cholesky_solve(b[:, None], factor)[:, 0]
+    step = -torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype)
     return step if bool(torch.isfinite(step).all()) else None

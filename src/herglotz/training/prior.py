@@ -14,10 +14,11 @@ from herglotz.training.flat import FlatModel
 class Prior:
     """Gaussian prior, as residuals that join a least-squares problem.
 
-    * The force of the potential's network, −∂V_net/∂q, on a grid over the data, is N(0, (τ F)²) with F the baseline's
-      typical force: `departure` = τ. The grid's residuals share one weight, so that τ does not depend on its size.
-    * Every network weight is N(0, `weight`²): weak, it only keeps unseen directions from drifting.
-    * The damping rate is N(its start, `rate_spread`²).
+    * The force of the potential's network, −∂V_net/∂q, has over the range of the data an RMS of N(0, (τ F)²), with F
+      the RMS force of the baseline: `departure` = τ. (Many grid points share that one residual's weight.)
+    * Every network weight is N(its start, `weight`²): weak, it only keeps unseen directions from drifting. (Centred
+      at 0 it would switch the network off: behind a zero-initialised last layer nothing else holds the first one.)
+    * The damping rate and the drag coefficients (per unit of position) are N(their start, `rate_spread`²).
     """
 
     def __init__(
@@ -36,21 +37,24 @@ class Prior:
         self.departure = departure if model.potential.network is not None else None
         networks = ("potential.network", "damping.network", "correction")
         self.weight_index = torch.cat([self.flat.index(prefix) for prefix in networks])
-        self.rate_index = self.flat.index("damping.rate")
-        self.rate_start, self.rate_spread, self.weight = theta[self.rate_index], rate_spread, weight
+        self.rate_index = torch.cat([self.flat.index("damping.rate"), self.flat.index("damping.drag")])
+        self.start, self.rate_spread, self.weight = theta, rate_spread, weight
         n = len(low)
         if n == 1:
             self.grid = torch.linspace(0, 1, grid, dtype=low.dtype, device=low.device)[:, None] * (high - low) + low
         else:
             points = torch.quasirandom.SobolEngine(n, seed=0).draw(grid * n).to(low)
             self.grid = points * (high - low) + low
-        self.force = float(self._baseline_force().square().mean().sqrt())
+        force = float(self._baseline_force().square().mean().sqrt())
+        self.force = force if force > 0 else 1.0
 
     def residuals(self, theta: Tensor) -> Tensor:
         """Prior residuals, (m,)."""
-        parts = [theta[self.weight_index] / self.weight, (theta[self.rate_index] - self.rate_start) / self.rate_spread]
+        moved = theta - self.start
+        parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
         if self.departure is not None:
-            parts.append(self._network_force(theta).reshape(-1) / (self.departure * self.force))
+            force = self._network_force(theta)
+            parts.append(force.reshape(-1) / (self.departure * self.force * force.numel() ** 0.5))
         return torch.cat(parts)
 
     def cost(self, theta: Tensor) -> Tensor:
@@ -61,6 +65,16 @@ class Prior:
         """(½|r|², JᵀJ, Jᵀr) of the prior alone."""
         r, J = self.residuals(theta), jacrev(self.residuals)(theta)
         return r.square().sum() / 2, J.T @ J, J.T @ r
+
+    def log_determinant(self, theta: Tensor) -> Tensor:
+        """log det of the prior's precision over the parameters it speaks about (for the evidence)."""
+        J = jacrev(self.residuals)(theta)
+        A = (J.T @ J)[self._covered][:, self._covered]
+        return torch.linalg.slogdet(A).logabsdet
+
+    @property
+    def _covered(self) -> Tensor:
+        return torch.cat([self.weight_index, self.rate_index])
 
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():

@@ -77,6 +77,20 @@ class ResidualProblem:
         cost = self.residuals(x).square().sum() / (2 * self.sigma**2)
         return cost if self.prior is None else cost + self.prior.cost(self._split(x)[0])
 
+    def cost_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """(cost, ∂cost/∂x) without a Jacobian, for Adam."""
+        if self.coupled:  # through the recurrence for s: the normal equations already hold its derivative
+            cost, _, gradient = self.normal_equations(x)
+            return cost, gradient
+        t = self.triples
+        theta = x.detach().requires_grad_()
+        r = self._local(theta, t.q0, t.q1, t.q2, torch.zeros_like(t.h0), t.h0, t.h1)
+        cost = r.square().sum() / (2 * self.sigma**2)
+        if self.prior is not None:
+            cost = cost + self.prior.cost(theta)
+        (gradient,) = torch.autograd.grad(cost, theta)
+        return cost.detach(), gradient
+
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(cost, JᵀJ, Jᵀr), accumulated over chunks of triples."""
         theta, latent = self._split(x)

@@ -133,6 +133,12 @@ class ShootingProblem:
             cost = cost + prior_cost
         return cost, A, b
 
+    def states_at(self, path: Path, samples: Tensor) -> Tensor:
+        """The fitted state (…, d) at recorded samples: where the segments of the next stage start."""
+        rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
+        rows[self.grid.sample] = self.grid.node
+        return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
+
     def misfit(self, path: Path) -> Tensor:
         """q_model − q_data at every sample, (N', n), in units of q."""
         return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]

@@ -1,0 +1,62 @@
+"""Figures of data, runs and the theory, as matplotlib `Figure` objects: nothing global, no window, no display needed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from herglotz.data.files import PathLike
+from herglotz.errors import InputError
+from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
+from herglotz.plots.motion import plot_data, plot_trajectory
+from herglotz.plots.phase import plot_phase_portrait
+from herglotz.plots.style import save_figure
+from herglotz.plots.training import plot_training
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+FIGURES = {
+    "trajectory.png": plot_trajectory,
+    "phase_portrait.png": plot_phase_portrait,
+    "momentum_vs_dS.png": plot_momentum_vs_generating_function,
+    "hj_residual.png": plot_hamilton_jacobi_residual,
+    "training.png": plot_training,
+}
+
+
+def save_figures(run: Run, folder: PathLike) -> list[Path]:
+    """Draw every figure of a run and write them as PNG into `folder`, which is made if need be.
+
+    Returns
+    -------
+    list of Path
+        In the order of `FIGURES`. Nothing is written before all are drawn.
+
+    Raises
+    ------
+    InputError
+        If the folder cannot be made or written to.
+    """
+    folder = Path(folder)
+    drawn = {name: plot(run) for name, plot in FIGURES.items()}
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    for name, figure in drawn.items():
+        save_figure(figure, folder / name)
+    return [folder / name for name in drawn]
+
+
+__all__ = [
+    "FIGURES",
+    "plot_data",
+    "plot_hamilton_jacobi_residual",
+    "plot_momentum_vs_generating_function",
+    "plot_phase_portrait",
+    "plot_training",
+    "plot_trajectory",
+    "save_figure",
+    "save_figures",
+]

@@ -1,0 +1,100 @@
+"""Fans of solutions: where the figures of the generating function and of the Hamilton–Jacobi equation start from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian, GeneratingFunction, generating_function
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State, Stepper
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+CAUSTIC = 1e-3  # smallest spread of ∂q_k/∂p̂0, relative to the median, at which S^k is still drawn
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Initial states, the step, and the model that moves them."""
+
+    L_d: DiscreteLagrangian
+    start: State  # (F, n), (F, n), (F,)
+    h: float
+    momentum_unit: str = ""
+    action_unit: str = ""
+
+    def generating_function(self, k: int, start: State | None = None) -> GeneratingFunction:
+        """S^k and its derivatives along every solution of the fan, k >= 1 steps from its start."""
+        stepper = Stepper(self.L_d)
+
+        def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return stepper.rollout(q, p, s, h=self.h, steps=k).final
+
+        return generating_function(flow, *(self.start if start is None else start))
+
+
+def regular(S: GeneratingFunction) -> Tensor:
+    """(F,) where S^k exists: finite, and not at a caustic."""
+    finite = torch.isfinite(S.S) & torch.isfinite(S.D2).all(-1) & torch.isfinite(S.p).all(-1)
+    spread = torch.where(finite, S.spread, torch.zeros_like(S.spread))
+    typical = spread[finite].median() if bool(finite.any()) else spread.sum()
+    return finite & (spread > CAUSTIC * typical)
+
+
+def spread_fan(source: Run | ContactLagrangian, size: int, h: float | None = None) -> Fan:
+    """`size` solutions from all over the data (a run) or over the model's typical box (a model alone)."""
+    if isinstance(source, ContactLagrangian):
+        return _box_fan(source, size, h)
+    states = source.states
+    rows = torch.linspace(0, len(states.s) - 1, min(size, len(states.s))).round().long()
+    start = State(states.q[rows].detach(), states.p[rows].detach(), states.s[rows].detach())
+    finite = torch.isfinite(start.q).all(-1) & torch.isfinite(start.p).all(-1) & torch.isfinite(start.s)
+    start = State(start.q[finite], start.p[finite], start.s[finite])
+    if not len(start.s):
+        raise InputError("the run has no finite state to start from; fit it again")
+    return Fan(source.model, start, source.h if h is None else h, *units(source))
+
+
+def point_fan(run: Run, size: int) -> Fan:
+    """`size` solutions that leave one point of the data, q̂0 and ŝ0, with different momenta p̂0 along one direction."""
+    states = run.states
+    finite = torch.isfinite(states.p).all(-1) & torch.isfinite(states.q).all(-1) & torch.isfinite(states.s)
+    if not bool(finite.any()):
+        raise InputError("the run has no finite state to start from; fit it again")
+    q, p, s = (x[finite].detach() for x in states)
+    row = int((q - q.median(0).values).abs().sum(-1).argmax()) if len(s) < 3 else len(s) // 3
+    reach = (p - p.median(0).values).abs().quantile(0.9, dim=0)
+    steps = torch.linspace(-1.0, 1.0, size, dtype=p.dtype, device=p.device)
+    momenta = p.median(0).values + steps[:, None] * reach.clamp_min(1e-6)
+    start = State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone())
+    return Fan(run.model, start, run.h, *units(run))
+
+
+def units(run: Run) -> tuple[str, str]:
+    """Units of p and s: the first entry of the mass is fixed at 1, so p is a velocity and s a squared length a time."""
+    length, time = run.data.units[0], run.data.time_unit
+    if len(set(run.data.units)) > 1:
+        return "", ""
+    per_time = "" if time in ("", "1") else f"/{time}"
+    length = "" if length in ("", "1") else length
+    momentum = f"{length or '1'}{per_time}" if length or per_time else ""
+    action = f"{length + '²' if length else '1'}{per_time}" if length or per_time else ""
+    return momentum, action
+
+
+def _box_fan(model: ContactLagrangian, size: int, h: float | None) -> Fan:
+    scale = torch.tensor(model.config.scale, dtype=torch.float64)
+    speed = torch.tensor(model.config.speed, dtype=torch.float64)
+    dtype = next(model.parameters()).dtype
+    generator = torch.Generator().manual_seed(0)
+    shape = (size, len(scale))
+    q = (scale * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)).to(dtype)
+    p = (speed * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)).to(dtype)
+    step = 0.1 * float((scale / speed).min()) if h is None else h
+    return Fan(model, State(q, p, torch.zeros_like(q[:, 0])), step)

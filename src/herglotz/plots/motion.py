@@ -1,0 +1,183 @@
+"""Positions against time: the data, the free run of the model, and what lies between them."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, corner, new_figure, number, styled, with_unit
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+MOST_PANELS = 4
+FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
+
+
+def plot_data(data: Trajectories) -> Figure:
+    """Draw the samples alone, up to four trajectories (or the coordinates of a single one); gaps stay open."""
+    cells = _cells(data, None)
+    with styled():
+        figure = new_figure(*_size(len(cells), 2.4), data.summary())
+        for ax, (b, i) in zip(_axes(figure, len(cells), 1), cells, strict=True):
+            t, q = _series(data, data.q, b, i)
+            t_open, q_open = _broken(t, q, data)
+            ax[0].plot(t_open, q_open, color=MODEL, lw=0.8, alpha=0.6)
+            ax[0].plot(t, q, ".", color=INK, ms=3)
+            ax[0].set(ylabel=with_unit(data.names[i], data.units[i]), xlabel=with_unit("time", data.time_unit))
+            if len(data) > 1:
+                ax[0].set_title(f"trajectory {b}")
+    return figure
+
+
+def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
+    """Draw data, free run and residual against time; what was not trained on is shaded.
+
+    Parameters
+    ----------
+    run
+        A fitted run; its prediction is one rollout a trajectory, never corrected by later data.
+    trajectory
+        Which one; left out, up to four spread over the set. A single one shows up to four coordinates.
+
+    Raises
+    ------
+    InputError
+        If there is no such trajectory.
+    """
+    data = run.data
+    if trajectory is not None and not 0 <= trajectory < len(data):
+        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
+    cells = _cells(data, trajectory)
+    with styled():
+        figure = new_figure(*_size(len(cells), 3.9), trajectory_title(run))
+        for (b, i), ax in zip(cells, _axes(figure, len(cells), 2), strict=True):
+            _draw_motion(run, b, i, ax[0], ax[1], labelled=(b, i) == cells[0])
+            ax[1].set_xlabel(with_unit("time", data.time_unit))
+            if len(data) > 1:
+                ax[0].set_title(f"trajectory {b}")
+    return figure
+
+
+def trajectory_title(run: Run) -> str:
+    """The message of the figure: how far the free run is from data that the fit has not seen."""
+    data = run.data
+    unit = data.units[0] if len(set(data.units)) == 1 else ""
+    error = (run.prediction - data.q).detach()
+    unseen = ~trained_mask(run)
+    lost = ~torch.isfinite(error).all(-1)
+    if bool(lost.any()):
+        row = int(lost.nonzero()[0])
+        return f"The free run breaks off at {number(float(data.t[row]), data.time_unit)}"
+    rms = float(error[unseen if bool(unseen.any()) else ~unseen].square().mean().sqrt())
+    if not bool(unseen.any()):
+        return f"Training RMS {number(rms, unit)}; nothing was held out"
+    part = float(unseen.double().mean())
+    near = min(FRACTIONS, key=lambda x: abs(x - part))
+    words = FRACTIONS[near] if abs(near - part) < 0.02 else f"{100 * part:.0f} %"
+    return f"Extrapolation RMS {number(rms, unit)} over the unseen {words}"
+
+
+def trained_mask(run: Run) -> torch.Tensor:
+    """(N,) whether a sample was trained on: the leading `train_lengths` of every trajectory."""
+    data = run.data
+    mask = torch.zeros(data.samples, dtype=torch.bool)
+    for start, count in zip(data.offsets, run.train_lengths, strict=True):
+        mask[start : start + count] = True
+    return mask
+
+
+def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
+    data, unit = run.data, run.data.units[i]
+    t, q = _series(data, data.q, b, i)
+    _, model = _series(data, run.prediction, b, i)
+    count = run.train_lengths[b]
+    boundary = t[0] if count == 0 else t[-1] if count >= len(t) else 0.5 * (t[count - 1] + t[count])
+    if count < len(t):
+        for ax in (top, bottom):
+            ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
+    top.plot(t, q, ".", color=INK, ms=3.2, zorder=2)
+    if len(t) > 120:
+        top.plot(t, model, color="white", lw=2.2, zorder=2.5)
+    seen, unseen = slice(0, max(count, 0)), slice(max(count - 1, 0), None)
+    top.plot(t[seen], model[seen], color=MODEL, zorder=3)
+    if count < len(t):
+        top.plot(t[unseen], model[unseen], color=UNSEEN, zorder=3)
+    low, high = np.nanmin(np.r_[q, model[np.isfinite(model)]]), np.nanmax(np.r_[q, model[np.isfinite(model)]])
+    top.set_ylim(low - 0.06 * (high - low) - 1e-12, high + 0.24 * (high - low) + 1e-12)
+    top.set_ylabel(with_unit(data.names[i], unit))
+    top.tick_params(labelbottom=False)
+    residual = q - model
+    bottom.axhline(0.0, color=MUTED, lw=0.8, zorder=1)
+    for span, color in ((slice(0, count), MODEL), (slice(count, None), UNSEEN)):
+        bottom.plot(t[span], residual[span], ".", color=color, ms=3, zorder=2)
+    bottom.set_ylabel(with_unit("data − model", unit))
+    for ax in (top, bottom):
+        ax.set_xlim(t[0], t[-1])
+    _draw_labels(run, top, bottom, (t, residual), count, labelled)
+
+
+def _draw_labels(
+    run: Run, top: Axes, bottom: Axes, series: tuple[np.ndarray, np.ndarray], count: int, labelled: bool
+) -> None:
+    """Say what is what beside it, once a figure; the RMS of each part in every panel."""
+    t, residual = series
+    unit = run.data.units[0] if len(set(run.data.units)) == 1 else ""
+    split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
+    if labelled and count:
+        corner(top, "● data   ━ model, trained here", MODEL)
+    if labelled and count < len(t):
+        corner(top, "━ model, free run", UNSEEN, x=1.0)
+    bottom.margins(y=0.3)
+    for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
+        part = residual[span]
+        if len(part):
+            text = f"RMS {number(math.sqrt(float(np.mean(part**2))), unit)}"
+            place = bottom.get_xaxis_transform()
+            x = t[0] + where * (t[-1] - t[0])
+            bottom.annotate(
+                text, (x, 1.0), xycoords=place, xytext=(5, -2), textcoords="offset points", color=color, va="top",
+                fontsize=8.5, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0},
+            )  # fmt: skip
+
+
+def _cells(data: Trajectories, trajectory: int | None) -> list[tuple[int, int]]:
+    """Which (trajectory, coordinate) a panel shows: a single trajectory's coordinates, else coordinate 0 of several."""
+    if trajectory is not None or len(data) == 1:
+        return [(trajectory or 0, i) for i in range(min(data.dof, MOST_PANELS))]
+    chosen = np.linspace(0, len(data) - 1, min(len(data), MOST_PANELS)).round().astype(int)
+    return [(int(b), 0) for b in chosen]
+
+
+def _size(cells: int, height: float) -> tuple[float, float]:
+    return (8.0, height + 0.6) if cells == 1 else (10.0, (height if cells == 2 else 1.75 * height) + 0.5)
+
+
+def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
+    """`cells` groups of panels in at most two columns, each of one or two rows that share their time axis."""
+    columns = 1 if cells == 1 else 2
+    grid = figure.add_gridspec(math.ceil(cells / columns), columns)
+    found = []
+    for k in range(cells):
+        ratios = [2.6, 1.0] if rows == 2 else [1.0]
+        inner = grid[k // columns, k % columns].subgridspec(rows, 1, height_ratios=ratios, hspace=0.03)
+        found.append([figure.add_subplot(inner[r]) for r in range(rows)])
+    return found
+
+
+def _series(data: Trajectories, values: torch.Tensor, b: int, i: int) -> tuple[np.ndarray, np.ndarray]:
+    rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
+    return data.t[rows].double().cpu().numpy(), values[rows, i].detach().double().cpu().numpy()
+
+
+def _broken(t: np.ndarray, q: np.ndarray, data: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """Put a NaN into every gap, so that the line is not drawn across it."""
+    at = np.nonzero(np.diff(t) > 1.5 * data.typical_step)[0] + 1
+    return np.insert(t, at, np.nan), np.insert(q, at, np.nan)

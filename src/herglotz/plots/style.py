@@ -1,0 +1,98 @@
+"""One look for every figure, without touching matplotlib's global settings or needing a display."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import matplotlib as mpl
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from herglotz.data.files import PathLike, write_atomically
+
+DPI = 150
+# Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
+INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", "#8A8A8A"
+SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
+SHADE = "#FBEDE3"  # behind what was not trained on
+
+STYLE: dict[str, Any] = {
+    "figure.dpi": DPI,
+    "figure.facecolor": "white",
+    "figure.constrained_layout.use": True,
+    "font.size": 9.5,
+    "font.family": "DejaVu Sans",  # ships with matplotlib: the same figure everywhere
+    "text.color": INK,
+    "axes.edgecolor": "#555555",
+    "axes.labelcolor": INK,
+    "axes.titlesize": 9.5,
+    "axes.titlelocation": "left",
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.linewidth": 0.8,
+    "axes.axisbelow": True,
+    "axes.unicode_minus": True,
+    "xtick.color": "#555555",
+    "ytick.color": "#555555",
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "lines.linewidth": 1.4,
+    "lines.solid_capstyle": "round",
+    "legend.frameon": False,
+    "path.simplify": True,
+}
+
+
+@contextmanager
+def styled() -> Iterator[None]:
+    """Draw with matplotlib's defaults and this style, whatever the caller's settings are, and restore them."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams.update(STYLE)
+        yield
+
+
+def new_figure(width: float, height: float, title: str) -> Figure:
+    """Return an empty figure (inches) with its message on top; no pyplot, so no window and no global list of figures."""
+    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    figure.suptitle(title, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
+    return figure
+
+
+def save_figure(figure: Figure, path: PathLike) -> None:
+    """Write a figure as PNG; the file appears whole or not at all."""
+    buffer = io.BytesIO()
+    with styled():
+        figure.savefig(buffer, format="png", dpi=DPI)
+    write_atomically(path, buffer.getvalue())
+
+
+def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: Any) -> None:
+    """Write `text` beside the data point (x, y), on a white halo so that lines behind do not disturb it."""
+    options = {"fontsize": 8.5, "xytext": (4, 4), "ha": "left", "va": "bottom"} | options
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0}
+    ax.annotate(text, (x, y), textcoords="offset points", color=color, bbox=box, **options)
+
+
+def corner(ax: Axes, text: str, color: str = INK, *, x: float = 0.0, y: float = 1.0, **options: Any) -> None:
+    """Write `text` inside a corner (axes fractions, 0 or 1 each)."""
+    options = {"fontsize": 8.5, "ha": "left" if x < 0.5 else "right", "va": "top" if y > 0.5 else "bottom"} | options
+    shift = (5 if x < 0.5 else -5, -5 if y > 0.5 else 5)
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
+    place: Any = (x, y)
+    ax.annotate(
+        text, place, xycoords="axes fraction", textcoords="offset points", xytext=shift, color=color, bbox=box, **options
+    )
+
+
+def with_unit(name: str, unit: str) -> str:
+    """An axis label: `theta (rad)`, or the name alone for a number without unit."""
+    return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+def number(value: float, unit: str = "") -> str:
+    """A number for people: three significant digits, and its unit."""
+    return f"{value:.3g}" + ("" if unit in ("", "1") else f" {unit}")

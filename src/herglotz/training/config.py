@@ -1,0 +1,103 @@
+"""What a fit is asked to do: plain values, stored beside the result."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import torch
+
+from herglotz.errors import InputError
+from herglotz.models import LEVELS
+
+OBJECTIVES = ("auto", "residual", "trajectory", "raw")
+OPTIMISERS = ("lm", "adam")
+DTYPES = {"float64": torch.float64, "float32": torch.float32}
+
+
+@dataclass(frozen=True)
+class FitConfig:
+    """Settings of `fit`; the defaults suit measured and simulated data alike.
+
+    Parameters
+    ----------
+    level
+        "linear" (one damping rate) or "affine" (damping depends on position and velocity).
+    objective
+        "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
+        "auto": whichever the noise found in the data asks for. "raw": ‖R‖², which collapses; for demonstration.
+    optimiser
+        "lm" (Levenberg–Marquardt), or "adam" for the residual objectives.
+    train_fraction
+        Part of every trajectory, in time, that is trained on; the rest tests. 1 trains on everything.
+    seed
+        Of the initial weights.
+    dtype, device
+        Of the whole fit and of the model it returns.
+    iterations
+        Bound on the iterations of the residual objectives, and on those of each stage of trajectory fitting.
+    departures
+        Prior strengths τ tried for the potential's departure from its baseline; the evidence chooses. One value
+        fixes it.
+    potential_width, damping_width, correction_width
+        Hidden units of the networks; the correction is used by the residual objectives, the potential's network by
+        trajectory fitting.
+    learning_rate
+        Of Adam.
+    """
+
+    level: str = "linear"
+    objective: str = "auto"
+    optimiser: str = "lm"
+    train_fraction: float = 0.667
+    seed: int = 0
+    dtype: str = "float64"
+    device: str = "cpu"
+    iterations: int = 200
+    departures: tuple[float, ...] = (2e-4, 6e-4, 2e-3, 6e-3)
+    potential_width: int = 8
+    damping_width: int = 6
+    correction_width: int = 16
+    learning_rate: float = 3e-3
+
+    def __post_init__(self):
+        _choice("level", self.level, LEVELS)
+        _choice("objective", self.objective, OBJECTIVES)
+        _choice("optimiser", self.optimiser, OPTIMISERS)
+        _choice("dtype", self.dtype, tuple(DTYPES))
+        if not 0 < self.train_fraction <= 1:
+            raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
+        if self.iterations < 1:
+            raise InputError(f"iterations must be >= 1, got {self.iterations}")
+        if not self.departures or min(self.departures) <= 0:
+            raise InputError(f"departures must be one or more positive numbers, got {self.departures}")
+        if self.optimiser == "adam" and self.objective not in ("residual", "raw"):
+            raise InputError(f"adam fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm")
+        try:
+            device = torch.device(self.device)
+        except RuntimeError:
+            raise InputError(f"unknown device '{self.device}'; use cpu or cuda") from None
+        if device.type == "cuda" and not torch.cuda.is_available():
+            raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
+
+    @property
+    def torch_dtype(self) -> torch.dtype:
+        """The dtype as torch knows it."""
+        return DTYPES[self.dtype]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return asdict(self)
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> FitConfig:
+        """Inverse of `to_dict`; unknown keys are an error."""
+        unknown = set(values) - {f.name for f in fields(cls)}
+        if unknown:
+            raise InputError(f"unknown setting {', '.join(sorted(unknown))}; written by another version of herglotz?")
+        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+
+
+def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise InputError(f"unknown {name} '{value}'; choose one of {', '.join(choices)}")

@@ -1,0 +1,123 @@
+"""A finished fit, in memory and on disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories, read_npz, write_npz
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+from herglotz.training.config import FitConfig
+
+FORMAT = 1
+
+
+@dataclass(frozen=True)
+class Run:
+    """A trained model with everything that is needed to judge it.
+
+    `prediction` is the model's free run at every sample: on the training part from the fitted states, and from the last
+    training sample on without another look at the data.
+    """
+
+    model: ContactLagrangian
+    config: FitConfig
+    metrics: dict[str, Any]
+    data: Trajectories  # all samples, training and test
+    train_lengths: tuple[int, ...]  # leading samples of each trajectory that were trained on
+    states: State  # (N, n), (N, n), (N,) at every sample
+    h: float  # typical model step
+    box: dict[str, list[float]]  # range of q, p, s over the data: where the model can be trusted
+    history: list[dict[str, Any]]  # stage, iteration, cost
+
+    @property
+    def prediction(self) -> Tensor:
+        """Predicted positions at every sample, (N, n)."""
+        return self.states.q
+
+    @property
+    def stepper(self) -> Stepper:
+        """The trained time stepper."""
+        return Stepper(self.model)
+
+
+def save_run(run: Run, folder: str | Path) -> None:
+    """Write model.pt, config.json, metrics.json and fit.npz into a folder; each file whole or not at all."""
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    write_npz(folder / "fit.npz", run.data)
+    model = {
+        "format": FORMAT,
+        "model": run.model.config.to_dict(),
+        "parameters": {k: v.detach().cpu() for k, v in run.model.state_dict().items()},
+        "states": {k: v.detach().cpu() for k, v in run.states._asdict().items()},
+        "train_lengths": list(run.train_lengths),
+        "h": run.h,
+        "box": run.box,
+        "history": run.history,
+        "data_digest": run.data.digest(),
+    }
+    buffer = BytesIO()
+    torch.save(model, buffer)
+    write_atomically(folder / "model.pt", buffer.getvalue())
+    for name, values in (("config.json", run.config.to_dict()), ("metrics.json", run.metrics)):
+        write_atomically(folder / name, (json.dumps(values, indent=2, allow_nan=False) + "\n").encode())
+
+
+def load_run(folder: str | Path) -> Run:
+    """Read what `save_run` wrote.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged or of another format.
+    """
+    folder = Path(folder)
+    if not (folder / "model.pt").is_file():
+        raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
+    try:
+        stored = torch.load(folder / "model.pt", weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise InputError(f"{folder / 'model.pt'}: cannot be read ({type(error).__name__}); fit again") from None
+    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+        raise InputError(f"{folder / 'model.pt'}: not a herglotz model of format {FORMAT}; fit again")
+    config = FitConfig.from_dict({**_json(folder / "config.json"), "device": "cpu"})
+    model = ContactLagrangian(ModelConfig.from_dict(stored["model"])).to(config.torch_dtype)
+    model.load_state_dict(stored["parameters"])
+    return Run(
+        model,
+        config,
+        _json(folder / "metrics.json"),
+        read_npz(folder / "fit.npz"),
+        tuple(stored["train_lengths"]),
+        State(**stored["states"]),
+        stored["h"],
+        stored["box"],
+        stored["history"],
+    )
+
+
+def _json(path: Path) -> dict[str, Any]:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); fit again") from None
+
+
+def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
+    """Lowest and highest q, p and s over a set of states."""
+    columns = {"q": q, "p": p, "s": s[:, None]}
+    return {
+        f"{name}_{end}": (x.amin(0) if end == "low" else x.amax(0)).tolist()
+        for name, x in columns.items()
+        for end in ("low", "high")
+    }

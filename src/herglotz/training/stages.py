@@ -1,0 +1,91 @@
+"""Named stages of a fit: progress bars, history, and a checkpoint from which an interrupted fit goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+from herglotz.training.levenberg_marquardt import OptimiserResult
+
+Callback = Callable[[int, float, Tensor], None]
+EVERY = 25  # iterations between two checkpoints inside a stage
+
+
+class Stages:
+    """Runs optimisations one after the other and remembers them.
+
+    A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again, and
+    an unfinished one goes on from its best point.
+
+    Parameters
+    ----------
+    progress
+        Show progress bars; None shows them on a terminal only.
+    checkpoint
+        File to write, or None.
+    key
+        Identifies data and settings; a checkpoint of another fit is refused.
+    resume
+        Read the checkpoint if there is one.
+    """
+
+    def __init__(self, progress: bool | None, checkpoint: Path | None, key: str, resume: bool):
+        self.disable = None if progress is None else not progress
+        self.checkpoint, self.key = checkpoint, key
+        self.history: list[dict[str, Any]] = []
+        self.done: dict[str, dict[str, Any]] = {}
+        if resume and checkpoint is not None and checkpoint.exists():
+            stored = torch.load(checkpoint, weights_only=True)
+            if stored["key"] != key:
+                raise InputError(
+                    f"{checkpoint}: belongs to other data or settings; leave out --resume or choose another folder"
+                )
+            self.done = stored["stages"]
+
+    def run(
+        self, name: str, x: Tensor, total: int, optimise: Callable[[Tensor, Callback], OptimiserResult]
+    ) -> OptimiserResult:
+        """Run one stage from x (or from where the checkpoint left it) and record its history."""
+        stored = self.done.get(name)
+        if stored is not None:
+            x = stored["x"].to(x)
+        if stored is not None and stored["done"]:
+            result = OptimiserResult(x, stored["cost"], stored["reason"], stored["iterations"], stored["history"])
+        else:
+            with tqdm(total=total, desc=name, disable=self.disable, leave=False) as bar:
+
+                def callback(iteration: int, cost: float, best: Tensor) -> None:
+                    bar.update(1)
+                    bar.set_postfix_str(f"cost {cost:.4g}", refresh=False)
+                    if iteration % EVERY == 0:
+                        self._store(name, OptimiserResult(best, cost, "interrupted", iteration), done=False)
+
+                result = optimise(x, callback)
+            self._store(name, result, done=True)
+        start = len(self.history)
+        self.history += [
+            {"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)
+        ]
+        return result
+
+    def _store(self, name: str, r: OptimiserResult, done: bool) -> None:
+        self.done[name] = {
+            "x": r.x.detach().cpu(),
+            "cost": r.cost,
+            "reason": r.reason,
+            "iterations": r.iterations,
+            "history": r.history,
+            "done": done,
+        }
+        if self.checkpoint is not None:
+            buffer = BytesIO()
+            torch.save({"key": self.key, "stages": self.done}, buffer)
+            write_atomically(self.checkpoint, buffer.getvalue())

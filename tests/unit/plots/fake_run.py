@@ -1,0 +1,39 @@
+"""A run as the fit returns it, without a fit: a model near the truth, its free run, and an invented history."""
+
+from types import SimpleNamespace
+
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+from herglotz.systems import scene
+
+
+def fake_run(trajectories: int = 1, steps: int = 60, level: str = "linear", dof: int = 1, fraction: float = 2 / 3):
+    """Pendulum data, or an oscillator in the plane for two coordinates."""
+    h = 0.2
+    data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
+    rate = 0.201
+    config = ModelConfig(angles=(True,), level=level, rate=rate, potential_width=0)
+    if dof == 2:
+        config = ModelConfig((False,) * 2, level, (1.0,) * 2, (1.0,) * 2, (1.0, 2.0), rate, potential_width=0)
+    model = ContactLagrangian(config)
+    parts = []
+    for b in range(trajectories):
+        q0 = data[b].q[0].expand(dof).clone()
+        p0 = (data[b].q[1] - data[b].q[0]).expand(dof) / h
+        with torch.no_grad():
+            parts.append(Stepper(model).rollout(q0, p0, q0.new_zeros(()), h=h, steps=steps))
+    states = State(torch.cat([x.q for x in parts]), torch.cat([x.p for x in parts]), torch.cat([x.s for x in parts]))
+    if dof == 2:
+        noise = 0.01 * torch.randn(states.q.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+        data = Trajectories.of(data.t, states.q + noise, data.lengths, names=("x", "y"), units=("m", "m"))
+    count = round(fraction * (steps + 1))
+    history = [{"stage": "residual", "iteration": k, "cost": 30.0 * 0.5**k + 2} for k in range(12)]
+    history += [{"stage": "horizon 30", "iteration": 12 + k, "cost": 90 * 0.6**k + 5} for k in range(10)]
+    history += [{"stage": "whole trajectory", "iteration": 22 + k, "cost": 40 * 0.3**k + 4} for k in range(8)]
+    return SimpleNamespace(
+        model=model, data=data, prediction=states.q, states=states, h=h, train_lengths=(count,) * trajectories,
+        history=history, metrics={"extrapolation_rms": 0.1}, config=None, box=None,
+    )  # fmt: skip
