@@ -60,7 +60,7 @@ class Kinetic(nn.Module):
 
 
 class Potential(nn.Module):
-    """V(q) = Σ kᵢ (1 − cos qᵢ) + bᵢ sin qᵢ (angles) or Σ kᵢ qᵢ²/2 + bᵢ qᵢ (others), plus a zero-initialised network of q.
+    """V(q) = Σ kᵢ (1 − cos qᵢ) + bᵢ sin qᵢ (angles) or Σ kᵢ qᵢ²/2 + bᵢ qᵢ (others), plus a zero-initialised network.
 
     The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
     network is multiplied by the energy scale Σ speed², so that its weights are of order one.
@@ -153,6 +153,13 @@ class AffineDamping(nn.Module):
         if self.network is not None:
             g = g - self.network(_phase_features(mean, velocity, self.angles, self.scale, self.speed))
         return g * h
+
+    def departure(self, q: Tensor, v: Tensor) -> Tensor | None:
+        """The network's rate G(q, v), shape (...), or None without a network."""
+        if self.network is None:
+            return None
+        mean, velocity = midpoint_velocity_jets(q - v / 2, q + v / 2, q.new_ones(()), 1)
+        return self.network(_phase_features(mean, velocity, self.angles, self.scale, self.speed)).value
 
 
 class Correction(nn.Module):

@@ -1,4 +1,4 @@
-"""Figures of data, runs and the theory, as matplotlib `Figure` objects: nothing global, no window, no display needed."""
+"""Figures of data, runs and the theory, as matplotlib `Figure` objects: nothing global, no window, no display."""
 
 from __future__ import annotations
 

@@ -7,22 +7,21 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 from matplotlib.axes import Axes
-from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from torch import Tensor
 
 from herglotz.mechanics import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 from herglotz.models import ContactLagrangian
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
-from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, corner, label, new_figure, styled, with_unit
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
 
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-STEPS, SIZE = 8, 41
-DISTANCES = np.logspace(-5, -0.5, 19)  # of q_{k+1} from the flow, in units of the fan's width
+STEPS, SIZE = 8, 31
+NULL_STEPS = (1, 4, 8)
+DISTANCES = np.logspace(-5, -0.5, 10)  # of q_{k+1} from the flow, in units of the fan's width
 FLOOR = 1e-18  # a residual of exactly 0 is drawn here
 
 
@@ -49,26 +48,29 @@ def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: 
     everything = np.concatenate(pairs, 1)
     worst = float(np.abs(everything[0] - everything[1]).max()) if everything.size else float("nan")
     with styled():
-        figure = new_figure(5.9, 5.2, f"dS^k is the momentum: largest difference {worst:.1e}")
-        ax = figure.add_subplot()
-        ends = [everything.min(), everything.max()] if everything.size else [-1.0, 1.0]
-        ax.plot(ends, ends, color=MUTED, lw=0.9, zorder=1)
-        colors = _map().to_rgba(np.arange(1, STEPS + 1))
-        for color, (p, dS) in zip(colors, pairs, strict=True):
-            ax.plot(p, dS, "o", ms=4.5, mfc="none", mec=tuple(color), mew=1.1, zorder=2)
-        figure.colorbar(_map(), ax=ax, label="steps k", ticks=range(1, STEPS + 1), shrink=0.8)
-        label(ax, ends[1], ends[1], "y = x", MUTED, ha="right", va="top", xytext=(-8, 0))
-        corner(ax, f"max |D₂Sᵏ − p_k| = {worst:.1e}\n{everything.shape[1]} points" + _without(left_out))
+        figure = new_figure(9.2, 4.4, f"The action's derivative is the momentum, to {worst:.1e}")
+        left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.0])
         unit = fan.momentum_unit and f"{fan.momentum_unit}, mass 1"
-        ax.set(xlabel=with_unit("p_k from the stepper", unit), ylabel=with_unit("D₂Sᵏ(q_k) from the action", unit))
-        ax.set_aspect("equal", adjustable="datalim")
+        ends = [everything.min(), everything.max()] if everything.size else [-1.0, 1.0]
+        left.plot(ends, ends, color=MUTED, lw=0.9, zorder=1)
+        left.plot(*everything, "o", ms=4, mfc="none", mec=MODEL, mew=0.9, zorder=2)
+        captions(left, [(f"○ {everything.shape[1]} end points" + _without(left_out), MODEL), ("─ y = x", "#666666")])
+        left.set(xlabel=with_unit("$p_k$ from the stepper", unit), box_aspect=1)
+        left.set(ylabel=with_unit(r"$D_2S^k(q_k)$ from the action", unit))
+        for k, (p, dS) in enumerate(pairs, 1):
+            right.plot(np.full(len(p), k), np.maximum(np.abs(p - dS), FLOOR), "o", ms=3.5, color=MODEL, alpha=0.35)
+        right.axhline(max(worst, FLOOR), color=INK, lw=1.0, ls=(0, (4, 3)))
+        label(right, STEPS, max(worst, FLOOR), f"largest: {worst:.1e}", INK, ha="right", xytext=(8, 3))
+        right.set(yscale="log", ylim=(FLOOR / 3, max(30 * worst, 1e-12)), xlabel="steps k", xticks=range(1, STEPS + 1))
+        captions(right, [(f"a difference of exactly 0 is drawn at {FLOOR:.0e}", "#666666")])
+        right.set(ylabel=with_unit(r"$|D_2S^k(q_k) - p_k|$", unit), box_aspect=1)
     return figure
 
 
 def plot_hamilton_jacobi_residual(run: Run) -> Figure:
     """Draw the residual of the discrete Hamilton–Jacobi equation on the flow, and off it as the null experiment.
 
-    Left: |S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k)| over the sum of its terms' sizes, for
+    Left: |S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k)| over its terms' sizes, for
     a fan of solutions through one point. Right: the same with q_{k+1} moved to a neighbouring solution of the fan. Off
     the flow the equation is not an identity (erratum E7): the residual must grow with the square of the distance, and a
     check that stayed small there would check nothing.
@@ -78,14 +80,13 @@ def plot_hamilton_jacobi_residual(run: Run) -> Figure:
     rows = [_residual(fan, S[k], S[k + 1], S[k + 1]) for k in range(STEPS)]
     table = torch.stack(rows).double().cpu().numpy()
     distance, off_flow = _off_flow(fan, S)
-    on_flow = float(np.nanmedian(table)) if np.isfinite(table).any() else float("nan")
     worst = float(np.nanmax(table)) if np.isfinite(table).any() else float("nan")
     with styled():
         title = f"The learned action solves the discrete Hamilton–Jacobi equation: relative residual ≤ {worst:.0e}"
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, table)
-        _draw_null(right, distance, off_flow, on_flow, with_unit("distance of q_{k+1} from the flow", _length(run)))
+        _draw_null(right, distance, off_flow, worst, with_unit(r"distance of $q_{k+1}$ from the flow", _length(run)))
     return figure
 
 
@@ -101,17 +102,23 @@ def _residual(fan: Fan, S0: GeneratingFunction, S1: GeneratingFunction, near: Ge
 
 
 def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances (K, D) and median residuals (K, D) with q_{k+1} taken from a solution of slightly larger p̂0."""
+    """Distances and residuals, medians (K, D), with q_{k+1} taken from a solution of slightly larger p̂0."""
     q, p, s = fan.start
     width = float((p.amax(0) - p.amin(0)).abs().max())
+    count = len(DISTANCES)
+    shift = torch.as_tensor(DISTANCES * width, dtype=p.dtype, device=p.device).repeat_interleave(len(s))
+    moved = State(q.repeat(count, 1), p.repeat(count, 1) + shift[:, None], s.repeat(count))
     distances, residuals = [], []
-    for eps in DISTANCES:
-        moved = State(q, p + eps * width, s)
-        pairs = [(S[k], S[k + 1], fan.generating_function(k + 2, moved)) for k in (0, 3, 7)]
-        found = [(float((M.q - S1.q).norm(dim=-1).nanmedian()), _residual(fan, S0, M, S1)) for S0, S1, M in pairs]
-        distances.append([d for d, _ in found])
-        residuals.append([float(r.nanmedian()) for _, r in found])
-    return np.array(distances).T, np.array(residuals).T
+    for k in NULL_STEPS:
+        S0, S1 = (_repeated(x, count) for x in (S[k - 1], S[k]))
+        M = fan.generating_function(k + 1, moved)
+        distances.append((M.q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
+        residuals.append(_residual(fan, S0, M, S1).reshape(count, -1).nanmedian(1).values)
+    return torch.stack(distances).double().cpu().numpy(), torch.stack(residuals).double().cpu().numpy()
+
+
+def _repeated(S: GeneratingFunction, count: int) -> GeneratingFunction:
+    return GeneratingFunction(**{name: torch.cat([x] * count) for name, x in vars(S).items()})
 
 
 def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
@@ -120,42 +127,39 @@ def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
     extent = (momenta[0] - half, momenta[-1] + half, 0.5, STEPS + 0.5)
     image = ax.imshow(
         np.log10(np.maximum(table, FLOOR)), origin="lower", aspect="auto", extent=extent, cmap="cividis",
-        vmin=-18, vmax=-2, interpolation="nearest",
+        vmin=-17, vmax=-1, interpolation="nearest",
     )  # fmt: skip
     ax.set_facecolor("#DDDDDD")
-    bar = figure.colorbar(image, ax=ax, ticks=[-18, -14, -10, -6, -2])
+    bar = figure.colorbar(image, ax=ax, ticks=[-17, -13, -9, -5, -1])
     bar.set_label("log₁₀ relative residual", fontsize=9)
-    ax.set(xlabel=with_unit("initial momentum p̂₀", fan.momentum_unit and f"{fan.momentum_unit}, mass 1"))
+    ax.set(xlabel=with_unit(r"initial momentum $\hat p_0$", fan.momentum_unit and f"{fan.momentum_unit}, mass 1"))
     ax.set(ylabel="steps k", yticks=range(1, STEPS + 1), title="on the flow" + _caustics(table))
     ax.spines[:].set_visible(False)
 
 
 def _draw_null(ax: Axes, distance: np.ndarray, off_flow: np.ndarray, on_flow: float, xlabel: str) -> None:
-    for d, r, color, k in zip(distance, off_flow, (MODEL, UNSEEN, ACCENT), (1, 4, 8), strict=True):
+    names: list[tuple[str, str]] = []
+    for d, r, color, k in zip(distance, off_flow, (MODEL, UNSEEN, ACCENT), NULL_STEPS, strict=True):
         fine = np.isfinite(r) & (r > 0) & (d > 0)
         if fine.any():
             ax.plot(d[fine], r[fine], "o-", ms=3, color=color)
-            label(ax, d[fine][-1], r[fine][-1], f"k = {k}", color, ha="left", va="center", xytext=(5, 4 * k - 16))
+            names.append((f"● k = {k}", color))
     ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel="relative residual, median", title="off the flow (null)")
     ax.axhline(max(on_flow, FLOOR), color=INK, lw=1.0, ls=(0, (4, 3)))
     span = np.array([np.nanmin(distance), np.nanmax(distance)])
     middle = off_flow[0, len(DISTANCES) // 2] * (span / distance[0, len(DISTANCES) // 2]) ** 2
-    ax.plot(span, 4 * middle, color=MUTED, lw=0.9, ls=":")
-    ax.set_xlim(span[0] / 1.5, span[1] * 4)
-    ax.text(0.98, max(on_flow, FLOOR), "on the flow", transform=ax.get_yaxis_transform(), ha="right", va="bottom",
-            fontsize=8.5, color=INK)  # fmt: skip
+    ax.plot(span, 6 * middle, color=MUTED, lw=1.0, ls=":")
+    ax.set_ylim(top=300 * np.nanmax(middle))
+    captions(ax, names, "center right")
+    label(ax, span[1], max(on_flow, FLOOR), f"on the flow: at most {on_flow:.0e}", ha="right")
     slope = _slope(distance[0], off_flow[0])
-    corner(ax, f"grows like distance^{slope:.2f}\n(dotted: the square, as it must)", MUTED)
+    captions(ax, [(f"grows like distance^{slope:.2f}", MODEL), ("dotted: the square, as it must", "#666666")])
 
 
 def _slope(d: np.ndarray, r: np.ndarray) -> float:
     """Slope of log r in log d above round-off and below saturation."""
     fine = np.isfinite(r) & (r > 1e-12) & (r < 1e-3) & (d > 0)
     return float(np.polyfit(np.log(d[fine]), np.log(r[fine]), 1)[0]) if fine.sum() > 2 else float("nan")
-
-
-def _map() -> ScalarMappable:
-    return ScalarMappable(Normalize(1, STEPS), "viridis")
 
 
 def _without(count: int) -> str:

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, corner, new_figure, number, styled, with_unit
+from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, number, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -118,7 +118,7 @@ def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled:
     bottom.axhline(0.0, color=MUTED, lw=0.8, zorder=1)
     for span, color in ((slice(0, count), MODEL), (slice(count, None), UNSEEN)):
         bottom.plot(t[span], residual[span], ".", color=color, ms=3, zorder=2)
-    bottom.set_ylabel(with_unit("data − model", unit))
+    bottom.set_ylabel(with_unit("residual", unit))
     for ax in (top, bottom):
         ax.set_xlim(t[0], t[-1])
     _draw_labels(run, top, bottom, (t, residual), count, labelled)
@@ -131,11 +131,13 @@ def _draw_labels(
     t, residual = series
     unit = run.data.units[0] if len(set(run.data.units)) == 1 else ""
     split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
-    if labelled and count:
-        corner(top, "● data   ━ model, trained here", MODEL)
+    if labelled:
+        trained = [("━ model, trained here", MODEL)] if count else []
+        captions(top, [("● data", INK), *trained])
     if labelled and count < len(t):
-        corner(top, "━ model, free run", UNSEEN, x=1.0)
-    bottom.margins(y=0.3)
+        captions(top, [("━ model, free run", UNSEEN)], "upper right")
+    reach = float(np.nanmax(np.abs(residual))) if np.isfinite(residual).any() else 0.0
+    bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
         if len(part):
@@ -166,7 +168,7 @@ def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
     grid = figure.add_gridspec(math.ceil(cells / columns), columns)
     found = []
     for k in range(cells):
-        ratios = [2.6, 1.0] if rows == 2 else [1.0]
+        ratios = [2.4, 1.0] if rows == 2 else [1.0]
         inner = grid[k // columns, k % columns].subgridspec(rows, 1, height_ratios=ratios, hspace=0.03)
         found.append([figure.add_subplot(inner[r]) for r in range(rows)])
     return found

@@ -12,13 +12,14 @@ from matplotlib.figure import Figure
 
 from herglotz.plots.fan import units
 from herglotz.plots.motion import trained_mask
-from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, corner, new_figure, styled, with_unit
+from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, styled, with_unit
 from herglotz.stepping import Rollout, State, Stepper
 
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-LINES, STEPS, MOST_PANELS = 9, 60, 3
+LINES, MOST_PANELS = 13, 3
+SHORT, MOST_STEPS = 0.35, 400  # how long a rollout from the grid is drawn, in units of the typical time |q|/|p|
 NEAR_PI = 1.6  # an angle that goes further than this is drawn with ±π in sight
 
 
@@ -42,7 +43,7 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
     data, unit = run.data, units(run)[0]
     q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
     fine = np.isfinite(q) & np.isfinite(p)
-    (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine], False)
+    (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])
     for line in _background(run, (q_low, q_high), (p_low, p_high)):
         _draw_line(ax, line[:, 0, i], line[:, 1, i])
     seen = trained_mask(run).numpy()
@@ -54,24 +55,26 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
     if data.angles[i]:
         _mark_pi(ax, q_low, q_high)
     if i == 0:
-        corner(ax, "● state at a sample, trained", MODEL)
-        if bool((~seen).any()):
-            corner(ax, "● unseen", UNSEEN, x=1.0)
-        corner(ax, "○ start    → flow of the model", MUTED, y=0.0)
+        unseen = [("● unseen", UNSEEN)] if bool((~seen).any()) else []
+        captions(ax, [("○ start", INK), ("● trained", MODEL), *unseen, ("→ flow of the model", "#666666")])
 
 
 def _background(run: Run, q_range: tuple[float, float], p_range: tuple[float, float]) -> np.ndarray:
-    """(lines, STEPS + 1, 2, n) positions and momenta of rollouts; NaN after a step that failed."""
+    """(lines, K + 1, 2, n) positions and momenta of rollouts; NaN after a step that failed."""
     model, data = run.model, run.data
+    typical = (q_range[1] - q_range[0]) / (p_range[1] - p_range[0])
+    duration = max(float(one.t[-1] - one.t[0]) for one in data)
     starts = [x[list(data.offsets)].detach() for x in run.states]
     if data.dof == 1 and not model.s_enters_motion:
         like = run.states.q
         q = torch.linspace(*q_range, LINES, dtype=like.dtype, device=like.device)
         p = torch.linspace(*p_range, LINES, dtype=like.dtype, device=like.device)
         grid = torch.cartesian_prod(q, p)
-        starts = [grid[:, :1], grid[:, 1:], torch.zeros_like(grid[:, 0])]
+        starts, duration = [grid[:, :1], grid[:, 1:], torch.zeros_like(grid[:, 0])], SHORT * typical
+    steps = max(3, min(MOST_STEPS, round(duration / run.h)))
+    h = min(run.h, duration / steps)
     with torch.no_grad():
-        found: Rollout = Stepper(model).rollout(*State(*starts), h=run.h, steps=STEPS)
+        found: Rollout = Stepper(model).rollout(*State(*starts), h=h, steps=steps)
     return torch.stack([found.q, found.p], -2).double().cpu().numpy()
 
 
@@ -81,24 +84,26 @@ def _draw_line(ax: Axes, q: np.ndarray, p: np.ndarray) -> None:
     q, p = q[fine], p[fine]
     if len(q) < 2:
         return
-    ax.plot(q, p, color=MUTED, lw=0.5, alpha=0.55, zorder=1)
-    at = min(2, len(q) - 2)
+    ax.plot(q, p, color=MUTED, lw=0.6, alpha=0.7, zorder=1)
+    at = len(q) - 2 if len(q) < 12 else len(q) // 4
     ax.annotate(
         "",
         (q[at + 1], p[at + 1]),
         (q[at], p[at]),
-        arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 0.5, "mutation_scale": 6, "alpha": 0.8},
+        arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 0.6, "mutation_scale": 5, "alpha": 0.8}
+        | {"shrinkA": 0, "shrinkB": 0},
         annotation_clip=True,
         zorder=1,
     )
 
 
-def _limits(x: np.ndarray, angle: bool) -> tuple[float, float]:
+def _limits(x: np.ndarray, angle: bool | None = None) -> tuple[float, float]:
     low, high = (float(x.min()), float(x.max())) if len(x) else (-1.0, 1.0)
+    top = 0.08 if angle is not None else 0.18  # room for the captions above the momenta
     if angle and max(-low, high) > NEAR_PI:
         low, high = min(low, -math.pi), max(high, math.pi)
-    margin = 0.08 * (high - low) or 1.0
-    return low - margin, high + margin
+    size = (high - low) or 1.0
+    return low - 0.08 * size, high + top * size
 
 
 def _mark_pi(ax: Axes, low: float, high: float) -> None:

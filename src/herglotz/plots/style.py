@@ -10,6 +10,7 @@ from typing import Any
 import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
 from herglotz.data.files import PathLike, write_atomically
 
@@ -19,7 +20,7 @@ INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", 
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
 SHADE = "#FBEDE3"  # behind what was not trained on
 
-STYLE: dict[str, Any] = {
+STYLE: Any = {
     "figure.dpi": DPI,
     "figure.facecolor": "white",
     "figure.constrained_layout.use": True,
@@ -56,7 +57,7 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
-    """Return an empty figure (inches) with its message on top; no pyplot, so no window and no global list of figures."""
+    """Return an empty figure (inches) with its message on top; no pyplot: no window, no global list of figures."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
     return figure
@@ -77,15 +78,13 @@ def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: 
     ax.annotate(text, (x, y), textcoords="offset points", color=color, bbox=box, **options)
 
 
-def corner(ax: Axes, text: str, color: str = INK, *, x: float = 0.0, y: float = 1.0, **options: Any) -> None:
-    """Write `text` inside a corner (axes fractions, 0 or 1 each)."""
-    options = {"fontsize": 8.5, "ha": "left" if x < 0.5 else "right", "va": "top" if y > 0.5 else "bottom"} | options
-    shift = (5 if x < 0.5 else -5, -5 if y > 0.5 else 5)
-    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0}
-    place: Any = (x, y)
-    ax.annotate(
-        text, place, xycoords="axes fraction", textcoords="offset points", xytext=shift, color=color, bbox=box, **options
-    )
+def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left") -> None:
+    """Write (text, colour) entries in one line inside the panel, each in the colour of what it names."""
+    areas = [TextArea(text, textprops={"color": color, "fontsize": 8.5}) for text, color in entries]
+    box = AnchoredOffsetbox(where, child=HPacker(children=list(areas), pad=0, sep=10), pad=0.35, borderpad=0.2)
+    box.patch.set(facecolor="white", edgecolor="none", alpha=0.85)
+    box.set_zorder(5)
+    ax.add_artist(box)
 
 
 def with_unit(name: str, unit: str) -> str:

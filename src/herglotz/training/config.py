@@ -37,8 +37,8 @@ class FitConfig:
     iterations
         Bound on the iterations of the residual objectives, and on those of each stage of trajectory fitting.
     departures
-        Prior strengths τ tried for the potential's departure from its baseline; the evidence chooses. One value
-        fixes it.
+        Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
+        value fixes it.
     potential_width, damping_width, correction_width
         Hidden units of the networks; the correction is used by the residual objectives, the potential's network by
         trajectory fitting.

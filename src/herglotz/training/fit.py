@@ -144,7 +144,8 @@ def _fit_by_trajectory(
 ) -> _Fitted:
     found = fit_trajectories(model, train, base, sigma, config.departures, config.iterations, stages)
     found.problem.flat.set(found.theta)
-    notes = {"departure": found.departure, "log_evidence": found.evidence, "reason": found.result.reason}
+    held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
+    notes = {"departure": found.departure, "held_out_rms": held_out, "reason": found.result.reason}
     return _Fitted(model, found, "trajectory", found.sigma, notes)
 
 

@@ -8,6 +8,7 @@ from torch.func import functional_call, jacrev
 
 from herglotz.models import ContactLagrangian
 from herglotz.models.network import position_jet
+from herglotz.models.terms import AffineDamping
 from herglotz.training.flat import FlatModel
 
 
@@ -16,6 +17,7 @@ class Prior:
 
     * The force of the potential's network, −∂V_net/∂q, has over the range of the data an RMS of N(0, (τ F)²), with F
       the RMS force of the baseline: `departure` = τ. (Many grid points share that one residual's weight.)
+    * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
     * Every network weight is N(its start, `weight`²): weak, it only keeps unseen directions from drifting. (Centred
       at 0 it would switch the network off: behind a zero-initialised last layer nothing else holds the first one.)
     * The damping rate and the drag coefficients (per unit of position) are N(their start, `rate_spread`²).
@@ -30,21 +32,20 @@ class Prior:
         departure: float | None,
         weight: float = 10.0,
         rate_spread: float = 1.0,
-        grid: int = 32,
+        grid: int = 64,
     ):
         self.flat = FlatModel(model)
         theta = self.flat.get()
-        self.departure = departure if model.potential.network is not None else None
+        self.departure = departure
         networks = ("potential.network", "damping.network", "correction")
         self.weight_index = torch.cat([self.flat.index(prefix) for prefix in networks])
         self.rate_index = torch.cat([self.flat.index("damping.rate"), self.flat.index("damping.drag")])
         self.start, self.rate_spread, self.weight = theta, rate_spread, weight
-        n = len(low)
-        if n == 1:
-            self.grid = torch.linspace(0, 1, grid, dtype=low.dtype, device=low.device)[:, None] * (high - low) + low
-        else:
-            points = torch.quasirandom.SobolEngine(n, seed=0).draw(grid * n).to(low)
-            self.grid = points * (high - low) + low
+        unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
+        speed = low.new_tensor(model.config.speed)
+        self.grid = unit[:, : len(low)] * (high - low) + low
+        self.velocity = (2 * unit[:, len(low) :] - 1) * speed
+        self.typical_rate = float((speed / low.new_tensor(model.config.scale)).min())
         force = float(self._baseline_force().square().mean().sqrt())
         self.force = force if force > 0 else 1.0
 
@@ -53,8 +54,7 @@ class Prior:
         moved = theta - self.start
         parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
         if self.departure is not None:
-            force = self._network_force(theta)
-            parts.append(force.reshape(-1) / (self.departure * self.force * force.numel() ** 0.5))
+            parts += [x / (self.departure * x.numel() ** 0.5) for x in self._departures(theta)]
         return torch.cat(parts)
 
     def cost(self, theta: Tensor) -> Tensor:
@@ -66,35 +66,28 @@ class Prior:
         r, J = self.residuals(theta), jacrev(self.residuals)(theta)
         return r.square().sum() / 2, J.T @ J, J.T @ r
 
-    def log_determinant(self, theta: Tensor) -> Tensor:
-        """log det of the prior's precision over the parameters it speaks about (for the evidence)."""
-        J = jacrev(self.residuals)(theta)
-        A = (J.T @ J)[self._covered][:, self._covered]
-        return torch.linalg.slogdet(A).logabsdet
-
-    @property
-    def _covered(self) -> Tensor:
-        return torch.cat([self.weight_index, self.rate_index])
-
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():
             return self.flat.model.potential.baseline(position_jet(self.grid, 1)).gradient
 
-    def _network_force(self, theta: Tensor) -> Tensor:
-        return functional_call(_Departure(self.flat.model), self._prefixed(theta), (self.grid,))
+    def _departures(self, theta: Tensor) -> list[Tensor]:
+        """Network outputs on the grid, each relative to its natural size."""
+        named = {f"model.{name}": value for name, value in self.flat.unflatten(theta).items()}
+        force, rate = functional_call(_Departures(self.flat.model), named, (self.grid, self.velocity))
+        parts = [] if force is None else [force.reshape(-1) / self.force]
+        return parts if rate is None else [*parts, rate / self.typical_rate]
 
-    def _prefixed(self, theta: Tensor) -> dict[str, Tensor]:
-        return {f"model.{name}": value for name, value in self.flat.unflatten(theta).items()}
 
-
-class _Departure(torch.nn.Module):
-    """The network part of the potential's gradient, as a module so that functional_call reaches it."""
+class _Departures(torch.nn.Module):
+    """Force of the potential's network and rate of the damping's, as a module so that functional_call reaches them."""
 
     def __init__(self, model: ContactLagrangian):
         super().__init__()
         self.model = model
 
-    def forward(self, q: Tensor) -> Tensor:
+    def forward(self, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
         jet = self.model.potential.departure(position_jet(q, 1))
-        assert jet is not None
-        return jet.gradient
+        force = None if jet is None else jet.gradient
+        damping = self.model.damping
+        rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None
+        return force, rate

@@ -143,6 +143,17 @@ class ShootingProblem:
         """q_model − q_data at every sample, (N', n), in units of q."""
         return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
 
+    def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples."""
+        Z = self._sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] / self.sigma
+        order = self.grid.sample.argsort()
+        segment = self.grid.node // (self.grid.h.shape[1] + 1)
+        J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
+        J[..., : self.P] = Z[..., : self.P]
+        for i in range(self.d):
+            J[torch.arange(len(order)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
+        return (self.misfit(path) / self.sigma)[order].flatten(), J[order].flatten(0, 1)
+
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
         fit = (x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]) / self.sigma

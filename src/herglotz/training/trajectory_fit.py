@@ -1,4 +1,4 @@
-"""Fitting noisy trajectories: growing segments, then the prior strength by evidence."""
+"""Fitting noisy trajectories: growing segments, then the strength of the prior by held-out blocks of time."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from herglotz.data import Trajectories
 from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
+from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.grid import segment_grid
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.lifted import Path
@@ -31,7 +32,7 @@ class TrajectoryFit:
     path: Path
     sigma: float  # noise of q
     departure: float | None  # prior strength, where the model has a potential network
-    evidence: dict[str, float]  # log evidence of every strength tried
+    held_out: dict[float, Tensor]  # error of every fold, for every strength tried
     result: OptimiserResult
 
 
@@ -87,7 +88,8 @@ def fit_trajectories(
     """Fit parameters and states to positions (or, `frozen`, the states alone).
 
     Segments grow from 20 steps to whole trajectories, each stage started from the states of the one before. Then every
-    prior strength is fitted in turn, the noise is re-estimated, and the strength with the largest Laplace evidence wins.
+    prior strength is fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted
+    with. The strongest prior whose held-out error is not beaten beyond its spread wins.
 
     Returns
     -------
@@ -125,38 +127,32 @@ def _choose_departure(
     theta: Tensor,
     last: tuple[ShootingProblem, Path, OptimiserResult],
 ) -> TrajectoryFit:
-    problem, path, _ = last
-    grid, sigma = problem.grid, _noise(problem, path, len(theta))
+    problem, path, result = last
+    grid = problem.grid
+    first = TrajectoryFit(theta, problem, path, _noise(problem, path), departures[0], {}, result)
     fits: list[TrajectoryFit] = []
-    evidence: dict[str, float] = {}
-    for departure in departures:
-        start_path = path if not fits else fits[-1].path
-        start_theta = theta if not fits else fits[-1].theta
-        for round_ in (1, 2):  # the second with the noise that the first one found
-            problem = ShootingProblem(model, data, grid, sigma=sigma, prior=make_prior(model, base, departure))
-            states = problem.states_at(start_path, grid.start_sample)
-            problem.path = start_path
-            name = f"prior {departure:g}, round {round_}"
-            result, new_theta = _optimise(problem, start_theta, states, name, iterations, stages, False)
-            x = result.x
-            cost, A, _ = problem.normal_equations(x)
-            new_path = problem.path
-            if new_path is None or not bool(torch.isfinite(cost)):
-                break
-            start_path, start_theta = new_path, new_theta
-            prior_A = problem.prior.normal_equations(new_theta)[1] if problem.prior is not None else A * 0
-            effective = _effective_parameters(A, prior_A)
-            value = _log_evidence(problem, new_theta, float(cost), A)
-            sigma_new = _noise(problem, new_path, effective)
-            fit = TrajectoryFit(new_theta, problem, new_path, sigma, departure, evidence, result)
-            sigma = sigma_new
-        else:
-            fits.append(fit)
-            evidence[f"{departure:g}"] = value
+    held_out: dict[float, Tensor] = {}
+    previous = first
+    # The weakest prior twice: the first round finds the noise, which then stays the same for all.
+    weakest = max(departures)
+    for number, departure in enumerate([weakest, *sorted(departures, reverse=True)]):
+        sigma = _noise(previous.problem, previous.path) if number <= 1 else previous.sigma
+        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=make_prior(model, base, departure))
+        problem.path = previous.path
+        states = problem.states_at(previous.path, grid.start_sample)
+        name = f"prior {departure:g}" if number else "noise"
+        result, new_theta = _optimise(problem, previous.theta, states, name, iterations, stages, False)
+        cost, A, _ = problem.normal_equations(result.x)
+        if problem.path is None or not bool(torch.isfinite(cost)):
+            continue
+        previous = TrajectoryFit(new_theta, problem, problem.path, sigma, departure, held_out, result)
+        if number:
+            fits.append(previous)
+            held_out[departure] = held_out_errors(problem, problem.path, new_theta, A)
     if not fits:
-        problem, path, result = last
-        return TrajectoryFit(theta, problem, path, sigma, departures[0], evidence, result)
-    return max(fits, key=lambda f: evidence[f"{f.departure:g}"])
+        return first
+    chosen = simplest_not_beaten(held_out)
+    return next(f for f in fits if f.departure == chosen)
 
 
 def _optimise(
@@ -191,27 +187,6 @@ def _first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
     return problem.states(q, p)
 
 
-def _noise(problem: ShootingProblem, path: Path, used: float) -> float:
-    """σ of the residuals, with the degrees of freedom that the fit used up taken off (never more than half)."""
-    misfit = problem.misfit(path)
-    free = max(misfit.numel() - used, misfit.numel() / 2)
-    return float((misfit.square().sum() / free).sqrt())
-
-
-def _effective_parameters(A: Tensor, prior_A: Tensor) -> float:
-    """tr(A⁻¹ A_data): how many parameters the data, not the prior, decided."""
-    P = len(prior_A)
-    data_A = A.clone()
-    data_A[:P, :P] -= prior_A
-    return float(torch.linalg.lstsq(A.double(), data_A.double()).solution.trace())
-
-
-def _log_evidence(problem: ShootingProblem, theta: Tensor, cost: float, A: Tensor) -> float:
-    """Laplace's log evidence of the prior strength, up to a constant shared by all strengths.
-
-    −cost − N log σ + ½ log det Λ_prior − ½ log det A, over parameters and states (MacKay 1992).
-    """
-    observations = problem.grid.sample.numel() * problem.n
-    prior = 0.0 if problem.prior is None else float(problem.prior.log_determinant(theta))
-    posterior = float(torch.linalg.slogdet(A.double()).logabsdet)
-    return -cost - observations * math.log(problem.sigma) + prior / 2 - posterior / 2
+def _noise(problem: ShootingProblem, path: Path) -> float:
+    """RMS of the residuals, in units of q."""
+    return float(problem.misfit(path).square().mean().sqrt())

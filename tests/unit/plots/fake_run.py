@@ -17,7 +17,10 @@ def fake_run(trajectories: int = 1, steps: int = 60, level: str = "linear", dof:
     rate = 0.201
     config = ModelConfig(angles=(True,), level=level, rate=rate, potential_width=0)
     if dof == 2:
-        config = ModelConfig((False,) * 2, level, (1.0,) * 2, (1.0,) * 2, (1.0, 2.0), rate, potential_width=0)
+        config = ModelConfig(
+            angles=(False,) * 2, level=level, scale=(1.0,) * 2, speed=(1.0,) * 2, stiffness=(1.0, 2.0),
+            tilt=(0.0,) * 2, rate=rate, potential_width=0,
+        )  # fmt: skip
     model = ContactLagrangian(config)
     parts = []
     for b in range(trajectories):

@@ -1,0 +1,113 @@
+"""What the subcommands share: number types, checks of outputs before any work, tables and JSON."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from herglotz.errors import InputError
+
+
+def positive(text: str) -> float:
+    """Parse a finite number > 0 (argparse type)."""
+    value = finite(text)
+    if value <= 0:
+        raise argparse.ArgumentTypeError(f"must be > 0, got {text}")
+    return value
+
+
+def finite(text: str) -> float:
+    """Parse a finite number (argparse type)."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"must be a number, got {text!r}") from None
+    if not math.isfinite(value):
+        raise argparse.ArgumentTypeError(f"must be finite, got {text}")
+    return value
+
+
+def count(text: str) -> int:
+    """Parse a whole number >= 0 (argparse type)."""
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"must be a whole number >= 0, got {text!r}")
+    return int(text)
+
+
+def check_output_file(path: Path, suffixes: Sequence[str]) -> None:
+    """Raise unless a file of this name could be written now; nothing is left behind.
+
+    Raises
+    ------
+    InputError
+        If the extension is not one of `suffixes`, the folder does not exist or cannot be written to, or the path is a
+        folder.
+    """
+    if path.suffix.lower() not in suffixes:
+        raise InputError(f"--out {path}: the name must end in {' or '.join(suffixes)}")
+    if path.is_dir():
+        raise InputError(f"--out {path}: is a folder; name a file in it")
+    if not path.parent.is_dir():
+        raise InputError(f"--out {path}: the folder {path.parent} does not exist; make it first")
+    _probe(path, path.parent)
+
+
+def check_output_folder(path: Path) -> None:
+    """Raise unless this folder, or the missing part of its path, could be made and written to; nothing is left behind.
+
+    Raises
+    ------
+    InputError
+        If a file is in the way, or the folder cannot be written to.
+    """
+    existing = path
+    while not existing.exists() and existing != existing.parent:
+        existing = existing.parent
+    if not existing.is_dir():
+        raise InputError(f"--out {path}: {existing} is a file, not a folder; choose another folder")
+    _probe(path, existing)
+
+
+def _probe(path: Path, folder: Path) -> None:
+    try:
+        with tempfile.NamedTemporaryFile(dir=folder, prefix=".herglotz-"):
+            pass
+    except OSError as error:
+        raise InputError(f"--out {path}: cannot be written ({error.strerror}); choose another place") from error
+
+
+def is_run(path: Path) -> bool:
+    """Whether a path is a folder, and so must be a run."""
+    return path.is_dir()
+
+
+def is_exported(path: Path) -> bool:
+    """Whether a path is named like an exported model."""
+    return path.suffix.lower() == ".pt2"
+
+
+def print_json(values: dict[str, Any]) -> None:
+    """Print one JSON object; NaN and infinities, which JSON lacks, become null."""
+    print(json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False))
+
+
+def print_table(rows: Sequence[tuple[str, str]]) -> None:
+    """Print names and values in two aligned columns."""
+    width = max(len(name) for name, _ in rows)
+    for name, value in rows:
+        print(f"  {name:<{width}}  {value}")
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {str(k): _plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(v) for v in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,147 @@
+"""`herglotz fit`: train a model on measured positions."""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from herglotz.cli.common import check_output_folder, count, finite, print_json, print_table
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+LEVELS = ("linear", "affine")  # copies, so that help does not import PyTorch; a test compares them
+OBJECTIVES = ("auto", "residual", "trajectory", "raw")
+OPTIMISERS = ("lm", "adam")
+DTYPES = ("float64", "float32")
+DESCRIPTION = """\
+Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
+Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz and figures/.
+
+DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q) or a
+Schmidt & Lipson .txt. Steps may differ and samples may be missing.
+
+example:
+  herglotz fit pendulum.csv --out runs/pendulum
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("fit", help="train a model on measured positions", description=DESCRIPTION)
+    parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
+    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
+    parser.add_argument(
+        "--level", choices=LEVELS, default="linear",
+        help="linear: one damping rate. affine: damping depends on position and velocity (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--objective", choices=OBJECTIVES, default="auto",
+        help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. auto: measure "
+        "the noise and choose. raw: the residual that collapses, for demonstration (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--optimiser", choices=OPTIMISERS, default="lm",
+        help="lm: Levenberg–Marquardt. adam: for residual and raw only (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--train-fraction", type=finite, default=0.667, metavar="F",
+        help="part of every trajectory, in time, to train on, 0 < F <= 1 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=count, default=0, help="of the initial weights (default %(default)s)")
+    parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
+    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default %(default)s)")
+    parser.add_argument(
+        "--angles", metavar="NAMES",
+        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad)",
+    )  # fmt: skip
+    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint that an interrupted fit left")
+    parser.add_argument("--json", action="store_true", help="print the metrics as JSON, and nothing else")
+    parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read, check the output, train, save, draw, report."""
+    out: Path = arguments.out
+    check_output_folder(out)
+    if (out / "model.pt").exists() and not arguments.resume:
+        raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
+
+    from herglotz.data import load
+    from herglotz.training import FitConfig, fit, load_run, save_run
+
+    config = FitConfig(
+        level=arguments.level, objective=arguments.objective, optimiser=arguments.optimiser,
+        train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
+    )  # fmt: skip
+    data = load(arguments.data, angles=parse_angles(arguments.angles))
+    made = _make(out)
+    try:
+        save_run(fit(data, config, out=out, resume=arguments.resume), out)
+    except KeyboardInterrupt:
+        if (out / "checkpoint.pt").exists():
+            raise KeyboardInterrupt("; the same command with --resume goes on") from None
+        raise
+    finally:
+        for folder in made:  # innermost first; only what is empty, so only after a failure
+            with suppress(OSError):
+                folder.rmdir()
+    result = load_run(out)  # what later commands will see, and on the cpu
+    drawn = _draw(result, out) if not arguments.no_plots else None
+    if arguments.json:
+        print_json(result.metrics)
+    else:
+        report(result, out, drawn)
+    return 0
+
+
+def parse_angles(text: str | None) -> list[str] | None:
+    """`none` → [], `a,b` → [a, b], nothing → None: what the file says."""
+    if text is None:
+        return None
+    return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
+
+
+def report(result: Run, out: Path, drawn: Path | None) -> None:
+    """Print what was reached, for people, and what to do next."""
+    m, data = result.metrics, result.data
+    unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
+    kept, total = sum(result.train_lengths), data.samples
+    rows = [
+        ("data", data.summary()),
+        ("trained on", f"{kept} of {total} samples by the {m.get('objective')} objective, {m.get('level')} level"),
+        ("extrapolation RMS", f"{_show(m.get('extrapolation_rms'), unit)}  free run over the unseen samples"),
+        ("training RMS", _show(m.get("train_rms"), unit)),
+        ("one-step RMS", _show(m.get("one_step_rms"), unit)),
+        ("damping rate", _show(m.get("rate"), f"per {data.time_unit}")),
+        ("time", _show(m.get("seconds"), "s")),
+    ]
+    print_table([row for row in rows if not row[1].startswith("None")])
+    if m.get("extrapolation_status") not in (None, "ok"):
+        print(f"Note: {m['extrapolation_status']}")
+    if drawn is not None:
+        print(f"Figures: {drawn}")
+    print(f"Next: herglotz verify {out}")
+    print(f"      herglotz export {out} --out {out.name}.pt2")
+
+
+def _show(value: Any, unit: str) -> str:
+    return "None" if value is None else f"{value:.3g} {unit}".rstrip()
+
+
+def _draw(result: Run, out: Path) -> Path:
+    from herglotz.plots import save_figures
+
+    save_figures(result, out / "figures")
+    return out / "figures"
+
+
+def _make(folder: Path) -> list[Path]:
+    """Make a folder with its parents; return those that were missing, innermost first."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    return missing

@@ -1,0 +1,57 @@
+"""`herglotz plot`: figures of a run, or of data alone."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from herglotz.cli.common import check_output_folder, is_run
+
+DESCRIPTION = """\
+Draw figures as PNG. Of a RUN: trajectory, phase portrait, momentum against the generating function,
+Hamilton–Jacobi residual, training. Of DATA: its samples.
+
+examples:
+  herglotz plot runs/pendulum
+  herglotz plot pendulum.csv --out figures
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("plot", help="draw a run or data", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN|DATA", type=Path, help="folder of a run, or a data file")
+    parser.add_argument(
+        "--out", type=Path, metavar="FOLDER",
+        help="folder for the figures, made if missing (default: RUN/figures, or the current folder for DATA)",
+    )  # fmt: skip
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Draw and say where."""
+    source: Path = arguments.source
+    folder = arguments.out or (source / "figures" if is_run(source) else Path())
+    check_output_folder(folder)
+    if is_run(source):
+        from herglotz.training import load_run
+
+        result = load_run(source)
+
+        from herglotz.plots import save_figures
+
+        written = save_figures(result, folder)
+    else:
+        from herglotz.data import load
+
+        data = load(source)
+
+        from herglotz.plots import plot_data, save_figure
+
+        figure = plot_data(data)
+        folder.mkdir(parents=True, exist_ok=True)
+        written = [folder / f"{source.stem}.png"]
+        save_figure(figure, written[0])
+    for path in written:
+        print(path)
+    return 0

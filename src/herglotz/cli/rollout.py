@@ -1,0 +1,162 @@
+"""`herglotz rollout`: step a model and write the motion."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from herglotz.cli.common import check_output_file, count, finite, is_exported, positive, print_json
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.export import ExportedStepper
+    from herglotz.stepping import Rollout, State, Stepper
+
+DESCRIPTION = """\
+Step a model K times and write t, q, s and p as .csv or .npz. It starts from the last state that the fit
+trained on, or from --q0 and --p0. The model's mass is 1 (first coordinate), so p is close to a velocity there.
+
+examples:
+  herglotz rollout runs/pendulum --steps 200 --out future.csv
+  herglotz rollout pendulum.pt2 --steps 200 --h 0.05 --q0 1.2 --p0 0 --out motion.csv
+"""
+
+
+@dataclass(frozen=True)
+class Source:
+    """A model that can be stepped, and what its file knows."""
+
+    stepper: Stepper | ExportedStepper
+    start: State | None
+    t0: float
+    h: float
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    angles: tuple[bool, ...]
+    time_unit: str
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("rollout", help="step a model and write the motion", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN|FILE.pt2", type=Path, help="folder of a run, or an exported model")
+    parser.add_argument("--steps", required=True, type=count, metavar="K", help="number of steps, at least 2")
+    parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
+    parser.add_argument("--h", type=positive, help="step, in the data's unit of time (default: the model's)")
+    parser.add_argument("--q0", type=finite, nargs="+", help="initial position, one number a coordinate")
+    parser.add_argument("--p0", type=finite, nargs="+", help="initial momentum, one number a coordinate (with --q0)")
+    parser.add_argument("--s0", type=finite, help="initial action (default 0 with --q0, else the fitted one)")
+    parser.add_argument(
+        "--trajectory", type=count, default=0, metavar="B",
+        help="trajectory of the run whose last fitted state to start from, counted from 0 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print a summary as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Read the model, step it, write the motion."""
+    check_output_file(arguments.out, (".csv", ".npz"))
+    if arguments.steps < 2:
+        raise InputError(f"--steps must be at least 2, got {arguments.steps}")
+    if (arguments.q0 is None) != (arguments.p0 is None):
+        raise InputError("--q0 and --p0 go together; give both, or neither to start from the last fitted state")
+
+    import torch
+
+    from herglotz.data import Trajectories, save
+
+    source = read_source(arguments.source, arguments.trajectory)
+    start, t0 = _start(arguments, source)
+    h = source.h if arguments.h is None else arguments.h
+    began = time.perf_counter()
+    with torch.no_grad():
+        found = source.stepper.rollout(*start, h=h, steps=arguments.steps)
+    seconds = time.perf_counter() - began
+    _check(found, h)
+    motion = Trajectories.of(
+        t0 + h * torch.arange(arguments.steps + 1, dtype=torch.float64), found.q.double(), names=source.names,
+        units=source.units, angles=source.angles, s=found.s.double(), p=found.p.double(), time_unit=source.time_unit,
+        source=str(arguments.source),
+    )  # fmt: skip
+    save(arguments.out, motion)
+    last = found.final
+    summary = {
+        "file": str(arguments.out),
+        "steps": arguments.steps,
+        "h": h,
+        "seconds": seconds,
+        "largest_residual": float(found.residual.max()),
+        "final": {"q": last.q.tolist(), "p": last.p.tolist(), "s": float(last.s), "sigma": float(found.sigma[-1])},
+    }
+    if arguments.json:
+        print_json(summary)
+    else:
+        end = ", ".join(f"{name} = {float(x):.6g}" for name, x in zip(source.names, last.q, strict=True))
+        per_step = 1e6 * seconds / arguments.steps
+        print(f"{arguments.out}: {arguments.steps} steps of {h:g} {source.time_unit}, {per_step:.0f} µs each; {end}")
+    return 0
+
+
+def read_source(path: Path, trajectory: int) -> Source:
+    """A run or an exported model, as something to step.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or has no such trajectory.
+    """
+    import torch
+
+    from herglotz.stepping import State
+
+    if not is_exported(path):
+        from herglotz.cli.states import last_fitted
+        from herglotz.training import load_run
+
+        run_, data = (found := load_run(path)), found.data
+        start = last_fitted(run_, trajectory)
+        t0 = float(data.t[data.offsets[trajectory] + max(run_.train_lengths[trajectory], 1) - 1])
+        return Source(run_.stepper, start, t0, run_.h, data.names, data.units, data.angles, data.time_unit)
+
+    from herglotz.export import load_pt2
+
+    stepper = load_pt2(path)
+    m, n = stepper.metadata, stepper.dof
+    stored = m.get("start")
+    start = stored and State(*(torch.tensor(stored[name], dtype=stepper.dtype) for name in "qps"))
+    names = tuple(m.get("names") or (["q"] if n == 1 else [f"q{i}" for i in range(n)]))
+    angles = tuple(m.get("angles") or [False] * n)
+    units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
+    return Source(stepper, start, 0.0, stepper.h, names, units, angles, m.get("time_unit", "s"))
+
+
+def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
+    """The state to start from, in the model's dtype, and its time."""
+    import torch
+
+    from herglotz.stepping import State
+
+    like, n = source.start, len(source.names)
+    if arguments.q0 is None:
+        if like is None:
+            raise InputError(f"{arguments.source}: records no state to start from; give --q0 and --p0")
+        s = like.s if arguments.s0 is None else torch.full_like(like.s, arguments.s0)
+        return State(like.q, like.p, s), source.t0
+    for name in ("q0", "p0"):
+        given = getattr(arguments, name)
+        if len(given) != n:
+            raise InputError(f"--{name} needs {n} number(s), one a coordinate ({', '.join(source.names)}), got {given}")
+    dtype = getattr(source.stepper, "dtype", None) or (torch.float64 if like is None else like.q.dtype)
+    values = (arguments.q0, arguments.p0, arguments.s0 or 0.0)
+    return State(*(torch.tensor(x, dtype=dtype) for x in values)), 0.0
+
+
+def _check(found: Rollout, h: float) -> None:
+    """Raise if a step failed: a motion that ends early is not written."""
+    if not bool(found.ok):
+        k = int((found.status != 0).nonzero()[0])
+        raise InputError(f"step {k + 1} of h = {h:g} has no solution; take a smaller --h or another start")

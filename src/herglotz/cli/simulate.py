@@ -1,0 +1,98 @@
+"""`herglotz simulate`: sampled motions of a scene with a known answer."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.errors import InputError
+
+DESCRIPTION = """\
+Sample motions of a scene whose answer is known, from random initial positions and velocities, and write them
+as .csv or .npz for `herglotz fit`. The same seed gives the same file.
+
+Scenes: damped_oscillator, damped_pendulum, parachute.
+
+example:
+  herglotz simulate damped_pendulum --out pendulum.csv --steps 160 --h 0.1 --noise 0.003 --param gamma=0.2
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("simulate", help="write data of a scene with a known answer", description=DESCRIPTION)
+    parser.add_argument("scene", metavar="SCENE", help="name of the scene")
+    parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
+    parser.add_argument(
+        "--trajectories", type=count, default=4, metavar="N", help="number of motions (default %(default)s)"
+    )
+    parser.add_argument(
+        "--steps", type=count, default=100, metavar="K", help="steps of each, so K + 1 samples (default %(default)s)"
+    )
+    parser.add_argument(
+        "--h", type=positive, metavar="H", help="time between samples, in the scene's unit of time (default: its own)"
+    )
+    parser.add_argument(
+        "--noise", type=finite, default=0.0, metavar="S",
+        help="standard deviation of Gaussian noise on the positions, in their unit (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--gaps", type=count, default=0, metavar="G",
+        help="runs of 1 to 3 samples deleted from each motion (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--seed", type=count, default=0, help="of starts, noise and gaps (default %(default)s)")
+    parser.add_argument(
+        "--param", action="append", default=[], metavar="NAME=VALUE",
+        help="parameter of the scene, for example gamma=0.3; may come more than once",
+    )  # fmt: skip
+    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Simulate and write."""
+    check_output_file(arguments.out, (".csv", ".npz"))
+    parameters = parse_parameters(arguments.param)
+
+    from herglotz.data import save, simulate
+    from herglotz.systems import scene
+
+    system = scene(arguments.scene, **parameters)
+    h = system.h if arguments.h is None else arguments.h
+    data = simulate(
+        system, trajectories=arguments.trajectories, steps=arguments.steps, h=h, noise=arguments.noise,
+        gaps=arguments.gaps, seed=arguments.seed,
+    )  # fmt: skip
+    save(arguments.out, data)
+    if arguments.json:
+        print_json(
+            {
+                "file": str(arguments.out), "scene": system.name, "parameters": dict(system.parameters), "h": h,
+                "trajectories": len(data), "samples": data.samples, "seed": arguments.seed, "sha256": data.digest(),
+            }
+        )  # fmt: skip
+    else:
+        print(data.summary())
+        print(f"Next: herglotz fit {arguments.out} --out runs/{arguments.out.stem}")
+    return 0
+
+
+def parse_parameters(texts: list[str]) -> dict[str, float]:
+    """Parse `name=value` arguments.
+
+    Raises
+    ------
+    InputError
+        If one has no = or its value is not a number.
+    """
+    parameters = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        try:
+            parameters[name.strip()] = float(value)
+        except ValueError:
+            equals = ""
+        if not equals or not name.strip():
+            raise InputError(f"--param {text!r} is not NAME=VALUE with a number; for example --param gamma=0.3")
+    return parameters

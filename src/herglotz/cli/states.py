@@ -1,0 +1,26 @@
+"""States to start from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from herglotz.errors import InputError
+from herglotz.stepping import State
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+
+def last_fitted(run: Run, trajectory: int) -> State:
+    """The state at the last sample of a trajectory that was trained on, with shapes (n,), (n,), ().
+
+    Raises
+    ------
+    InputError
+        If there is no such trajectory.
+    """
+    data = run.data
+    if not 0 <= trajectory < len(data):
+        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
+    row = data.offsets[trajectory] + max(run.train_lengths[trajectory], 1) - 1
+    return State(*(x[row].detach() for x in run.states))

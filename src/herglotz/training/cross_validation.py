@@ -1,0 +1,56 @@
+"""How well a fitted trajectory predicts blocks of time it was not fitted to, without fitting again."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.training.lifted import Path
+from herglotz.training.shooting import ShootingProblem
+
+FOLDS = 5
+
+
+def held_out_errors(
+    problem: ShootingProblem,
+    path: Path,
+    theta: Tensor,  # (P,)
+    A: Tensor,  # JᵀJ of the whole problem at the fit, prior included
+) -> Tensor:
+    """RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
+
+    Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
+    there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
+    deterministic model misses comes in long runs: single left-out samples, and a likelihood that takes residuals for
+    white noise, would both be fooled by their neighbours.
+    """
+    r, J = problem.data_rows(path, theta)
+    inverse = torch.linalg.pinv(A.double(), hermitian=True)
+    r, J = r.double(), J.double()
+    fold = _folds(problem)
+    errors = []
+    for k in range(FOLDS):
+        rows = fold == k
+        H = J[rows] @ inverse @ J[rows].T
+        left_out = torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r[rows])[0]
+        errors.append(left_out.square().mean().sqrt() * problem.sigma)
+    return torch.stack(errors).nan_to_num(nan=torch.inf)
+
+
+def _folds(problem: ShootingProblem) -> Tensor:
+    """Fold of every data row, in the order of `data_rows`."""
+    parts = [torch.arange(length) * FOLDS // length for length in problem.data.lengths]
+    return torch.cat(parts).repeat_interleave(problem.n).to(problem.data.t.device)
+
+
+def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
+    """The smallest key (the strongest prior) whose held-out error the best one does not beat beyond its spread.
+
+    Spread: the standard error over folds of the difference of their squared errors.
+    """
+    best = min(errors, key=lambda k: float(errors[k].square().mean()))
+    for key in sorted(errors):
+        difference = errors[key].square() - errors[best].square()
+        if float(difference.mean()) <= float(difference.std() / len(difference) ** 0.5):
+            return key
+    return best

@@ -1,0 +1,158 @@
+"""Checks of the generating functions S^k and of the discrete Hamilton–Jacobi equation.
+
+S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 is taken through the flow; its derivatives through the endpoint map; H⁺ through L_d. None of
+the identities that are checked enters the computation of the other side.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import (
+    GeneratingFunction,
+    flow_derivative,
+    generating_function,
+    hamilton_jacobi_residual,
+    partials,
+    right_hamiltonian,
+    right_hamiltonian_on_flow,
+)
+from herglotz.stepping import State
+from herglotz.verify.report import Check
+from herglotz.verify.subject import Subject
+from herglotz.verify.walk import worst
+
+FAN = 4  # momenta p̂0 from each start (q̂0, ŝ0): together they cover an open set of q_k, which E7 asks for
+OPENING = 0.1  # of the fan, in standard deviations of p̂0
+CAUSTIC = 1e-2  # spread of a fan over k times that of one step, below which S^k is not defined well enough
+FOLD = 1e-3  # D2D2 L_d over its own typical size, below which H⁺ is not (erratum E4: steps do not need it)
+
+
+@dataclass(frozen=True)
+class Fan:
+    """Solutions from common starts (q̂0, ŝ0) with different p̂0, and their S^k for some k."""
+
+    start: State  # (F, n), (F, n), (F)
+    S: dict[int, GeneratingFunction]  # by k
+    sigma: dict[int, Tensor]  # (F) by k, as the stepper reports c
+    keep: dict[int, Tensor]  # (F) bool by k: away from a caustic
+    failed: int = 0  # solutions dropped because a step failed or has no finite derivative
+
+    def left_out(self) -> str:
+        """How many solutions the checks do not count."""
+        failed = self.failed * len(self.keep)
+        lost = sum(int((~keep).sum()) for keep in self.keep.values()) + failed
+        total = sum(keep.numel() for keep in self.keep.values()) + failed
+        return f"{lost} of {total} solutions left out: near a caustic or not converged" if lost else ""
+
+
+def fan(subject: Subject, steps: int, seed: int) -> Fan:
+    """Open a fan of momenta from every state, and differentiate the k-step maps at k = 1, 2, K−1, K."""
+    q, p, s = subject.states
+    make = torch.Generator().manual_seed(seed)
+    size = p.std(0, correction=0) if len(p) > 1 else p.abs()[0]
+    size = torch.where(size > 0, size, 1.0)
+    offset = torch.randn(len(p), FAN, p.shape[-1], generator=make, dtype=torch.float64).to(p.dtype)
+    offset[:, 0] = 0.0
+    momenta = p[:, None] + OPENING * size * offset
+    start = State(
+        q[:, None].expand_as(momenta).flatten(0, 1),
+        momenta.flatten(0, 1),
+        s[:, None].expand(momenta.shape[:-1]).flatten(),
+    )
+    end, D = flow_derivative(subject.flow(steps), *start)
+    sound = torch.isfinite(D).all(-1).all(-1) & torch.isfinite(end[2])
+    failed = int((~sound).sum())
+    start = State(*(x[sound] for x in start))
+    sigma = _accumulated(subject, start, steps)
+    S = {k: generating_function(subject.flow(k), *start) for k in sorted({1, 2, steps - 1, steps})}
+    keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
+    return Fan(start, S, sigma, keep, failed)
+
+
+def derivatives(f: Fan, bound: float) -> list[Check]:
+    """D2S^k = p_k, D1S^k = −σ_k p̂0 and 1 + D3S^k = σ_k, relative to the largest momentum and to σ_k."""
+    size = max([worst(f.start.p.abs())] + [worst(g.p[f.keep[k]].abs()) for k, g in f.S.items() if f.keep[k].any()])
+
+    def largest(error: Callable[[int, GeneratingFunction], Tensor]) -> float:
+        return worst(torch.cat([error(k, g)[f.keep[k]].reshape(-1) for k, g in f.S.items()]))
+
+    note = f.left_out()
+    D2 = largest(lambda _, g: (g.D2 - g.p).abs() / size)
+    D1 = largest(lambda k, g: (g.D1 + f.sigma[k][..., None] * f.start.p).abs() / size)
+    D3 = largest(lambda k, g: ((1 + g.D3) / f.sigma[k] - 1).abs())
+    return [
+        Check.at_most("D2S", "generating function: D2 S^k = p_k", D2, bound, note),
+        Check.at_most("D1S", "generating function: D1 S^k = −σ_k p0", D1, bound, note),
+        Check.at_most("D3S", "conformal product: 1 + D3 S^k = σ_k", D3, bound, note),
+    ]
+
+
+def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
+    """S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
+
+    H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is known
+    it is p1·q1 − (s1 − s0) along the step.
+    """
+    residuals, sizes, folds = [], [], 0
+    for k in [k for k in f.S if k + 1 in f.S]:
+        before, after = f.S[k], f.S[k + 1]
+        keep = f.keep[k] & f.keep[k + 1]
+        with torch.no_grad():
+            if subject.L_d is not None:
+                regular = _single_valued(subject, before, after)
+                folds += int((keep & ~regular).sum())
+                keep = keep & regular
+            b, a = (GeneratingFunction(**{name: x[keep] for name, x in vars(g).items()}) for g in (before, after))
+            H = _right_hamiltonian(subject, b, a)
+            residual = hamilton_jacobi_residual(a.S, b.S, a.D2, a.q, H)
+            residuals.append(residual.abs())
+            sizes.append(a.S.abs() + b.S.abs() + (a.D2 * a.q).abs().sum(-1) + H.abs())
+    notes = [f.left_out()] if f.left_out() else []
+    if folds:
+        notes.append(f"{folds} left out near a fold of H⁺ (det D2D2 L_d = 0)")
+    if subject.L_d is None:
+        notes.append("no L_d in the file: H⁺ rebuilt as p1·q1 − (s1 − s0)")
+    size = worst(torch.cat(sizes))
+    value = worst(torch.cat(residuals)) / size if size > 0 else float("nan")
+    return Check.at_most("hamilton_jacobi", "discrete Hamilton–Jacobi equation on a fan", value, bound, "; ".join(notes))
+
+
+def _right_hamiltonian(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
+    """H⁺(q_k, dS^{k+1}, s_k)."""
+    if subject.L_d is None:
+        return right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
+    # The guess picks the branch of H⁺ and is off by a little, so that the equation is really solved.
+    guess = after.q + 1e-3 * (after.q - before.q)
+    return right_hamiltonian(subject.L_d, before.q, after.D2, before.s, subject.h, guess)
+
+
+def _single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
+    """Whether det D2D2 L_d is away from 0, so that H⁺ exists there."""
+    assert subject.L_d is not None
+    P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
+    finite = torch.isfinite(P.D22).all(-1).all(-1)
+    smallest = torch.zeros_like(P.L)
+    smallest[finite] = torch.linalg.svdvals(P.D22[finite])[..., -1]
+    size = P.D12.abs().amax((-2, -1)) + P.D22.abs().amax((-2, -1))
+    return smallest > FOLD * size
+
+
+def _usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
+    """Away from a caustic: the fan has opened, compared with k free steps."""
+    return (g.spread > CAUSTIC * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)
+
+
+def _accumulated(subject: Subject, start: State, steps: int) -> dict[int, Tensor]:
+    """σ_k for k = 1 … K, from the factors that the stepper reports."""
+    sigma, state, product = {}, start, torch.ones_like(start.s)
+    with torch.no_grad():
+        for k in range(1, steps + 1):
+            step = subject.step(state, subject.h)
+            state, product = step.state, product * step.c
+            sigma[k] = product
+    return sigma

@@ -1,0 +1,122 @@
+"""Does a fitted model predict the motion it was fitted to? The identities cannot tell: a constant L_d satisfies many."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.mechanics import momentum_jacobian, momentum_residual, partials
+from herglotz.stepping import solve
+from herglotz.training import Run
+from herglotz.verify.report import Check
+
+# Half the null model's error: far above what a fitted model leaves (1e-2 and less on clean data), far below the ratio
+# of about 1 and more that a model with nothing in it, or a collapsed one, has.
+ONE_STEP = 0.5
+# Predicting the mean of the extrapolated samples would give exactly 1.
+FREE_RUN = 1.0
+DECIDABLE = 2.0  # the null model's squared error must be this many times the noise's
+
+
+def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
+    """The checks that need recorded motion, and the numbers behind them.
+
+    One step: RMS of J⁻¹R over the recorded triples, each coordinate in units of its own spread, against that of uniform
+    motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both alike, so its share, estimated from the data
+    alone, is taken off both; where the null model's error *is* noise, one step decides nothing and the check is left out.
+
+    Free run: RMS of prediction − data over the samples beyond the training part, relative to their spread.
+    """
+    q = run.data.unwrapped().q
+    spread = _spread(q)
+    model, null, floor = _one_step(run, q, spread)
+    numbers = {"one_step_rms": model, "null_rms": null, "noise_rms": floor}
+    checks, extra = [], ""
+    if null**2 > DECIDABLE * floor**2:
+        ratio = math.sqrt(max(model**2 - floor**2, 0.0) / (null**2 - floor**2)) if math.isfinite(model) else math.inf
+        note = f"RMS {model:.3g}, uniform motion {null:.3g}, noise {floor:.3g}, in units of the data's spread"
+        checks.append(Check.at_most("one_step", "predicts a step: |J⁻¹R| over uniform motion", ratio, ONE_STEP, note))
+    else:
+        extra = f"; one step is not judged: uniform motion's error ({null:.2g}) is mostly noise ({floor:.2g})"
+    value, note = _free_run(run)
+    note += extra
+    below = Check("free_run", "predicts beyond training: RMS over spread", value, FREE_RUN, value < FREE_RUN, note, "<")
+    return [*checks, below], numbers
+
+
+def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]:
+    """RMS errors of the model, of uniform motion and of the noise in either, in units of the spread."""
+    t = run.data.unwrapped().triples()
+    dtype = next(run.model.parameters()).dtype
+    keep = (t.h0 <= 1.5 * run.h) & (t.h1 <= 1.5 * run.h)  # no single step across a gap
+    if not bool(keep.any()):
+        keep = torch.ones_like(keep)
+    q0, q1, q2, h0, h1, s0 = (
+        x[keep].to(dtype) for x in (t.q0, t.q1, t.q2, t.h0, t.h1, run.states.s[t.index])
+    )
+    with torch.no_grad():
+        before = partials(run.model, q0, q1, s0, h0)
+        after = partials(run.model, q1, q2, s0 + before.L, h1, 2)
+        error = solve(momentum_jacobian(after, before.D2), momentum_residual(after, before.D2))
+    r = (h1 / h0)[:, None]
+    uniform = q2 - q1 - r * (q1 - q0)
+    weight = (1 + (1 + r) ** 2 + r**2).mean()
+    sigma = noise_level(run.data.t, q, run.data)
+    return _rms(error / spread), _rms(uniform / spread), _rms(sigma / spread) * float(weight) ** 0.5
+
+
+def noise_level(t: Tensor, q: Tensor, data: Trajectories, orders: tuple[int, ...] = (3, 4, 5, 6)) -> Tensor:
+    """Upper estimate of the standard deviation of white noise in each coordinate, (n,), without a model.
+
+    Divided differences of order d, with weights scaled to leave white noise as it is, remove any smooth motion; the
+    order that leaves least is the best estimate.
+    """
+    estimates = []
+    for d in orders:
+        rows = [_divided(t[a:b], q[a:b], d) for a, b in _spans(data) if b - a > d]
+        if rows:
+            estimates.append(torch.cat(rows).square().mean(0).sqrt())
+    return torch.stack(estimates).amin(0) if estimates else torch.zeros_like(q[0])
+
+
+def _divided(t: Tensor, q: Tensor, d: int) -> Tensor:
+    """Normalised divided differences of order d along one trajectory, (N − d, n)."""
+    times = t.unfold(0, d + 1, 1)  # (N − d, d + 1)
+    times = (times - times[:, :1]) / (times[:, -1:] - times[:, :1])
+    gaps = times[:, :, None] - times[:, None, :] + torch.eye(d + 1, dtype=t.dtype, device=t.device)
+    weights = 1 / gaps.prod(-1)
+    weights = weights / weights.norm(dim=-1, keepdim=True)
+    return (q.unfold(0, d + 1, 1) * weights[:, None, :]).sum(-1)
+
+
+def _free_run(run: Run) -> tuple[float, str]:
+    """RMS of prediction − data over the samples after the training part, over their spread; worst if there are none."""
+    q = run.data.unwrapped().q
+    rows = [torch.arange(a + k, b) for (a, b), k in zip(_spans(run.data), run.train_lengths, strict=True) if b - a > k]
+    note = f"{sum(len(x) for x in rows)} samples the fit did not see"
+    if not rows:
+        rows, note = [torch.arange(len(q))], "no samples were held out: all of them"
+    index = torch.cat(rows)
+    error = run.prediction[index].to(q.dtype) - q[index]
+    turning = torch.tensor(run.data.angles)
+    error = torch.where(turning, error - 2 * math.pi * torch.round(error / (2 * math.pi)), error)
+    value = _rms(error / _spread(q[index]))
+    return (value if math.isfinite(value) else math.inf), note
+
+
+def _spans(data: Trajectories) -> Iterator[tuple[int, int]]:
+    return ((a, a + length) for a, length in zip(data.offsets, data.lengths, strict=True))
+
+
+def _spread(q: Tensor) -> Tensor:
+    """Standard deviation of each coordinate, (n,); 1 for one that never moves."""
+    spread = q.std(0, correction=0)
+    return torch.where(spread > 0, spread, 1.0)
+
+
+def _rms(x: Tensor) -> float:
+    return float(x.double().square().mean().sqrt())

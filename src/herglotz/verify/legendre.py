@@ -1,0 +1,95 @@
+"""Checks of the Legendre transforms along rollouts: momentum matching and regularity."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import herglotz_residual, mixed_hessian, momentum_jacobian, partials
+from herglotz.stepping import solve
+from herglotz.verify.report import Check
+from herglotz.verify.subject import Subject
+from herglotz.verify.walk import Walk, worst
+
+MARGIN = 1e-3  # rounding aside, a kinetic term gives about 1; the collapsed models of trap 2 give 0 or change sign
+
+
+def momentum_matching(subject: Subject, w: Walk, bound: float) -> Check:
+    """FL⁺ of one step = FL⁻ of the next: the discrete Herglotz residual J⁻¹R, relative to the size of positions.
+
+    With L_d, R is evaluated on (q_{k−1}, q_k, q_{k+1}, s_{k−1}) alone. Without it, D1 L_d and D2 L_d are taken from the
+    derivative of the map: by the chain rule of the one-step generating function S¹ = L_d.
+    """
+    statement, note = "momenta match: discrete Herglotz equation, |J⁻¹R|/|q|", ""
+    both = w.ok[:, :-1] & w.ok[:, 1:]
+    size = w.q.abs().amax() + (w.q[:, 1:] - w.q[:, :-1]).abs().amax()
+    if subject.L_d is None:
+        note = "no L_d in the file: its derivatives are taken from those of the map"
+        D1, D2, Y_p = _from_map(w)
+        R = D1[:, 1:] + w.c[:, 1:, None] * D2[:, :-1]
+        error = (Y_p[:, 1:] @ R[..., None])[..., 0] / w.c[:, 1:, None]  # ∂q1/∂p0 = −c J⁻¹
+        error = error[both]
+    else:
+        q0, q1, q2 = (w.q[:, k : w.steps - 1 + k][both] for k in range(3))
+        s0, s1 = w.s[:, :-2][both], w.s[:, 1:-1][both]
+        with torch.no_grad():
+            R = herglotz_residual(subject.L_d, q0, q1, q2, s0, subject.h, subject.h)
+            p1 = partials(subject.L_d, q0, q1, s0, subject.h).D2
+            error = solve(momentum_jacobian(partials(subject.L_d, q1, q2, s1, subject.h, 2), p1), R)
+    return Check.at_most("momentum", statement, worst(error.abs().amax(-1) / size), bound, note)
+
+
+def regularity(subject: Subject, w: Walk) -> Check:
+    """det M ≠ 0 with a margin: smallest singular value of M, in units that make D11, D22 and M of size 1.
+
+    Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. A determinant of
+    either sign among the samples means that M is singular somewhere between them.
+    """
+    with torch.no_grad():
+        if subject.L_d is None:
+            M, sizes, note = _map_hessians(w)
+        else:
+            M, sizes, note = _hessians(subject, w)
+        scale = torch.stack([x.diagonal(dim1=-2, dim2=-1).abs() for x in sizes]).sum(0).rsqrt()
+        scaled = scale[..., :, None] * M * scale[..., None, :]
+        usable = torch.isfinite(scaled).all(-1).all(-1)
+        margin = torch.zeros_like(usable, dtype=M.dtype)  # all of D11, D22, M zero: no margin
+        margin[usable] = torch.linalg.svdvals(scaled[usable])[..., -1]
+        sign = torch.linalg.det(scaled[usable]).sign()
+    same = bool((sign == sign[:1]).all()) and bool(sign.abs().min() > 0) if len(sign) else False
+    if not same:
+        note = "; ".join(x for x in (note, "det M vanishes or changes sign over the samples") if x)
+    value = float(margin.min()) if margin.numel() else float("nan")
+    return Check.more_than("regularity", "regular: margin of det M ≠ 0", value, MARGIN, note, also=same)
+
+
+def _hessians(subject: Subject, w: Walk) -> tuple[Tensor, list[Tensor], str]:
+    """M and the blocks it is compared with, at every step; a step that failed is replaced by rest, q1 = q0."""
+    q0, q1 = w.q[:, :-1], w.q[:, 1:]
+    q1 = torch.where(w.ok[..., None], q1, q0)
+    flat = (x.flatten(0, 1) for x in (q0, q1))
+    assert subject.L_d is not None
+    P = partials(subject.L_d, *flat, w.s[:, :-1].flatten(0, 1), subject.h, 2)
+    M = mixed_hessian(P)
+    note = "" if bool(w.ok.all()) else "M at q1 = q0 where the step failed"
+    return M, [M, P.D11, P.D22], note
+
+
+def _map_hessians(w: Walk) -> tuple[Tensor, list[Tensor], str]:
+    """M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map."""
+    n = w.q.shape[-1]
+    D = w.derivative[w.ok]
+    inverse = torch.linalg.inv_ex(D[..., :n, n : 2 * n])[0]
+    M = -w.c[w.ok][..., None, None] * inverse
+    return M, [M, D[..., n : 2 * n, n : 2 * n] @ inverse], "no L_d in the file: M from the derivative of the map"
+
+
+def _from_map(w: Walk) -> tuple[Tensor, Tensor, Tensor]:
+    """D1 and D2 of S¹ = L_d by the chain rule through q1(q0, p0, s0), and ∂q1/∂p0."""
+    n = w.q.shape[-1]
+    D = w.derivative
+    Y_q, Y_p = D[..., :n, :n], D[..., :n, n : 2 * n]
+    G_q, G_p = D[..., 2 * n, :n], D[..., 2 * n, n : 2 * n]
+    D2 = solve(Y_p.mT, G_p)
+    D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
+    return D1, D2, Y_p

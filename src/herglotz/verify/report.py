@@ -1,0 +1,97 @@
+"""What a verification found, as data, as a table and as JSON."""
+
+from __future__ import annotations
+
+import math
+import unicodedata
+from dataclasses import dataclass, field
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Check:
+    """One claim, what was measured and what was allowed."""
+
+    name: str  # short and stable, for programs
+    statement: str  # the claim, for people
+    value: float  # worst over all samples; not finite where nothing could be measured
+    bound: float
+    passed: bool
+    note: str = ""
+    relation: str = "<="  # how value and bound must compare
+
+    @classmethod
+    def at_most(cls, name: str, statement: str, value: float, bound: float, note: str = "") -> Check:
+        """A check that passes when value ≤ bound; a value that is not a number fails."""
+        return cls(name, statement, value, bound, value <= bound, note)
+
+    @classmethod
+    def more_than(cls, name: str, statement: str, value: float, bound: float, note: str = "", also: bool = True) -> Check:
+        """A check that passes when value > bound and `also` holds."""
+        return cls(name, statement, value, bound, also and value > bound, note, ">")
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON; a value that is not finite becomes None."""
+        value = self.value if math.isfinite(self.value) else None
+        return {
+            "name": self.name,
+            "statement": self.statement,
+            "value": value,
+            "relation": self.relation,
+            "bound": self.bound,
+            "passed": self.passed,
+            "note": self.note,
+        }
+
+
+@dataclass(frozen=True)
+class Report:
+    """All checks of one target."""
+
+    target: str
+    checks: tuple[Check, ...]
+    details: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether there are checks and every one passed."""
+        return bool(self.checks) and all(check.passed for check in self.checks)
+
+    def __getitem__(self, name: str) -> Check:
+        """Return the check called `name`."""
+        for check in self.checks:
+            if check.name == name:
+                return check
+        raise KeyError(f"no check {name!r}; there are {', '.join(c.name for c in self.checks)}")
+
+    def table(self) -> str:
+        """An aligned table: claim, measured, bound, ok or FAIL; notes below it."""
+        rows = [("claim", "measured", "bound", "")]
+        notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
+        for check in self.checks:
+            mark = f" [{notes.index(check.note) + 1}]" if check.note else ""
+            sign = "≤" if check.relation == "<=" else check.relation
+            verdict = "ok" if check.passed else "FAIL"
+            rows.append((check.statement + mark, f"{check.value:.3g}", f"{sign} {check.bound:.3g}", verdict))
+        widths = [max(_width(row[i]) for row in rows) for i in range(3)]
+        lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
+        lines += [
+            f"  {claim}{' ' * (widths[0] - _width(claim))}  {value:>{widths[1]}}  {bound:<{widths[2]}}  {verdict}".rstrip()
+            for claim, value, bound, verdict in rows
+        ]
+        lines += [f"  [{i}] {note}" for i, note in enumerate(notes, 1)]
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return {
+            "target": self.target,
+            "passed": self.passed,
+            "details": self.details,
+            "checks": [check.to_dict() for check in self.checks],
+        }
+
+
+def _width(text: str) -> int:
+    """Columns that a text takes: the tilde of Φ̃ has none of its own."""
+    return sum(not unicodedata.combining(character) for character in text)

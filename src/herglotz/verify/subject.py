@@ -1,0 +1,139 @@
+"""What is verified: a step map with sample states, whatever it came from."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.export import ExportedStepper, load_pt2
+from herglotz.export.compare import draw
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.contact import Flow
+from herglotz.stepping import State, Step, Stepper
+from herglotz.systems import Scene, scene, scene_names
+from herglotz.training import Run, load_run
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A step map, where it is sampled and what else is known of it."""
+
+    name: str
+    kind: str  # "scene", "run", "pt2", "stepper" or "L_d"
+    step: Callable[[State, float], Step]
+    states: State  # (B, n), (B, n), (B)
+    h: float
+    L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
+    scene: Scene | None = None
+    run: Run | None = None
+
+    @property
+    def dof(self) -> int:
+        """Number of coordinates n."""
+        return self.states.q.shape[-1]
+
+    def flow(self, k: int = 1) -> Flow:
+        """The k-step map (q, p, s) → (q_k, p_k, s_k); NaN in a sample whose step failed."""
+
+        def flow_k(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            state = State(q, p, s)
+            for _ in range(k):
+                state = self.step(state, self.h).state
+            return state
+
+        return flow_k
+
+
+def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
+    """Turn anything that `verify` takes into a `Subject`.
+
+    States are drawn: for a scene from its `q_range` and `v_range` with s in [−1, 1]; for a run from its fitted states;
+    for a file from its box. A pair (L_d or stepper, states) brings its own.
+
+    Raises
+    ------
+    InputError
+        If the target is none of these, or h is missing or not positive.
+    """
+    if samples < 1:
+        raise InputError(f"samples must be >= 1, got {samples}")
+    make = torch.Generator().manual_seed(seed)
+    if isinstance(target, str | os.PathLike):
+        target = _open(target)
+    if isinstance(target, Scene):
+        L_d = target.L_d
+        states = _scene_states(target, samples, make)
+        return Subject(f"scene {target.name}", "scene", _stepper(L_d), states, _step_size(h, target.h), L_d, target)
+    if isinstance(target, Run):
+        states = _run_states(target, samples, make)
+        size = _step_size(h, target.h)
+        return Subject(f"run on {target.data.source or 'data'}", "run", _stepper(target.model), states, size, target.model, run=target)
+    if isinstance(target, ExportedStepper):
+        return Subject(target.path, "pt2", target.step, draw(target, samples, make), _step_size(h, target.h))
+    if isinstance(target, tuple) and len(target) == 2:
+        return _pair(*target, h)
+    raise InputError(
+        f"cannot verify a {type(target).__name__}; give a scene, a run, a .pt2 file or a pair (L_d or stepper, states)"
+    )
+
+
+def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
+    """A scene by name, a run by its folder, or an exported file."""
+    if target in scene_names():
+        return scene(str(target))
+    path = Path(target)
+    if path.is_dir():
+        return load_run(path)
+    if path.suffix == ".pt2" or path.is_file():
+        return load_pt2(path)
+    raise InputError(f"{target}: no such scene ({', '.join(scene_names())}), run folder or .pt2 file")
+
+
+def _pair(source: Any, states: Any, h: float | None) -> Subject:
+    """A discrete Lagrangian, or anything with `step(state, h) -> Step`, with states given as (q, p, s)."""
+    if h is None:
+        raise InputError("h must be given with a pair (L_d or stepper, states), e.g. h=0.1")
+    q, p, s = states
+    if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
+        raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
+    state, size = State(q.detach(), p.detach(), s.detach()), _step_size(h, h)
+    if hasattr(source, "step"):
+        return Subject(type(source).__name__, "stepper", source.step, state, size, getattr(source, "L_d", None))
+    return Subject(getattr(source, "__name__", type(source).__name__), "L_d", _stepper(source), state, size, source)
+
+
+def _stepper(L_d: DiscreteLagrangian) -> Callable[[State, float], Step]:
+    return Stepper(L_d).step
+
+
+def _step_size(h: float | None, default: float) -> float:
+    size = float(default if h is None else h)
+    if not 0 < size < float("inf"):
+        raise InputError(f"h must be finite and > 0, got {size:g}")
+    return size
+
+
+def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
+    shape = (samples, scene.dof)
+    q = torch.empty(shape, dtype=torch.float64).uniform_(*scene.q_range, generator=make)
+    v = torch.empty(shape, dtype=torch.float64).uniform_(*scene.v_range, generator=make)
+    s = torch.empty(samples, dtype=torch.float64).uniform_(-1.0, 1.0, generator=make)
+    return State(q, scene.momentum(q, v, s), s)
+
+
+def _run_states(run: Run, samples: int, make: torch.Generator) -> State:
+    """Fitted states of a run, drawn without repetition; those that are not finite are passed over."""
+    dtype = next(run.model.parameters()).dtype
+    q, p, s = (x.detach().to(dtype) for x in run.states)
+    finite = (torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s)).nonzero()[:, 0]
+    if not len(finite):
+        raise InputError("the run holds no finite state; its fit has diverged, fit again")
+    index = finite[torch.randperm(len(finite), generator=make)[:samples]]
+    return State(q[index], p[index], s[index])

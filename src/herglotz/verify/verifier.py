@@ -1,0 +1,112 @@
+"""`verify`: every identity of a contact integrator measured on a scene, a fit, a file or a discrete Lagrangian."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from herglotz.errors import InputError
+from herglotz.verify.action import derivatives, fan, hamilton_jacobi
+from herglotz.verify.data_checks import data_checks
+from herglotz.verify.legendre import momentum_matching, regularity
+from herglotz.verify.report import Check, Report
+from herglotz.verify.subject import Subject, subject
+from herglotz.verify.walk import Walk, contact, convergence, positive_factor, volume, walk, worst
+
+# Relative to the terms that cancel. Measured: 1e-13 on models, 8e-13 on the parachute, whose Newton tolerance (64 eps of
+# q ≈ 100 m) is large beside its steps of 0.1 m; null models miss by 1e-3 and more.
+CONTACT = {torch.float64: 1e-11, torch.float32: 5e-4}
+IDENTITY = {torch.float64: 1e-10, torch.float32: 1e-3}
+
+
+def verify(
+    target: Any,
+    *,
+    h: float | None = None,
+    samples: int = 64,
+    steps: int = 8,
+    seed: int = 0,
+    tolerance: float | None = None,
+) -> Report:
+    """Measure the identities that every discrete contact Lagrangian's flow satisfies, on this one.
+
+    On rollouts of `steps` steps from `samples` states: convergence, c > 0, DΦ̃ᵀη = cη, det DΦ̃ = c^{n+1}, momentum
+    matching, regularity; on fans of solutions: D2S^k = p_k, D1S^k = −σ_k p̂0, 1 + D3S^k = σ_k and the discrete
+    Hamilton–Jacobi equation; for a scene with an exact L_d also its closed-form flow, for a run its data.
+
+    Parameters
+    ----------
+    target
+        A scene or its name, a run or its folder, an exported stepper or its `.pt2` file, or a pair (L_d, states) or
+        (stepper, states), with states (q, p, s) of shapes (B, n), (B, n), (B,).
+    h
+        Step; default that of the target, required for a pair.
+    samples, steps, seed
+        How many states are drawn, how many steps are taken from each, and the seed of the draw.
+    tolerance
+        Bound on every identity, instead of 1e-11 (contact, with L_d) and 1e-10 in float64, 5e-4 and 1e-3 in float32.
+
+    Returns
+    -------
+    Report
+        One check per claim. Samples near a caustic are left out and counted; a check that is left with none fails.
+
+    Raises
+    ------
+    InputError
+        If the target or a setting is not usable.
+
+    Source: sections 1–3 of `mathematics.md`, errata E4 and E7.
+    """
+    if steps < 2:
+        raise InputError(f"steps must be >= 2, got {steps}; momentum matching joins two")
+    if tolerance is not None and not tolerance > 0:
+        raise InputError(f"tolerance must be > 0, got {tolerance}")
+    known = subject(target, h, samples, seed)
+    dtype = known.states.q.dtype
+    if dtype not in IDENTITY:
+        raise InputError(f"states must be float32 or float64, got {dtype}; convert them with .double()")
+    identity = IDENTITY[dtype] if tolerance is None else tolerance
+    strict = CONTACT[dtype] if tolerance is None and known.L_d is not None else identity
+
+    w = walk(known, steps)
+    f = fan(known, steps, seed + 1)
+    checks = [
+        convergence(w),
+        positive_factor(w),
+        regularity(known, w),
+        contact(w, strict),
+        volume(w, identity),
+        momentum_matching(known, w, identity),
+        *derivatives(f, identity),
+        hamilton_jacobi(known, f, identity),
+    ]
+    details = {
+        "kind": known.kind,
+        "dof": known.dof,
+        "dtype": str(dtype).removeprefix("torch."),
+        "h": known.h,
+        "samples": len(known.states.s),
+        "steps": steps,
+        "seed": seed,
+        "torch": str(torch.__version__),
+    }
+    if known.scene is not None and known.scene.exact:
+        checks.append(_exact_flow(known, w, identity))
+    if known.run is not None:
+        more, numbers = data_checks(known.run)
+        checks += more
+        details["data"] = numbers
+    return Report(known.name, tuple(checks), details)
+
+
+def _exact_flow(known: Subject, w: Walk, bound: float) -> Check:
+    """Every step equals the closed-form flow, relative to the largest q, p and s."""
+    assert known.scene is not None
+    start = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
+    with torch.no_grad():
+        flow = known.scene.flow(*start, known.h)
+    pairs = zip((w.q, w.p, w.s), flow, strict=True)
+    value = max(worst((x[:, 1:][w.ok] - y).abs()) / float(x.abs().max()) for x, y in pairs)
+    return Check.at_most("exact_flow", "exact L_d: a step is the closed-form flow", value, bound)

@@ -1,0 +1,97 @@
+"""The rollouts on which one-step identities are measured, and the checks of single steps."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import contact_defect, contact_form, flow_derivative
+from herglotz.stepping import State, Status
+from herglotz.verify.report import Check
+from herglotz.verify.subject import Subject
+
+
+@dataclass(frozen=True)
+class Walk:
+    """B rollouts of K steps with the derivative of every step, all measured on the map itself."""
+
+    q: Tensor  # (B, K+1, n)
+    p: Tensor  # (B, K+1, n)
+    s: Tensor  # (B, K+1)
+    c: Tensor  # (B, K) as the stepper reports it
+    status: Tensor  # (B, K)
+    derivative: Tensor  # (B, K, 2n+1, 2n+1) DΦ̃ at entry k
+
+    @property
+    def ok(self) -> Tensor:
+        """(B, K) whether the step converged and everything about it is finite."""
+        finite = torch.isfinite(self.derivative).all(-1).all(-1) & torch.isfinite(self.c)
+        return (self.status == Status.CONVERGED) & finite
+
+    @property
+    def steps(self) -> int:
+        """Number of steps K."""
+        return self.c.shape[-1]
+
+
+def walk(subject: Subject, steps: int) -> Walk:
+    """Roll out from the subject's states and differentiate every step by autograd."""
+    states, c, status = [subject.states], [], []
+    with torch.no_grad():
+        for _ in range(steps):
+            step = subject.step(states[-1], subject.h)
+            # A failed sample stays where it was: it is counted, and its neighbours need finite inputs.
+            bad = ~(torch.isfinite(step.state.q).all(-1) & torch.isfinite(step.state.p).all(-1))
+            bad = bad | ~torch.isfinite(step.state.s)
+            old = states[-1]
+            states.append(
+                State(
+                    torch.where(bad[:, None], old.q, step.state.q),
+                    torch.where(bad[:, None], old.p, step.state.p),
+                    torch.where(bad, old.s, step.state.s),
+                )
+            )
+            c.append(step.c)
+            status.append(torch.where(bad & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status))
+    q, p = (torch.stack([getattr(x, name) for x in states], 1) for name in ("q", "p"))
+    s = torch.stack([x.s for x in states], 1)
+    start = (x[:, :-1].flatten(0, 1) for x in (q, p, s))
+    _, D = flow_derivative(subject.flow(), *start)
+    return Walk(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
+
+
+def worst(values: Tensor) -> float:
+    """The largest entry; NaN, which fails every bound, if there is none or one is NaN."""
+    return float(values.max()) if values.numel() else float("nan")
+
+
+def convergence(w: Walk) -> Check:
+    """Every step of every rollout converged."""
+    failed = w.status != Status.CONVERGED
+    counts = ", ".join(f"{int((w.status == k).sum())} {k.name}" for k in Status if k and bool((w.status == k).any()))
+    return Check.at_most("converged", "every step converges (share failed)", float(failed.double().mean()), 0.0, counts)
+
+
+def positive_factor(w: Walk) -> Check:
+    """c > 0 at every step: orientation is kept and FL⁻ exists."""
+    c = w.c[w.ok]
+    return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
+
+
+def contact(w: Walk, bound: float) -> Check:
+    """DΦ̃ᵀ η(x1) = c η(x0), relative to the terms that cancel."""
+    p0, p1 = w.p[:, :-1][w.ok], w.p[:, 1:][w.ok]
+    D, c = w.derivative[w.ok], w.c[w.ok]
+    defect = contact_defect(D, p0, p1, c)
+    pulled = (D.abs().mT @ contact_form(p1).abs()[..., None])[..., 0]
+    size = (pulled + c.abs()[..., None] * contact_form(p0).abs()).amax(-1)
+    return Check.at_most("contact", "contact map: DΦ̃ᵀη(x1) = c η(x0)", worst(defect.abs().amax(-1) / size), bound)
+
+
+def volume(w: Walk, bound: float) -> Check:
+    """det DΦ̃ = c^{n+1}, relative."""
+    n = w.q.shape[-1]
+    ratio = torch.linalg.det(w.derivative[w.ok]) / w.c[w.ok] ** (n + 1)
+    return Check.at_most("volume", "volume: det DΦ̃ = c^(n+1)", worst((ratio - 1).abs()), bound)

@@ -1,0 +1,43 @@
+"""Tiny data and one fitted run for all tests of the command line."""
+
+from pathlib import Path
+
+import pytest
+
+from herglotz.cli import main
+
+
+@pytest.fixture(scope="session")
+def tiny_csv(tmp_path_factory) -> Path:
+    """One pendulum motion of 31 samples without noise."""
+    path = tmp_path_factory.mktemp("cli_data") / "tiny.csv"
+    arguments = [
+        "simulate",
+        "damped_pendulum",
+        "--out",
+        str(path),
+        "--trajectories",
+        "1",
+        "--steps",
+        "30",
+        "--h",
+        "0.2",
+    ]
+    assert main([*arguments, "--seed", "4"]) == 0
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny_run(tiny_csv, tmp_path_factory) -> Path:
+    """A run fitted on it, without figures; treat it as read-only."""
+    path = tmp_path_factory.mktemp("cli_run") / "run"
+    assert main(["fit", str(tiny_csv), "--out", str(path), "--no-plots"]) == 0
+    return path
+
+
+@pytest.fixture(scope="session")
+def tiny_pt2(tiny_run, tmp_path_factory) -> Path:
+    """The run as an exported file; treat it as read-only."""
+    path = tmp_path_factory.mktemp("cli_pt2") / "tiny.pt2"
+    assert main(["export", str(tiny_run), "--out", str(path)]) == 0
+    return path

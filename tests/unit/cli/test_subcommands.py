@@ -1,0 +1,202 @@
+"""Each subcommand end to end on tiny data."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+import herglotz
+import herglotz.cli
+import herglotz.cli.fit
+from herglotz.cli import main
+from herglotz.data import load
+from herglotz.models import LEVELS
+from herglotz.systems import scene_names
+from herglotz.training import load_run
+from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS
+
+
+def run_json(capsys, *arguments: object) -> tuple[int, dict]:
+    """Exit code and the JSON that must be all of stdout."""
+    capsys.readouterr()
+    code = main([*map(str, arguments), "--json"])
+    return code, json.loads(capsys.readouterr().out)
+
+
+def test_version(capsys):  # fails if the version is not the package's
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
+
+
+@pytest.mark.parametrize("command", ["simulate", "fit", "rollout", "export", "verify", "plot"])
+def test_help_teaches_every_option(capsys, command):  # fails if an option has no help, or there is no example
+    assert main([command, "--help"]) == 0
+    text = capsys.readouterr().out
+    assert f"example:\n  herglotz {command}" in text or f"examples:\n  herglotz {command}" in text
+    subparser = herglotz.cli.build_parser()._subparsers._group_actions[0].choices[command]  # pyright: ignore
+    for action in subparser._actions:
+        assert action.help, action.dest
+
+
+def test_help_does_not_import_torch():  # fails if a heavy import moves to the top of a module (help takes seconds)
+    code = "import sys; from herglotz.cli import main; main(['fit', '--help']); sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, check=False).returncode == 0
+
+
+def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit code on
+    command = [sys.executable, "-m", "herglotz", "plot", str(tmp_path / "no.csv")]
+    found = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert found.returncode == 2
+    assert found.stderr.startswith("herglotz: error: ")
+    assert found.stderr.count("\n") == 1
+
+
+def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
+    fit = herglotz.cli.fit
+    assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, fit.DTYPES)
+    for name in scene_names():
+        assert name in herglotz.cli.simulate.DESCRIPTION
+
+
+def test_simulate(tmp_path, capsys):  # fails if an option does not reach the data, or the seed does not decide them
+    arguments = ["simulate", "damped_oscillator", "--trajectories", 2, "--steps", 20, "--h", 0.25, "--noise", 0.01]
+    arguments += ["--gaps", 1, "--seed", 7, "--param", "gamma=0.5"]
+    code, found = run_json(capsys, *arguments, "--out", tmp_path / "a.csv")
+    assert code == 0
+    assert found["parameters"]["gamma"] == 0.5
+    data = load(tmp_path / "a.csv")
+    assert (len(data), data.gaps, data.typical_step, found["samples"]) == (2, 2, 0.25, data.samples)
+    assert main([*map(str, arguments), "--out", str(tmp_path / "b.npz")]) == 0
+    assert load(tmp_path / "b.npz").digest() == data.digest() == found["sha256"]
+    assert main([*map(str, arguments), "--seed", "8", "--out", str(tmp_path / "c.csv")]) == 0
+    assert load(tmp_path / "c.csv").digest() != data.digest()
+
+
+def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if files, figures or the table go missing
+    folder = tmp_path / "new" / "run"
+    assert main(["fit", str(tiny_csv), "--out", str(folder), "--train-fraction", "0.8", "--seed", "3"]) == 0
+    out, err = capsys.readouterr()
+    assert "extrapolation RMS" in out
+    assert f"Next: herglotz verify {folder}" in out
+    assert err == ""  # quiet when not a terminal
+    assert {"model.pt", "metrics.json", "config.json", "fit.npz", "figures"} <= {x.name for x in folder.iterdir()}
+    assert len(list((folder / "figures").glob("*.png"))) == 5
+    run = load_run(folder)
+    assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
+
+
+def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped or resume refits
+    folder = tmp_path / "run"
+    arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
+    arguments += ["--objective", "residual", "--level", "affine"]
+    code, found = run_json(capsys, *arguments)
+    assert (code, found["level"], found["objective"]) == (0, "affine", "residual")
+    run = load_run(folder)
+    assert next(run.model.parameters()).dtype == torch.float32
+    assert run.data.angles == (False,)
+    assert not (folder / "figures").exists()
+    code, again = run_json(capsys, *arguments, "--resume")
+    assert (code, again["train_rms"]) == (0, found["train_rms"])
+
+
+def test_rollout_goes_on_where_training_ended(tiny_run, tmp_path, capsys):
+    # fails if the rollout starts at another sample or time, or steps with another h than the free run
+    run = load_run(tiny_run)
+    first = run.train_lengths[0] - 1
+    steps = run.data.samples - 1 - first
+    code, found = run_json(capsys, "rollout", tiny_run, "--steps", steps, "--out", tmp_path / "a.csv")
+    assert (code, found["steps"]) == (0, steps)
+    motion = load(tmp_path / "a.csv")
+    torch.testing.assert_close(motion.t, run.data.t[first:], rtol=0, atol=1e-12)
+    torch.testing.assert_close(motion.q, run.prediction[first:], rtol=0, atol=1e-10)
+    assert motion.p is not None
+    assert motion.s is not None
+
+
+def test_rollout_of_a_file_is_that_of_the_run(tiny_run, tiny_pt2, tmp_path):  # fails if export loses start, h or names
+    for name, source in (("a.npz", tiny_run), ("b.npz", tiny_pt2)):
+        assert main(["rollout", str(source), "--steps", "5", "--out", str(tmp_path / name)]) == 0
+    one, two = load(tmp_path / "a.npz"), load(tmp_path / "b.npz")
+    torch.testing.assert_close(one.q, two.q, rtol=0, atol=1e-12)
+    assert (one.names, one.units, one.angles, one.time_unit) == (two.names, two.units, two.angles, two.time_unit)
+
+
+@pytest.mark.parametrize("kind", ["tiny_run", "tiny_pt2"])
+def test_rollout_from_given_state(kind, tmp_path, request):  # fails if -1e-1 is taken for an option, or h is ignored
+    source = str(request.getfixturevalue(kind))
+    state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", "0.05"]
+    assert main(["rollout", source, "--steps", "3", *state, "--out", str(tmp_path / "a.csv")]) == 0
+    motion = load(tmp_path / "a.csv")
+    assert motion.p is not None
+    assert motion.s is not None
+    assert (float(motion.q[0]), float(motion.p[0]), float(motion.s[0])) == (-0.1, 0.5, 0.25)
+    torch.testing.assert_close(motion.t, 0.05 * torch.arange(4, dtype=torch.float64))
+
+
+def test_export(
+    tiny_pt2, tiny_run, tmp_path, capsys
+):  # fails if the file does not load without herglotz, or lacks the box
+    q, s = torch.zeros(2, 1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
+    assert len(torch.export.load(tiny_pt2).module()(q, q + 1, s, s + 0.1)) == 6
+    code, report = run_json(capsys, "export", tiny_run, "--out", tmp_path / "b.pt2")
+    assert code == 0
+    assert report["metadata"]["names"] == ["theta"]
+    assert report["metadata"]["box"] is not None
+
+
+def test_verify_each_kind_of_target(tiny_run, tiny_pt2, capsys):  # fails if a target is misread or the code is not 0
+    for target in ("damped_oscillator", tiny_run, tiny_pt2):
+        code, found = run_json(capsys, "verify", target, "--samples", 8, "--steps", 3)
+        assert (code, found["passed"]) == (0, True), target
+    assert main(["verify", "damped_oscillator", "--samples", "8", "--steps", "3"]) == 0
+    assert "verified" in capsys.readouterr().out
+
+
+def test_verify_fails_with_1(monkeypatch, capsys):  # fails if a failed check still exits with 0
+    class Failed:
+        passed = False
+
+        def table(self) -> str:
+            return "NOT verified"
+
+    import herglotz.verify
+
+    monkeypatch.setattr(herglotz.verify, "verify", lambda *_, **__: Failed())
+    assert main(["verify", "damped_oscillator"]) == 1
+    assert capsys.readouterr().out == "NOT verified\n"
+
+
+def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is missing or its path is not printed
+    assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
+    assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
+    written = capsys.readouterr().out.split()
+    assert len(written) == 6
+    for path in written:
+        assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_interrupt(monkeypatch, tiny_csv, tmp_path, capsys):  # fails if Ctrl-C prints a traceback or leaves a folder
+    import herglotz.training
+
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(herglotz.training, "fit", interrupted)
+    assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 130
+    assert capsys.readouterr().err == "herglotz: interrupted\n"
+    assert not (tmp_path / "run").exists()
+
+
+def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  # fails if nobody is told about --resume
+    import herglotz.training
+
+    def interrupted(*_, out, **__):
+        (out / "checkpoint.pt").write_text("")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(herglotz.training, "fit", interrupted)
+    assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 130
+    assert "--resume" in capsys.readouterr().err

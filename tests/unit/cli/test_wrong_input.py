@@ -1,0 +1,137 @@
+"""Every mistake is one line on stderr with exit code 2, and leaves nothing behind."""
+
+from pathlib import Path
+
+import pytest
+
+from herglotz.cli import main
+
+GOOD = "t[s],theta[rad]\n" + "".join(f"{k / 10},{1 - k / 50}\n" for k in range(30))
+BAD_FILES = {
+    "missing column": ("theta[rad]\n1\n2\n3\n", "no time column"),
+    "no coordinate": ("t[s]\n1\n2\n3\n", "no coordinate column"),
+    "non-numeric cell": (GOOD.replace("0.5,0.9", "0.5,high"), "'high' is not a number"),
+    "NaN": (GOOD.replace("0.5,0.9", "0.5,nan"), "not finite"),
+    "time not increasing": (GOOD.replace("0.6,", "0.4,"), "does not increase"),
+    "one sample": ("t[s],theta[rad]\n0,1\n", "at least 3 are needed"),
+    "empty": ("", "empty"),
+    "header only": ("t[s],theta[rad]\n", "no samples"),
+}
+
+
+def mistake(capsys, folder: Path, *arguments: object) -> str:
+    """Run, demand exit code 2, one line and no new file; return the line."""
+    before = sorted(folder.rglob("*"))
+    capsys.readouterr()
+    code = main([*map(str, arguments)])
+    out, err = capsys.readouterr()
+    assert code == 2
+    assert out == ""
+    assert err.startswith("herglotz: error: ")
+    assert err.count("\n") == 1
+    assert "Traceback" not in err
+    assert sorted(folder.rglob("*")) == before
+    return err
+
+
+@pytest.mark.parametrize("command", ["fit", "plot"])
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_bad_data(tmp_path, capsys, name, command):  # fails if a bad file reaches the fit, or a folder is left behind
+    content, message = BAD_FILES[name]
+    (tmp_path / "bad.csv").write_text(content)
+    assert message in mistake(capsys, tmp_path, command, tmp_path / "bad.csv", "--out", tmp_path / "a" / "out")
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "message"),
+    [
+        ("--level", "quadratic", "invalid choice: 'quadratic'"),
+        ("--dtype", "float16", "invalid choice: 'float16'"),
+        ("--objective", "x", "invalid choice"),
+        ("--optimiser", "adam", "adam fits the objectives"),
+        ("--train-fraction", "1.5", "train fraction"),
+        ("--train-fraction", "nan", "finite"),
+        ("--seed", "-1", "whole number"),
+        ("--device", "tpu9", "unknown device"),
+        ("--angles", "phi", "phi"),
+        ("--nonsense", "1", "unrecognized"),
+    ],
+)
+def test_bad_options_of_fit(tmp_path, capsys, option, value, message):  # fails if an option is checked after the work
+    (tmp_path / "good.csv").write_text(GOOD)
+    assert message in mistake(capsys, tmp_path, "fit", tmp_path / "good.csv", "--out", tmp_path / "run", option, value)
+
+
+def test_unwritable_output_is_found_before_training(tmp_path, capsys, monkeypatch):
+    # fails if a fit of an hour ends in "cannot be written"
+    import herglotz.training
+
+    monkeypatch.setattr(herglotz.training, "fit", lambda *_, **__: pytest.fail("trained"))
+    (tmp_path / "good.csv").write_text(GOOD)
+    (tmp_path / "file").write_text("in the way")
+    for out in (tmp_path / "file", tmp_path / "file" / "run", "/proc/herglotz/run"):
+        assert "--out" in mistake(capsys, tmp_path, "fit", tmp_path / "good.csv", "--out", out)
+
+
+def test_an_old_run_is_not_overwritten(tmp_path, capsys):  # fails if a finished fit is lost without a word
+    (tmp_path / "good.csv").write_text(GOOD)
+    (tmp_path / "model.pt").write_text("old")
+    assert "already holds a run" in mistake(capsys, tmp_path, "fit", tmp_path / "good.csv", "--out", tmp_path)
+
+
+@pytest.mark.parametrize(
+    "out", ["no_folder/a.csv", "a.txt", ".", "/proc/a.csv"], ids=["no folder", "extension", "a folder", "unwritable"]
+)
+@pytest.mark.parametrize("command", [["simulate", "damped_pendulum"], ["rollout", "nothing", "--steps", "9"]])
+def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output is checked after the work
+    assert "--out" in mistake(capsys, tmp_path, *command, "--out", tmp_path / out)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["simulate", "double_pendulum", "--out", "OUT.csv"], "unknown scene 'double_pendulum'"),
+        (["simulate", "parachute", "--out", "OUT.csv", "--param", "wind=3"], "no parameter 'wind'"),
+        (["simulate", "parachute", "--out", "OUT.csv", "--param", "m"], "not NAME=VALUE"),
+        (["simulate", "parachute", "--out", "OUT.csv", "--h", "0"], "must be > 0"),
+        (["simulate", "parachute", "--out", "OUT.csv", "--noise", "-1"], "noise"),
+        (["simulate", "parachute", "--out", "OUT.csv", "--trajectories", "0"], "trajectories"),
+        (["verify", "double_pendulum"], "double_pendulum"),
+        (["verify", "missing.pt2"], "no such file"),
+        (["verify", "damped_oscillator", "--samples", "0"], "at least 1"),
+        (["fit", "missing.csv", "--out", "OUT"], "no such file"),
+        (["plot", "missing.csv", "--out", "OUT"], "no such file"),
+        (["plot", "OUT", "--out", "OUT2"], "OUT"),
+        (["rollout", "missing", "--steps", "5", "--out", "OUT.csv"], "no model.pt"),
+        (["rollout", "missing.pt2", "--steps", "5", "--out", "OUT.csv"], "no such file"),
+        (["export", "missing", "--out", "OUT.pt2"], "no model.pt"),
+        (["export", "missing", "--out", "OUT.onnx"], "must end in .pt2"),
+        ([], "required"),
+        (["train"], "invalid choice"),
+    ],
+)
+def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, message):  # fails if one of them ends in a traceback
+    monkeypatch.chdir(tmp_path)
+    assert message in mistake(capsys, tmp_path, *arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--steps", "1"], "at least 2"),
+        (["--steps", "5", "--q0", "1"], "go together"),
+        (["--steps", "5", "--q0", "1", "2", "--p0", "0"], "--q0 needs 1 number"),
+        (["--steps", "5", "--q0", "inf", "--p0", "0"], "finite"),
+        (["--steps", "5", "--trajectory", "7"], "there is no trajectory 7"),
+        (["--steps", "-5"], "whole number"),
+    ],
+)
+def test_bad_rollouts(tmp_path, capsys, tiny_run, options, message):  # fails if a bad start is stepped
+    assert message in mistake(capsys, tmp_path, "rollout", tiny_run, *options, "--out", tmp_path / "a.csv")
+
+
+def test_a_damaged_run_and_file(tmp_path, capsys):  # fails if torch's own error gets through
+    (tmp_path / "model.pt").write_bytes(b"junk")
+    (tmp_path / "a.pt2").write_bytes(b"junk")
+    assert "cannot be read" in mistake(capsys, tmp_path, "verify", tmp_path)
+    assert "not a readable .pt2" in mistake(capsys, tmp_path, "verify", tmp_path / "a.pt2")

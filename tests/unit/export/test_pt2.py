@@ -1,0 +1,295 @@
+"""Exported files: what they compute, what they say of themselves, and what is refused."""
+
+import json
+import subprocess
+import sys
+import zipfile
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export import StepModule, compare, export_pt2, load_pt2, weights_digest
+from herglotz.mechanics import flow_derivative, partials, step_derivative
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Status, Stepper
+
+BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-0.5], "s_high": [0.5]}
+
+
+def model_of(n, level, correction=0, dtype=torch.float64):
+    """A model whose every parameter is random."""
+    ones, make = (1.0,) * n, torch.Generator().manual_seed(n)
+    angles = tuple(i % 2 == 0 for i in range(n))
+    config = ModelConfig(
+        angles, level, ones, ones, ones, (0.0,) * n, potential_width=4, damping_width=4, correction_width=correction
+    )
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    return model.to(dtype)
+
+
+def states_of(n, batch, dtype=torch.float64, seed=0):
+    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+
+
+@pytest.fixture(scope="module")
+def leapfrog(tmp_path_factory):
+    """(model, path) at the level whose step is linear in q1."""
+    model = model_of(1, "linear")
+    path = tmp_path_factory.mktemp("pt2") / "leapfrog.pt2"
+    export_pt2(model, path, h=0.1, box=BOX, units=["rad"], metadata={"data": "none"})
+    return model, path
+
+
+@pytest.fixture(scope="module")
+def affine(tmp_path_factory):
+    """(model, path) in two coordinates, where every step is a Newton solve of a 2 × 2 system."""
+    model = model_of(2, "affine")
+    path = tmp_path_factory.mktemp("pt2") / "affine.pt2"
+    export_pt2(model, path, h=0.1, newton_iterations=5)
+    return model, path
+
+
+@pytest.mark.parametrize("fixture", ["leapfrog", "affine"])
+def test_a_file_matches_the_eager_stepper_at_every_batch_size(fixture, request):
+    # fails if the graph is specialised to a batch, stops iterating too early or mixes samples
+    model, path = request.getfixturevalue(fixture)
+    result = compare(load_pt2(path), Stepper(model), steps=10)
+    assert set(result["per_batch"]) == {1, 7, 4096}
+    assert max(result[key] for key in ("q", "p", "s", "c")) <= 1e-12, result
+    assert result["status"] == result["failed"] == 0
+
+
+def test_float32_files(tmp_path):
+    # fails if a float64 constant in the graph turns the result into float64
+    model = model_of(1, "linear", dtype=torch.float32)
+    exported = load_pt2(export_pt2(model, tmp_path / "single.pt2", h=0.1))
+    step = exported.step(states_of(1, 5, torch.float32), 0.1)
+    assert {x.dtype for x in (*step.state, step.c, step.residual)} == {torch.float32}
+    result = compare(exported, Stepper(model), batches=(1, 7), steps=10)
+    assert max(result[key] for key in ("q", "p", "s", "c")) <= 1e-4, result
+
+
+@pytest.mark.parametrize("fixture", ["leapfrog", "affine"])
+def test_the_derivative_of_a_file_is_that_of_the_implicit_function_theorem(fixture, request):
+    # fails if the last Newton iteration is masked: frozen samples would have dq1/dx = 0 or a truncated derivative
+    model, path = request.getfixturevalue(fixture)
+    exported, n = load_pt2(path), model.config.dof
+    q, p, s = states_of(n, 6)
+    (q1, _, _), D = flow_derivative(lambda *x: exported.step(State(*x), 0.1).state, q, p, s)
+    with torch.no_grad():
+        exact = step_derivative(partials(model, q, q1, s, 0.1, 2), p)
+    torch.testing.assert_close(D, exact, rtol=1e-10, atol=1e-10)
+
+
+def test_a_file_steps_without_herglotz(leapfrog, tmp_path):
+    # fails if the graph or the archive needs this package to be read
+    model, path = leapfrog
+    script = """
+import sys, torch
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] == "herglotz":
+            raise ImportError("herglotz is not installed here")
+sys.meta_path.insert(0, Blocked())
+try:
+    import herglotz
+except ImportError:
+    pass
+else:
+    raise SystemExit("herglotz was importable")
+step = torch.export.load(sys.argv[1]).module()
+q, p, s = torch.tensor([[0.3]], dtype=torch.float64), torch.tensor([[-0.2]], dtype=torch.float64), torch.zeros(1).double()
+h = torch.full((1,), 0.1, dtype=torch.float64)
+for _ in range(50):
+    q, p, s, c, residual, status = step(q, p, s, h)
+assert int(status) == 0
+print(float(q), float(p), float(s))
+"""
+    (tmp_path / "alone.py").write_text(script)
+    command = [sys.executable, "-I", str(tmp_path / "alone.py"), str(path)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stderr
+    alone = torch.tensor([float(x) for x in done.stdout.split()], dtype=torch.float64)
+    start = (torch.tensor([[x]], dtype=torch.float64) for x in (0.3, -0.2))
+    with torch.no_grad():
+        final = Stepper(model).rollout(*start, h=0.1, steps=50).final
+    torch.testing.assert_close(alone, torch.cat([x.reshape(-1) for x in final]), rtol=1e-12, atol=1e-12)
+
+
+def test_metadata_describes_the_file(leapfrog):
+    # fails if an entry is missing or wrong, or if the hash does not depend on the weights
+    model, path = leapfrog
+    known = load_pt2(path).metadata
+    assert (known["format"], known["level"], known["dof"], known["dtype"], known["h"]) == (1, "linear", 1, "float64", 0.1)
+    assert (known["units"], known["angles"], known["box"], known["data"]) == (["rad"], [True], BOX, "none")
+    assert known["torch_version"] == str(torch.__version__)
+    assert ModelConfig.from_dict(known["model"]) == model.config
+    assert known["weights_sha256"] == weights_digest(model) != weights_digest(model_of(1, "affine"))
+    assert known["newton_iterations"] == 2
+
+
+def test_a_file_names_no_local_path(leapfrog):
+    # fails if torch's stack traces, which name the author's folders, are shipped
+    _, path = leapfrog
+    with zipfile.ZipFile(path) as archive:
+        content = b"".join(archive.read(name) for name in archive.namelist())
+    assert b"site-packages" not in content
+    assert b"src/herglotz" not in content
+
+
+def test_steps_keep_the_shape_of_the_state(leapfrog):
+    # fails if leading dimensions or a per-sample h are lost
+    model, path = leapfrog
+    exported = load_pt2(path)
+    q, p, s = (x.reshape(2, 3, *x.shape[1:]) for x in states_of(1, 6))
+    h = torch.linspace(0.05, 0.3, 6, dtype=torch.float64).reshape(2, 3)
+    ours, eager = exported.step(State(q, p, s), h), Stepper(model).step(State(q, p, s), h)
+    for a, b in zip((*ours.state, ours.c), (*eager.state, eager.c), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+    steps = torch.tensor([0.1, 0.2, 0.05], dtype=torch.float64)
+    a, b = (x.rollout(q, p, s, h=steps) for x in (exported, Stepper(model)))
+    torch.testing.assert_close(a.q, b.q, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(a.sigma, b.sigma, rtol=1e-12, atol=1e-12)
+    single = exported.step(State(q[0, 0], p[0, 0], s[0, 0]), 0.1)
+    assert single.state.q.shape == (1,)
+
+
+def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone():
+    # fails if a status is lost or a failure spreads
+    model = model_of(1, "affine")
+    q, p, s = states_of(1, 4)
+    p = p.clone()
+    p[2] = 1e200
+    module = StepModule(model, 8)
+    with torch.no_grad():
+        q1, p1, s1, c, _, status = module(q, p, s, torch.full((4,), 0.1, dtype=torch.float64))
+        alone = module(q[:1], p[:1], s[:1], torch.full((1,), 0.1, dtype=torch.float64))
+    assert status.dtype == torch.uint8
+    assert (status == Status.CONVERGED).tolist() == [True, True, False, True]
+    for x in (q1, p1, s1, c):
+        assert torch.isnan(x.reshape(4, -1)[:, 0]).tolist() == [False, False, True, False]
+    torch.testing.assert_close(q1[:1], alone[0])
+
+
+def test_too_few_iterations_are_reported():
+    # fails if the status says converged whatever the residual is
+    model = model_of(1, "affine", correction=4)
+    q, p, s = states_of(1, 8)
+    with torch.no_grad():
+        *_, residual, status = StepModule(model, 2)(q, 5 * p, s, torch.full((8,), 0.5, dtype=torch.float64))
+    assert (status == Status.MAX_ITERATIONS).any()
+    assert (residual[status == Status.MAX_ITERATIONS] > 1e-12).all()
+
+
+def test_outside_the_box(leapfrog):
+    # fails if a bound is ignored, or an angle is not taken modulo 2π
+    exported = load_pt2(leapfrog[1])
+    q = torch.tensor([[0.0], [6.3], [2.0], [0.0], [0.0]], dtype=torch.float64)
+    p = torch.tensor([[0.0], [0.0], [0.0], [1.5], [0.0]], dtype=torch.float64)
+    s = torch.tensor([0.0, 0.0, 0.0, 0.0, 0.6], dtype=torch.float64)
+    assert exported.outside_box(State(q, p, s)).tolist() == [False, False, True, True, True]
+
+
+def test_outside_an_unrecorded_box(affine):
+    # fails if "no box" reads as "never outside"
+    with pytest.raises(InputError, match="records no box"):
+        load_pt2(affine[1]).outside_box(states_of(2, 3))
+
+
+def test_wrong_states_are_refused(leapfrog):
+    # fails if a wrong dtype or shape reaches the graph, which does not check
+    exported = load_pt2(leapfrog[1])
+    q, p, s = states_of(1, 4)
+    with pytest.raises(InputError, match=r"q must be torch.float64, got torch.float32"):
+        exported.step(State(q.float(), p, s), 0.1)
+    with pytest.raises(InputError, match="need shapes"):
+        exported.step(State(q, p[:3], s), 0.1)
+    with pytest.raises(InputError, match="p must be finite, got 4"):
+        exported.step(State(q, p * torch.nan, s), 0.1)
+    with pytest.raises(InputError, match="no samples"):
+        exported.step(State(q[:0], p[:0], s[:0]), 0.1)
+    with pytest.raises(InputError, match="match the batch"):
+        exported.step(State(q, p, s), torch.full((3,), 0.1, dtype=torch.float64))
+    for h in (0.0, -0.1, float("nan"), float("inf")):
+        with pytest.raises(InputError, match="h must be finite and > 0"):
+            exported.step(State(q, p, s), h)
+    with pytest.raises(InputError, match="scalar h needs steps"):
+        exported.rollout(q, p, s, h=0.1)
+    with pytest.raises(InputError, match="lists 2 steps but steps=3"):
+        exported.rollout(q, p, s, h=torch.tensor([0.1, 0.1]), steps=3)
+
+
+def test_unreadable_files_are_refused(leapfrog, tmp_path):
+    # fails if torch's own exceptions reach the user
+    with pytest.raises(InputError, match="no such file"):
+        load_pt2(tmp_path / "nothing.pt2")
+    (tmp_path / "text.pt2").write_text("not an archive")
+    with pytest.raises(InputError, match="not a readable .pt2 file"):
+        load_pt2(tmp_path / "text.pt2")
+    whole = leapfrog[1].read_bytes()
+    (tmp_path / "half.pt2").write_bytes(whole[: len(whole) // 2])
+    with pytest.raises(InputError, match="not a readable .pt2 file"):
+        load_pt2(tmp_path / "half.pt2")
+
+
+def test_files_of_others_are_refused(tmp_path):
+    # fails if a .pt2 file without our metadata, or of a later format, is stepped all the same
+    class Double(torch.nn.Module):
+        def forward(self, x):
+            return 2 * x
+
+    program = torch.export.export(Double(), (torch.ones(3),))
+    torch.export.save(program, tmp_path / "other.pt2")
+    with pytest.raises(InputError, match="no herglotz metadata"):
+        load_pt2(tmp_path / "other.pt2")
+    later = {"format": 99, "dof": 1, "dtype": "float64", "h": 0.1, "box": None, "newton_iterations": 2, "newton_tolerance": 0.0}
+    torch.export.save(program, tmp_path / "later.pt2", extra_files={"metadata.json": json.dumps(later)})
+    with pytest.raises(InputError, match="format 99, this herglotz reads 1"):
+        load_pt2(tmp_path / "later.pt2")
+
+
+def test_what_cannot_be_exported_is_refused(tmp_path):
+    # fails if a mistake is found only after the file was written
+    model, path = model_of(1, "linear"), tmp_path / "a.pt2"
+    for h in (0.0, float("nan")):
+        with pytest.raises(InputError, match="h must be a finite number > 0"):
+            export_pt2(model, path, h=h)
+    with pytest.raises(InputError, match="units needs one entry"):
+        export_pt2(model, path, h=0.1, units=["rad", "m"])
+    with pytest.raises(InputError, match="box needs exactly the keys"):
+        export_pt2(model, path, h=0.1, box={"q_low": [0.0]})
+    with pytest.raises(InputError, match="p_low needs 1 numbers"):
+        export_pt2(model, path, h=0.1, box={**BOX, "p_low": [0.0, 1.0]})
+    with pytest.raises(InputError, match="q_low must not exceed q_high"):
+        export_pt2(model, path, h=0.1, box={**BOX, "q_low": [2.0]})
+    with pytest.raises(InputError, match="may not replace dof"):
+        export_pt2(model, path, h=0.1, metadata={"dof": 7})
+    with pytest.raises(InputError, match="cannot be written as JSON"):
+        export_pt2(model, path, h=0.1, metadata={"data": torch.ones(1)})
+    with pytest.raises(InputError, match="at least 2"):
+        export_pt2(model_of(1, "affine"), path, h=0.1, newton_iterations=1)
+    with pytest.raises(InputError, match="float32 or float64 model"):
+        export_pt2(model_of(1, "linear", dtype=torch.float16), path, h=0.1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_unwritable_path_is_refused(tmp_path):
+    # fails if torch's error reaches the user or a partial file stays behind
+    with pytest.raises(InputError, match="cannot be written"):
+        export_pt2(model_of(1, "linear"), tmp_path / "nowhere" / "a.pt2", h=0.1)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_model_is_left_as_it_was():
+    # fails if export freezes or converts the caller's own parameters
+    model = model_of(1, "linear")
+    before = weights_digest(model)
+    with pytest.raises(InputError):
+        export_pt2(model, "/nowhere/at/all.pt2", h=0.1)
+    assert weights_digest(model) == before
+    assert all(x.requires_grad for x in model.parameters())

@@ -1,0 +1,184 @@
+"""Every figure is drawn from a run, says what it should, and is written as a PNG; nothing global changes."""
+
+import os
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+import torch
+from fake_run import fake_run
+from matplotlib.figure import Figure
+
+from herglotz.errors import InputError
+from herglotz.plots import (
+    FIGURES,
+    plot_data,
+    plot_momentum_vs_generating_function,
+    plot_phase_portrait,
+    plot_training,
+    plot_trajectory,
+    save_figure,
+    save_figures,
+)
+from herglotz.stepping import State
+
+KINDS = {
+    "one": {},
+    "many": {"trajectories": 5, "steps": 20},
+    "affine": {"level": "affine", "steps": 30},
+    "plane": {"dof": 2, "steps": 30},
+    "everything trained": {"fraction": 1.0, "steps": 20},
+}
+
+
+def title(figure: Figure) -> str:
+    assert figure._suptitle is not None
+    return figure._suptitle.get_text()
+
+
+def png_size(path: Path) -> tuple[int, int]:
+    head = path.read_bytes()[:24]
+    assert head[:8] == b"\x89PNG\r\n\x1a\n"
+    width, height = struct.unpack(">II", head[16:24])
+    return width, height
+
+
+@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_figure_of_every_kind_of_run(tmp_path, kind, name):
+    # fails if a figure warns, is empty, or cannot take several trajectories or coordinates, or no test part
+    figure = FIGURES[name](fake_run(**KINDS[kind]))
+    save_figure(figure, tmp_path / name)
+    width, height = png_size(tmp_path / name)
+    inches = figure.get_size_inches()
+    assert (width, height) == (int(150 * inches[0]), int(150 * inches[1]))
+    assert width >= 750
+    assert np.asarray(mpl.image.imread(tmp_path / name)).std() > 0.02  # something is drawn
+    assert title(figure)
+
+
+def test_save_figures_writes_all_and_nothing_else(tmp_path):
+    # fails if a name changes, a temporary file stays, or the folder is not made
+    folder = tmp_path / "a" / "b"
+    assert save_figures(fake_run(steps=20), folder) == [folder / name for name in FIGURES]
+    assert sorted(x.name for x in folder.iterdir()) == sorted(FIGURES)
+    assert set(FIGURES) == {
+        "trajectory.png", "phase_portrait.png", "momentum_vs_dS.png", "hj_residual.png", "training.png"
+    }  # fmt: skip
+
+
+def test_a_folder_that_cannot_be_made(tmp_path):  # fails if an OSError escapes instead of one clear line
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InputError, match="cannot be made"):
+        save_figures(fake_run(steps=12), tmp_path / "file" / "figures")
+
+
+def test_the_title_is_the_error_of_the_unseen_part():  # fails if training samples enter, or the fraction is wrong
+    run = fake_run(steps=59)
+    unseen = (run.prediction - run.data.q)[run.train_lengths[0] :].detach()
+    rms = float(unseen.square().mean().sqrt())
+    assert title(plot_trajectory(run)) == f"Extrapolation RMS {rms:.3g} rad over the unseen third"
+    assert "nothing was held out" in title(plot_trajectory(fake_run(fraction=1.0, steps=20)))
+    assert "unseen 20 %" in title(plot_trajectory(fake_run(fraction=0.8, steps=49)))
+
+
+def test_a_free_run_that_fails_is_drawn_and_named():  # fails if NaN in a prediction breaks or beautifies the figure
+    run = fake_run(steps=40)
+    run.prediction = run.prediction.clone()
+    run.prediction[35:] = torch.nan
+    run.states = State(run.prediction, run.states.p, run.states.s)
+    figure = plot_trajectory(run)
+    assert title(figure) == "The free run breaks off at 7 s"
+    for plot in FIGURES.values():
+        plot(run).canvas.draw()
+
+
+def test_one_trajectory_can_be_chosen():  # fails if the index is ignored or not checked
+    run = fake_run(trajectories=3, steps=20)
+    figure = plot_trajectory(run, 2)
+    drawn = figure.axes[0].lines[0].get_ydata()
+    np.testing.assert_array_equal(drawn, run.data[2].q[:, 0])
+    with pytest.raises(InputError, match="there is no trajectory 3; choose one from 0 to 2"):
+        plot_trajectory(run, 3)
+
+
+def test_residuals_are_data_minus_model():  # fails if the lower panel shows something else
+    run = fake_run(steps=20)
+    lower = plot_trajectory(run).axes[1]
+    drawn = np.concatenate([np.asarray(line.get_ydata()) for line in lower.lines[1:]])
+    np.testing.assert_allclose(drawn, (run.data.q - run.prediction)[:, 0].detach(), atol=1e-15)
+
+
+def test_an_angle_shows_plus_and_minus_pi():  # fails if ±π is not marked for angles, or is for lengths
+    ticks = [x.get_text() for x in plot_phase_portrait(fake_run(steps=60)).axes[0].get_xticklabels()]
+    assert {"π", "−π"} <= set(ticks)
+    ticks = [x.get_text() for x in plot_phase_portrait(fake_run(dof=2, steps=20)).axes[0].get_xticklabels()]
+    assert not {"π", "−π"} & set(ticks)
+
+
+def test_momentum_figure_takes_a_model_alone():  # fails if a model needs a run, or if dS is not the momentum
+    figure = plot_momentum_vs_generating_function(fake_run(steps=12).model, h=0.1)
+    assert float(title(figure).split()[-1]) < 1e-12
+
+
+def test_momentum_figure_shows_a_wrong_momentum():  # fails if the figure compares a momentum with itself
+    model = fake_run(steps=12).model
+
+    class Wrong(type(model)):
+        def partials(self, q0, q1, s0, h, order=1):
+            P = super().partials(q0, q1, s0, h, order)
+            return type(P)(**{**vars(P), "D2": 1.01 * P.D2})
+
+    model.__class__ = Wrong
+    assert float(title(plot_momentum_vs_generating_function(model, h=0.1)).split()[-1]) > 1e-3
+
+
+def test_the_null_grows_with_the_square_of_the_distance():  # fails if the off-flow check would pass anything (E7)
+    figure = FIGURES["hj_residual.png"](fake_run(steps=20))
+    assert float(title(figure).split()[-1]) < 1e-12
+    d, r = (np.asarray(x) for x in figure.axes[1].lines[0].get_data())
+    slope = np.polyfit(np.log(d[:6]), np.log(r[:6]), 1)[0]
+    assert abs(slope - 2) < 0.05
+
+
+def test_stages_are_separate_lines():  # fails if costs of different objectives are joined, or a stage is lost
+    figure = plot_training(fake_run(steps=12))
+    assert [len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "o"] == [
+        12,
+        10,
+        8,
+    ]
+    texts = [text.get_text() for text in figure.axes[0].texts]
+    assert texts == ["residual", "horizon 30", "whole trajectory"]
+    with pytest.raises(InputError, match="no history"):
+        plot_training(SimpleNamespace(history=[]))  # pyright: ignore[reportArgumentType]
+
+
+def test_data_alone_leaves_gaps_open():  # fails if a line is drawn across missing samples
+    data = fake_run(steps=30).data
+    keep = torch.ones(31, dtype=torch.bool)
+    keep[10:13] = False
+    gappy = type(data).of(data.t[keep], data.q[keep], angles=(True,), names=("theta",))
+    line = np.asarray(plot_data(gappy).axes[0].lines[0].get_ydata())
+    assert np.isnan(line).nonzero()[0].tolist() == [10]
+    assert plot_data(fake_run(trajectories=6, steps=12).data).axes[-1].get_title(loc="left") == "trajectory 5"
+
+
+def test_nothing_global_changes(tmp_path):  # fails if rcParams leak either way, or pyplot is imported
+    before = dict(mpl.rcParams)
+    figure = plot_training(fake_run(steps=12))
+    assert dict(mpl.rcParams) == before
+    with mpl.rc_context({"savefig.dpi": 31, "savefig.bbox": "tight"}):
+        save_figure(figure, tmp_path / "a.png")
+    assert png_size(tmp_path / "a.png") == (1290, 750)
+
+
+def test_no_display_and_no_pyplot_needed():  # fails if pyplot, and with it a window system, is imported
+    code = "import sys, herglotz.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MPLBACKEND")}
+    assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0

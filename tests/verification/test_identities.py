@@ -1,0 +1,69 @@
+"""The identities of a contact integrator on random models and on every scene."""
+
+import pytest
+import torch
+
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State
+from herglotz.systems import scene, scene_names
+from herglotz.verify import verify
+
+
+def random_model(n, level, seed, correction=8):
+    """A model whose every parameter, zero-initialised ones included, is random; mixed angles and lengths."""
+    ones, make = (1.0,) * n, torch.Generator().manual_seed(seed)
+    angles = tuple(i % 2 == 0 for i in range(n))
+    config = ModelConfig(angles, level, ones, ones, ones, (0.0,) * n, correction_width=correction, seed=seed)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    x = torch.randn(32, 2 * n + 1, generator=make, dtype=torch.float64)
+    return model, State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("level", ["linear", "affine"])
+def test_random_models_are_contact_integrators(n, level):
+    # fails if any closed-form derivative, FL⁻, FL⁺, c or the step's own derivative is wrong
+    report = verify(random_model(n, level, seed=n), h=0.1, steps=4)
+    assert report.passed, report.table()
+    assert report["contact"].value <= 1e-12
+    for name in ("volume", "momentum", "D1S", "D2S", "D3S", "hamilton_jacobi"):
+        assert report[name].value <= 1e-11, report.table()
+
+
+@pytest.mark.parametrize("h", [0.02, 0.5])
+def test_the_identities_hold_at_any_step(h):
+    # fails if a term scales with h in its value and not in its derivative
+    report = verify(random_model(1, "affine", seed=5), h=h, steps=4)
+    assert report.passed, report.table()
+
+
+def test_float32_has_its_own_bounds():
+    # fails if a float32 model is held to float64 bounds, or if its bounds let anything pass
+    model, states = random_model(2, "affine", seed=2)
+    report = verify((model.float(), State(*(x.float() for x in states))), h=0.1, steps=4)
+    assert report.passed, report.table()
+    assert 1e-10 < report["contact"].value < report["contact"].bound == 5e-4
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_every_scene_verifies(name):
+    # fails if a scene's L_d, its closed-form derivatives or its closed-form flow is wrong
+    report = verify(name)
+    assert report.passed, report.table()
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_every_rule_of_every_scene_verifies(name):
+    # fails if a rule's value is not differentiable as its derivatives say (the implicit midpoint above all)
+    system = scene(name)
+    make = torch.Generator().manual_seed(0)
+    q = torch.empty(16, system.dof, dtype=torch.float64).uniform_(*system.q_range, generator=make)
+    v = torch.empty(16, system.dof, dtype=torch.float64).uniform_(*system.v_range, generator=make)
+    s = torch.rand(16, generator=make, dtype=torch.float64)
+    states = State(q, system.momentum(q, v, s), s)
+    for rule, L_d in system.L_d_rules.items():
+        report = verify((L_d, states), h=system.h / 2, steps=3)
+        assert report.passed, f"{rule}\n{report.table()}"

@@ -1,0 +1,151 @@
+"""Null models must fail: a check that accepts these checks nothing."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.stepping import State, Step, Stepper
+from herglotz.systems import scene
+from herglotz.verify import verify
+from herglotz.verify.action import fan, hamilton_jacobi
+from herglotz.verify.subject import subject
+
+H = 0.1
+OSCILLATOR = scene("damped_oscillator").L_d
+
+
+def states(n=1, count=16, seed=0):
+    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+
+
+class Altered:
+    """The oscillator's stepper with its result changed; the L_d it claims is the true one."""
+
+    L_d = OSCILLATOR
+
+    def __init__(self, change):
+        self.change = change
+
+    def step(self, state, h):
+        return self.change(state, Stepper(self.L_d).step(state, h))
+
+
+def with_state(step, **parts):
+    return replace(step, state=step.state._replace(**parts))
+
+
+def failed(report):
+    return {check.name for check in report.checks if not check.passed}
+
+
+def test_the_unaltered_stepper_passes():
+    # fails if the harness of this file itself makes checks fail
+    assert verify((Altered(lambda _, step: step), states()), h=H).passed
+
+
+def test_a_constant_L_d_fails():
+    # fails if regularity or convergence accepts M = 0, which every residual accepts
+    report = verify((lambda q0, q1, s0, h: 0.3 + 0 * (q0 + q1).sum(-1) + 0 * s0 + 0 * h, states()), h=H)
+    assert {"converged", "regularity"} <= failed(report)
+    # fails if checks with no sample left pass vacuously
+    assert {"contact", "volume", "momentum", "D2S", "hamilton_jacobi"} <= failed(report)
+
+
+def test_an_L_d_blind_to_s_fails_against_a_claim_of_damping():
+    # fails if c is taken from the map that it is compared with, instead of from the claim
+    def blind(q0, q1, s0, h):
+        return ((q1 - q0) ** 2).sum(-1) / (2 * h) - h / 2 * (q0**2).sum(-1) + 0 * s0
+
+    class Claims:
+        def step(self, state, h) -> Step:
+            step = Stepper(blind).step(state, h)
+            return replace(step, c=step.c * torch.exp(torch.tensor(-0.2 * h, dtype=torch.float64)))
+
+    assert verify((blind, states()), h=H).passed
+    assert {"contact", "volume", "D3S"} <= failed(verify((Claims(), states()), h=H))
+
+
+def test_a_degenerate_model_fails():
+    # fails if regularity accepts b(q1) − c·b(q0) + (c − 1)s, whose Herglotz residual is zero for every motion (trap 2)
+    def degenerate(q0, q1, s0, h):  # noqa: ARG001
+        c = 0.9
+        b0, b1 = (torch.sin(q).sum(-1) + (q**2).sum(-1) for q in (q0, q1))
+        return b1 - c * b0 + (c - 1) * s0
+
+    assert "regularity" in failed(verify((degenerate, states()), h=H))
+
+
+def test_a_nearly_degenerate_model_fails_regularity_alone():
+    # fails if the margin is not scale-free: here M is 1e-5 everywhere, every step converges, and D11, D22 are of size 1
+    def collapsed(q0, q1, s0, h):  # noqa: ARG001
+        return (q1**2 - 0.9 * q0**2).sum(-1) + 1e-5 * (q0 * q1).sum(-1) - 0.1 * s0
+
+    q, p, s = states()
+    start = State(q, -2 * q + 1e-6 * p, s)  # momenta that lead to q1 of size 1
+    assert "regularity" in failed(verify((collapsed, start), h=H, steps=2))
+
+
+def test_a_change_of_sign_of_det_M_fails():
+    # fails if only |det M| at the samples is looked at
+    def folded(q0, q1, s0, h):
+        return ((q1 - q0) ** 2).sum(-1) / (2 * h) * torch.tanh(5 * q0).sum(-1) + 0 * s0
+
+    q, p, s = states()
+    report = verify((folded, State(torch.where(q > 0, q + 1, q - 1), 0.1 * p, s)), h=H, steps=2)
+    assert "sign" in report["regularity"].note
+    assert "regularity" in failed(report)
+
+
+def test_a_momentum_scaled_wrongly_fails():
+    # fails if the contact defect or the momentum check compares p with itself
+    report = verify((Altered(lambda _, step: with_state(step, p=1.01 * step.state.p)), states()), h=H)
+    assert {"contact", "volume", "momentum", "D2S"} <= failed(report)
+
+
+def test_a_momentum_divided_by_c_fails():
+    # fails if FL⁺ is divided by c and nobody notices
+    report = verify((Altered(lambda _, step: with_state(step, p=step.state.p / step.c[:, None])), states()), h=H)
+    assert {"contact", "momentum", "D2S"} <= failed(report)
+
+
+def test_an_action_that_is_not_the_sum_of_L_d_fails():
+    # fails if the Hamilton–Jacobi check takes S from somewhere else than the flow's s
+    def half(state, step):
+        return with_state(step, s=(state.s + step.state.s) / 2)
+
+    assert {"contact", "D2S", "D3S", "hamilton_jacobi"} <= failed(verify((Altered(half), states()), h=H))
+
+
+def test_a_position_that_misses_the_solution_fails_momentum_matching():
+    # fails if momentum matching is measured on the stepper's own p instead of on q by the Herglotz residual
+    report = verify((Altered(lambda _, step: with_state(step, q=step.state.q + 1e-6)), states()), h=H)
+    assert "momentum" in failed(report)
+
+
+@pytest.mark.parametrize("wrong", ["scaled", "shifted", "slope"])
+def test_the_Hamilton_Jacobi_check_rejects_a_wrong_S(wrong):
+    # fails if the residual is zero for any S, e.g. because H⁺ is built from the same S
+    known = subject((OSCILLATOR, states()), H, 16, 0)
+    f = fan(known, 4, 0)
+    assert hamilton_jacobi(known, f, 1e-10).passed
+    change = {
+        "scaled": lambda g: replace(g, S=1.1 * g.S, D2=1.1 * g.D2),
+        "shifted": lambda g: replace(g, S=g.S + 0.01 * g.q[..., 0], D2=g.D2 + 0.01),
+        "slope": lambda g: replace(g, D2=g.D2 + 0.01),
+    }[wrong]
+    broken = replace(f, S={k: change(g) if k % 2 == 0 else g for k, g in f.S.items()})
+    assert not hamilton_jacobi(known, broken, 1e-10).passed
+
+
+def test_all_samples_at_a_caustic_fail():
+    # fails if a check whose every sample is left out passes: at ωh = π all solutions of the oscillator meet again
+    oscillator = scene("damped_oscillator")
+    report = verify(oscillator, h=3.15741941699827646 / 2, steps=2)
+    assert report["D2S"].passed  # k = 1 is kept
+    assert report["D2S"].note
+    known = subject((oscillator.L_d, states()), H, 16, 0)
+    f = fan(known, 4, 0)
+    nowhere = replace(f, keep={k: torch.zeros_like(x) for k, x in f.keep.items()})
+    assert not hamilton_jacobi(known, nowhere, 1e-10).passed
