@@ -34,8 +34,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
         return stop.code if isinstance(stop.code, int) else OK
-    except KeyboardInterrupt:
-        return _say("interrupted", INTERRUPTED)
+    except KeyboardInterrupt as interrupt:
+        return _say(f"interrupted{interrupt}", INTERRUPTED)
     except BrokenPipeError:  # the reader of our output has left (`herglotz verify ... | head -1`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK

@@ -122,7 +122,8 @@ class ExportedStepper:
 
     def _step(self, state: State, h: Tensor) -> Step:
         q, p, s = state
-        if h.ndim and torch.broadcast_shapes(h.shape, s.shape) != s.shape:
+        fits = h.ndim <= s.ndim and all(a in (1, b) for a, b in zip(h.shape[::-1], s.shape[::-1], strict=False))
+        if not fits:
             raise InputError(f"h must be a scalar or match the batch {tuple(s.shape)}, got shape {tuple(h.shape)}")
         flat = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.expand(s.shape).reshape(-1))
         q1, p1, s1, c, residual, status = self.module(*(x.contiguous() for x in flat))
@@ -145,7 +146,7 @@ class ExportedStepper:
     def _checked_h(self, h: Tensor | float) -> Tensor:
         h = torch.as_tensor(h, dtype=self.dtype)
         if h.numel() == 0 or not bool(((h > 0) & torch.isfinite(h)).all()):
-            raise InputError(f"h must be finite and > 0, got {float(h.min()) if h.numel() else 'none':}")
+            raise InputError(f"h must be finite and > 0, got {float(h.min()) if h.numel() else 'none'}")
         return h
 
     def _steps(self, h: Tensor | float, steps: int | None) -> Tensor:

@@ -43,7 +43,7 @@ class StepModule(nn.Module):
         s: Tensor,  # (B,)
         h: Tensor,  # (B,)
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """guess → Newton → momentum → action.
+        """One step: guess → Newton → momentum → action.
 
         Returns
         -------

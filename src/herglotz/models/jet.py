@@ -190,5 +190,3 @@ def affine(value: Tensor, slope: Tensor, order: int) -> Jet:
 def concatenate(jets: list[Jet]) -> Jet:
     """Join vector-valued jets along the last axis."""
     return Jet(torch.cat([j.data for j in jets], -1), jets[0].tangents, jets[0].order)
-
-

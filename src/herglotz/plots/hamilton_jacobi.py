@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
 
 STEPS, SIZE = 8, 31
 NULL_STEPS = (1, 4, 8)
-DISTANCES = np.logspace(-5, -0.5, 10)  # of q_{k+1} from the flow, in units of the fan's width
-FLOOR = 1e-18  # a residual of exactly 0 is drawn here
+DISTANCES, ANCHOR = np.logspace(-5, -0.5, 10), 7  # of q_{k+1} from the flow, in units of the fan's width
+BELOW = 1 / 200  # of a rounding error: where a difference of exactly 0 is drawn
 
 
 def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: float | None = None) -> Figure:
@@ -47,6 +48,7 @@ def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: 
         pairs.append(torch.stack([S.p[fine], S.D2[fine]]).flatten(1).double().cpu().numpy())
     everything = np.concatenate(pairs, 1)
     worst = float(np.abs(everything[0] - everything[1]).max()) if everything.size else float("nan")
+    floor = BELOW * torch.finfo(fan.start.q.dtype).eps
     with styled():
         figure = new_figure(9.2, 4.4, f"The action's derivative is the momentum, to {worst:.1e}")
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.0])
@@ -58,11 +60,13 @@ def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: 
         left.set(xlabel=with_unit("$p_k$ from the stepper", unit), box_aspect=1)
         left.set(ylabel=with_unit(r"$D_2S^k(q_k)$ from the action", unit))
         for k, (p, dS) in enumerate(pairs, 1):
-            right.plot(np.full(len(p), k), np.maximum(np.abs(p - dS), FLOOR), "o", ms=3.5, color=MODEL, alpha=0.35)
-        right.axhline(max(worst, FLOOR), color=INK, lw=1.0, ls=(0, (4, 3)))
-        label(right, STEPS, max(worst, FLOOR), f"largest: {worst:.1e}", INK, ha="right", xytext=(8, 3))
-        right.set(yscale="log", ylim=(FLOOR / 3, max(30 * worst, 1e-12)), xlabel="steps k", xticks=range(1, STEPS + 1))
-        captions(right, [(f"a difference of exactly 0 is drawn at {FLOOR:.0e}", "#666666")])
+            right.plot(np.full(len(p), k), np.maximum(np.abs(p - dS), floor), "o", ms=3.5, color=MODEL, alpha=0.35)
+        right.axhline(max(worst, floor), color=INK, lw=1.0, ls=(0, (4, 3)))
+        label(right, STEPS, max(worst, floor), f"largest: {worst:.1e}", INK, ha="right", xytext=(8, 3))
+        right.set(
+            yscale="log", ylim=(floor / 3, max(1e3 * worst, 1e6 * floor)), xlabel="steps k", xticks=range(1, STEPS + 1)
+        )
+        captions(right, [(f"a difference of exactly 0 is drawn at {floor:.0e}", "#666666")])
         right.set(ylabel=with_unit(r"$|D_2S^k(q_k) - p_k|$", unit), box_aspect=1)
     return figure
 
@@ -81,12 +85,19 @@ def plot_hamilton_jacobi_residual(run: Run) -> Figure:
     table = torch.stack(rows).double().cpu().numpy()
     distance, off_flow = _off_flow(fan, S)
     worst = float(np.nanmax(table)) if np.isfinite(table).any() else float("nan")
+    floor = BELOW * torch.finfo(fan.start.q.dtype).eps
     with styled():
         title = f"The learned action solves the discrete Hamilton–Jacobi equation: relative residual ≤ {worst:.0e}"
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
-        _draw_table(figure, left, fan, table)
-        _draw_null(right, distance, off_flow, worst, with_unit(r"distance of $q_{k+1}$ from the flow", _length(run)))
+        _draw_table(figure, left, fan, np.maximum(table, floor))
+        _draw_null(
+            right,
+            distance,
+            off_flow,
+            max(worst, floor),
+            with_unit(r"distance of $q_{k+1}$ from the flow", _length(run)),
+        )
     return figure
 
 
@@ -125,12 +136,13 @@ def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
     momenta = fan.start.p[:, 0].double().cpu().numpy()
     half = 0.5 * (momenta[1] - momenta[0])
     extent = (momenta[0] - half, momenta[-1] + half, 0.5, STEPS + 0.5)
+    low = math.floor(np.log10(BELOW * torch.finfo(fan.start.q.dtype).eps))
     image = ax.imshow(
-        np.log10(np.maximum(table, FLOOR)), origin="lower", aspect="auto", extent=extent, cmap="cividis",
-        vmin=-17, vmax=-1, interpolation="nearest",
+        np.log10(table), origin="lower", aspect="auto", extent=extent, cmap="cividis",
+        vmin=low, vmax=-1, interpolation="nearest",
     )  # fmt: skip
     ax.set_facecolor("#DDDDDD")
-    bar = figure.colorbar(image, ax=ax, ticks=[-17, -13, -9, -5, -1])
+    bar = figure.colorbar(image, ax=ax, ticks=np.linspace(low, -1, 5).round())
     bar.set_label("log₁₀ relative residual", fontsize=9)
     ax.set(xlabel=with_unit(r"initial momentum $\hat p_0$", fan.momentum_unit and f"{fan.momentum_unit}, mass 1"))
     ax.set(ylabel="steps k", yticks=range(1, STEPS + 1), title="on the flow" + _caustics(table))
@@ -145,21 +157,27 @@ def _draw_null(ax: Axes, distance: np.ndarray, off_flow: np.ndarray, on_flow: fl
             ax.plot(d[fine], r[fine], "o-", ms=3, color=color)
             names.append((f"● k = {k}", color))
     ax.set(xscale="log", yscale="log", xlabel=xlabel, ylabel="relative residual, median", title="off the flow (null)")
-    ax.axhline(max(on_flow, FLOOR), color=INK, lw=1.0, ls=(0, (4, 3)))
+    ax.axhline(on_flow, color=INK, lw=1.0, ls=(0, (4, 3)))
     span = np.array([np.nanmin(distance), np.nanmax(distance)])
-    middle = off_flow[0, len(DISTANCES) // 2] * (span / distance[0, len(DISTANCES) // 2]) ** 2
-    ax.plot(span, 6 * middle, color=MUTED, lw=1.0, ls=":")
-    ax.set_ylim(top=300 * np.nanmax(middle))
-    captions(ax, names, "center right")
-    label(ax, span[1], max(on_flow, FLOOR), f"on the flow: at most {on_flow:.0e}", ha="right")
-    slope = _slope(distance[0], off_flow[0])
-    captions(ax, [(f"grows like distance^{slope:.2f}", MODEL), ("dotted: the square, as it must", "#666666")])
+    square = off_flow[0, ANCHOR] * (span / distance[0, ANCHOR]) ** 2
+    ax.plot(span, 6 * square, color=MUTED, lw=1.0, ls=":")
+    ax.set_ylim(bottom=on_flow / 30, top=1e5 * np.nanmax(square))
+    captions(ax, names, row=1)
+    label(ax, span[1], on_flow, f"on the flow: at most {on_flow:.0e}", ha="right")
+    slope = _slope(distance[0], off_flow[0], 30 * on_flow)
+    captions(
+        ax,
+        [
+            (f"grows like distance^{slope:.2f}" if math.isfinite(slope) else "growth not measurable", MODEL),
+            ("dotted: the square, as it must", "#666666"),
+        ],
+    )
 
 
-def _slope(d: np.ndarray, r: np.ndarray) -> float:
+def _slope(d: np.ndarray, r: np.ndarray, noise: float) -> float:
     """Slope of log r in log d above round-off and below saturation."""
-    fine = np.isfinite(r) & (r > 1e-12) & (r < 1e-3) & (d > 0)
-    return float(np.polyfit(np.log(d[fine]), np.log(r[fine]), 1)[0]) if fine.sum() > 2 else float("nan")
+    fine = np.isfinite(r) & (r > noise) & (r < 1e-2) & (d > 0)
+    return float(np.polyfit(np.log(d[fine]), np.log(r[fine]), 1)[0]) if fine.sum() > 1 else float("nan")
 
 
 def _without(count: int) -> str:

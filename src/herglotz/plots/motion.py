@@ -17,7 +17,7 @@ from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, new
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-MOST_PANELS = 4
+MOST_PANELS, DATA = 4, "#B5B5B5"
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 
@@ -103,13 +103,11 @@ def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled:
     if count < len(t):
         for ax in (top, bottom):
             ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
-    top.plot(t, q, ".", color=INK, ms=3.2, zorder=2)
-    if len(t) > 120:
-        top.plot(t, model, color="white", lw=2.2, zorder=2.5)
+    top.plot(t, q, ".", color=DATA, ms=7, mew=0, zorder=2)  # wide and pale, so that the line does not hide them
     seen, unseen = slice(0, max(count, 0)), slice(max(count - 1, 0), None)
-    top.plot(t[seen], model[seen], color=MODEL, zorder=3)
+    top.plot(t[seen], model[seen], color=MODEL, lw=1.2, zorder=3)
     if count < len(t):
-        top.plot(t[unseen], model[unseen], color=UNSEEN, zorder=3)
+        top.plot(t[unseen], model[unseen], color=UNSEEN, lw=1.2, zorder=3)
     low, high = np.nanmin(np.r_[q, model[np.isfinite(model)]]), np.nanmax(np.r_[q, model[np.isfinite(model)]])
     top.set_ylim(low - 0.06 * (high - low) - 1e-12, high + 0.24 * (high - low) + 1e-12)
     top.set_ylabel(with_unit(data.names[i], unit))
@@ -133,7 +131,7 @@ def _draw_labels(
     split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
     if labelled:
         trained = [("━ model, trained here", MODEL)] if count else []
-        captions(top, [("● data", INK), *trained])
+        captions(top, [("● data", "#777777"), *trained])
     if labelled and count < len(t):
         captions(top, [("━ model, free run", UNSEEN)], "upper right")
     reach = float(np.nanmax(np.abs(residual))) if np.isfinite(residual).any() else 0.0

@@ -78,10 +78,17 @@ def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: 
     ax.annotate(text, (x, y), textcoords="offset points", color=color, bbox=box, **options)
 
 
-def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left") -> None:
-    """Write (text, colour) entries in one line inside the panel, each in the colour of what it names."""
+def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left", row: int = 0) -> None:
+    """Write (text, colour) entries in one line inside the panel, each in the colour of what it names.
+
+    `row` counts lines from the panel's top, for a second line under the first.
+    """
     areas = [TextArea(text, textprops={"color": color, "fontsize": 8.5}) for text, color in entries]
-    box = AnchoredOffsetbox(where, child=HPacker(children=list(areas), pad=0, sep=10), pad=0.35, borderpad=0.2)
+    line = HPacker(children=list(areas), pad=0, sep=10)
+    place: Any = (0.0, 0.0, 1.0, 1.0 - 0.075 * row)
+    box = AnchoredOffsetbox(
+        where, child=line, pad=0.35, borderpad=0.2, bbox_to_anchor=place, bbox_transform=ax.transAxes
+    )
     box.patch.set(facecolor="white", edgecolor="none", alpha=0.85)
     box.set_zorder(5)
     ax.add_artist(box)

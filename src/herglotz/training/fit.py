@@ -236,9 +236,7 @@ def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor]:
     return (t.diff() / counts).repeat_interleave(counts), counts.cumsum(0)
 
 
-def _judge(
-    fitted: _Fitted, data: Trajectories, train: Trajectories, states: State, base: Baseline
-) -> dict[str, Any]:
+def _judge(fitted: _Fitted, data: Trajectories, train: Trajectories, states: State, base: Baseline) -> dict[str, Any]:
     """RMS errors in the units of q; None where there is nothing to measure or the prediction failed."""
     training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, trained in zip(data.offsets, train.lengths, strict=True):

@@ -124,9 +124,7 @@ class ResidualProblem:
         P = len(x) - self.latents
         return x[:P], x[P:]
 
-    def _local(
-        self, theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, s0: Tensor, h0: Tensor, h1: Tensor
-    ) -> Tensor:
+    def _local(self, theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, s0: Tensor, h0: Tensor, h1: Tensor) -> Tensor:
         """J⁻¹R (or R) of one triple or of a batch of them."""
         before = self.flat.partials(theta, q0, q1, s0, h0, 1)
         after = self.flat.partials(theta, q1, q2, s0 + before.L, h1, 2)

@@ -71,9 +71,7 @@ class Stages:
                 result = optimise(x, callback)
             self._store(name, result, done=True)
         start = len(self.history)
-        self.history += [
-            {"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)
-        ]
+        self.history += [{"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)]
         return result
 
     def _store(self, name: str, r: OptimiserResult, done: bool) -> None:

@@ -56,7 +56,7 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
     make = torch.Generator().manual_seed(seed)
     size = p.std(0, correction=0) if len(p) > 1 else p.abs()[0]
     size = torch.where(size > 0, size, 1.0)
-    offset = torch.randn(len(p), FAN, p.shape[-1], generator=make, dtype=torch.float64).to(p.dtype)
+    offset = torch.randn(len(p), FAN, p.shape[-1], generator=make, dtype=torch.float64).to(p)
     offset[:, 0] = 0.0
     momenta = p[:, None] + OPENING * size * offset
     start = State(
@@ -95,8 +95,8 @@ def derivatives(f: Fan, bound: float) -> list[Check]:
 def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
     """S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
 
-    H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is known
-    it is p1·q1 − (s1 − s0) along the step.
+    H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is
+    known it is p1·q1 − (s1 − s0) along the step.
     """
     residuals, sizes, folds = [], [], 0
     for k in [k for k in f.S if k + 1 in f.S]:
@@ -119,7 +119,9 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
         notes.append("no L_d in the file: H⁺ rebuilt as p1·q1 − (s1 − s0)")
     size = worst(torch.cat(sizes))
     value = worst(torch.cat(residuals)) / size if size > 0 else float("nan")
-    return Check.at_most("hamilton_jacobi", "discrete Hamilton–Jacobi equation on a fan", value, bound, "; ".join(notes))
+    return Check.at_most(
+        "hamilton_jacobi", "discrete Hamilton–Jacobi equation on a fan", value, bound, "; ".join(notes)
+    )
 
 
 def _right_hamiltonian(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:

@@ -1,4 +1,4 @@
-"""Does a fitted model predict the motion it was fitted to? The identities cannot tell: a constant L_d satisfies many."""
+"""Does a fitted model predict the motion it was fitted to? The identities cannot tell: any regular L_d has them all."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     """The checks that need recorded motion, and the numbers behind them.
 
     One step: RMS of J⁻¹R over the recorded triples, each coordinate in units of its own spread, against that of uniform
-    motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both alike, so its share, estimated from the data
-    alone, is taken off both; where the null model's error *is* noise, one step decides nothing and the check is left out.
+    motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both alike, so before a model fails its share,
+    estimated from the data alone, is taken off both; where the null model's error *is* noise, one step decides nothing
+    and the check is left out.
 
     Free run: RMS of prediction − data over the samples beyond the training part, relative to their spread.
     """
@@ -37,7 +38,9 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     numbers = {"one_step_rms": model, "null_rms": null, "noise_rms": floor}
     checks, extra = [], ""
     if null**2 > DECIDABLE * floor**2:
-        ratio = math.sqrt(max(model**2 - floor**2, 0.0) / (null**2 - floor**2)) if math.isfinite(model) else math.inf
+        ratio = model / null if math.isfinite(model) else math.inf
+        if ratio > ONE_STEP:  # perhaps only noise keeps it there
+            ratio = math.sqrt(max(model**2 - floor**2, 0.0) / (null**2 - floor**2))
         note = f"RMS {model:.3g}, uniform motion {null:.3g}, noise {floor:.3g}, in units of the data's spread"
         checks.append(Check.at_most("one_step", "predicts a step: |J⁻¹R| over uniform motion", ratio, ONE_STEP, note))
     else:
@@ -55,9 +58,7 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
     keep = (t.h0 <= 1.5 * run.h) & (t.h1 <= 1.5 * run.h)  # no single step across a gap
     if not bool(keep.any()):
         keep = torch.ones_like(keep)
-    q0, q1, q2, h0, h1, s0 = (
-        x[keep].to(dtype) for x in (t.q0, t.q1, t.q2, t.h0, t.h1, run.states.s[t.index])
-    )
+    q0, q1, q2, h0, h1, s0 = (x[keep].to(dtype) for x in (t.q0, t.q1, t.q2, t.h0, t.h1, run.states.s[t.index]))
     with torch.no_grad():
         before = partials(run.model, q0, q1, s0, h0)
         after = partials(run.model, q1, q2, s0 + before.L, h1, 2)
@@ -102,7 +103,7 @@ def _free_run(run: Run) -> tuple[float, str]:
         rows, note = [torch.arange(len(q))], "no samples were held out: all of them"
     index = torch.cat(rows)
     error = run.prediction[index].to(q.dtype) - q[index]
-    turning = torch.tensor(run.data.angles)
+    turning = torch.tensor(run.data.angles, device=q.device)
     error = torch.where(turning, error - 2 * math.pi * torch.round(error / (2 * math.pi)), error)
     value = _rms(error / _spread(q[index]))
     return (value if math.isfinite(value) else math.inf), note

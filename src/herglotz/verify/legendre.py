@@ -40,7 +40,7 @@ def momentum_matching(subject: Subject, w: Walk, bound: float) -> Check:
 
 
 def regularity(subject: Subject, w: Walk) -> Check:
-    """det M ≠ 0 with a margin: smallest singular value of M, in units that make D11, D22 and M of size 1.
+    """Regularity, det M ≠ 0 with a margin: smallest singular value of M, in units that make D11, D22 and M of size 1.
 
     Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. A determinant of
     either sign among the samples means that M is singular somewhere between them.
@@ -67,9 +67,8 @@ def _hessians(subject: Subject, w: Walk) -> tuple[Tensor, list[Tensor], str]:
     """M and the blocks it is compared with, at every step; a step that failed is replaced by rest, q1 = q0."""
     q0, q1 = w.q[:, :-1], w.q[:, 1:]
     q1 = torch.where(w.ok[..., None], q1, q0)
-    flat = (x.flatten(0, 1) for x in (q0, q1))
     assert subject.L_d is not None
-    P = partials(subject.L_d, *flat, w.s[:, :-1].flatten(0, 1), subject.h, 2)
+    P = partials(subject.L_d, q0.flatten(0, 1), q1.flatten(0, 1), w.s[:, :-1].flatten(0, 1), subject.h, 2)
     M = mixed_hessian(P)
     note = "" if bool(w.ok.all()) else "M at q1 = q0 where the step failed"
     return M, [M, P.D11, P.D22], note

@@ -26,7 +26,9 @@ class Check:
         return cls(name, statement, value, bound, value <= bound, note)
 
     @classmethod
-    def more_than(cls, name: str, statement: str, value: float, bound: float, note: str = "", also: bool = True) -> Check:
+    def more_than(
+        cls, name: str, statement: str, value: float, bound: float, note: str = "", also: bool = True
+    ) -> Check:
         """A check that passes when value > bound and `also` holds."""
         return cls(name, statement, value, bound, also and value > bound, note, ">")
 
@@ -76,7 +78,7 @@ class Report:
         widths = [max(_width(row[i]) for row in rows) for i in range(3)]
         lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
         lines += [
-            f"  {claim}{' ' * (widths[0] - _width(claim))}  {value:>{widths[1]}}  {bound:<{widths[2]}}  {verdict}".rstrip()
+            f"  {_pad(claim, widths[0])}  {value:>{widths[1]}}  {bound:<{widths[2]}}  {verdict}".rstrip()
             for claim, value, bound, verdict in rows
         ]
         lines += [f"  [{i}] {note}" for i, note in enumerate(notes, 1)]
@@ -90,6 +92,10 @@ class Report:
             "details": self.details,
             "checks": [check.to_dict() for check in self.checks],
         }
+
+
+def _pad(text: str, width: int) -> str:
+    return text + " " * (width - _width(text))
 
 
 def _width(text: str) -> int:

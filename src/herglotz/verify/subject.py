@@ -74,7 +74,15 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     if isinstance(target, Run):
         states = _run_states(target, samples, make)
         size = _step_size(h, target.h)
-        return Subject(f"run on {target.data.source or 'data'}", "run", _stepper(target.model), states, size, target.model, run=target)
+        return Subject(
+            f"run on {target.data.source or 'data'}",
+            "run",
+            _stepper(target.model),
+            states,
+            size,
+            target.model,
+            run=target,
+        )
     if isinstance(target, ExportedStepper):
         return Subject(target.path, "pt2", target.step, draw(target, samples, make), _step_size(h, target.h))
     if isinstance(target, tuple) and len(target) == 2:

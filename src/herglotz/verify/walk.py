@@ -75,7 +75,7 @@ def convergence(w: Walk) -> Check:
 
 
 def positive_factor(w: Walk) -> Check:
-    """c > 0 at every step: orientation is kept and FL⁻ exists."""
+    """Conformal factor c > 0 at every step: orientation is kept and FL⁻ exists."""
     c = w.c[w.ok]
     return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
 
@@ -91,7 +91,7 @@ def contact(w: Walk, bound: float) -> Check:
 
 
 def volume(w: Walk, bound: float) -> Check:
-    """det DΦ̃ = c^{n+1}, relative."""
+    """Volume factor det DΦ̃ = c^{n+1}, relative."""
     n = w.q.shape[-1]
     ratio = torch.linalg.det(w.derivative[w.ok]) / w.c[w.ok] ** (n + 1)
     return Check.at_most("volume", "volume: det DΦ̃ = c^(n+1)", worst((ratio - 1).abs()), bound)

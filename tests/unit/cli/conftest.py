@@ -9,7 +9,7 @@ from herglotz.cli import main
 
 @pytest.fixture(scope="session")
 def tiny_csv(tmp_path_factory) -> Path:
-    """One pendulum motion of 31 samples without noise."""
+    """One pendulum motion of 31 samples."""
     path = tmp_path_factory.mktemp("cli_data") / "tiny.csv"
     arguments = [
         "simulate",
@@ -23,7 +23,7 @@ def tiny_csv(tmp_path_factory) -> Path:
         "--h",
         "0.2",
     ]
-    assert main([*arguments, "--seed", "4"]) == 0
+    assert main([*arguments, "--seed", "4", "--noise", "0.005"]) == 0
     return path
 
 

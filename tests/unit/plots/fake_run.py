@@ -1,16 +1,22 @@
 """A run as the fit returns it, without a fit: a model near the truth, its free run, and an invented history."""
 
-from types import SimpleNamespace
-
 import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.systems import scene
+from herglotz.training import FitConfig, Run
 
 
-def fake_run(trajectories: int = 1, steps: int = 60, level: str = "linear", dof: int = 1, fraction: float = 2 / 3):
+def fake_run(
+    trajectories: int = 1,
+    steps: int = 60,
+    level: str = "linear",
+    dof: int = 1,
+    fraction: float = 2 / 3,
+    dtype: torch.dtype = torch.float64,
+) -> Run:
     """Pendulum data, or an oscillator in the plane for two coordinates."""
     h = 0.2
     data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=steps, h=h, noise=0.01, gaps=0, seed=3)
@@ -36,7 +42,5 @@ def fake_run(trajectories: int = 1, steps: int = 60, level: str = "linear", dof:
     history = [{"stage": "residual", "iteration": k, "cost": 30.0 * 0.5**k + 2} for k in range(12)]
     history += [{"stage": "horizon 30", "iteration": 12 + k, "cost": 90 * 0.6**k + 5} for k in range(10)]
     history += [{"stage": "whole trajectory", "iteration": 22 + k, "cost": 40 * 0.3**k + 4} for k in range(8)]
-    return SimpleNamespace(
-        model=model, data=data, prediction=states.q, states=states, h=h, train_lengths=(count,) * trajectories,
-        history=history, metrics={"extrapolation_rms": 0.1}, config=None, box=None,
-    )  # fmt: skip
+    model, data, states = model.to(dtype), data.to(dtype), State(*(x.to(dtype) for x in states))
+    return Run(model, FitConfig(level=level), {}, data, (count,) * trajectories, states, h, {}, history)

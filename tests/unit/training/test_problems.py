@@ -1,0 +1,315 @@
+"""The least-squares problems: exact derivatives, gauge invariance, optimisers, cross-validation, checkpoints."""
+
+import math
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper
+from herglotz.systems import scene
+from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.grid import segment_grid
+from herglotz.training.lifted import solve_path
+from herglotz.training.stages import Stages
+
+
+def model_of(level, n=1, seed=0, **settings):
+    angles = tuple(i == 0 for i in range(n))
+    sizes = {"scale": (1.5,) * n, "speed": (1.2,) * n, "stiffness": (1.0,) * n, "tilt": (0.0,) * n}
+    model = ContactLagrangian(ModelConfig(angles=angles, level=level, rate=0.2, **sizes, **settings))
+    make = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for p in model.parameters():
+            p += 0.1 * torch.randn(p.shape, generator=make, dtype=p.dtype)
+    return model
+
+
+def data_of(n=1, gaps=2, noise=0.01):
+    one = simulate(scene("damped_pendulum"), trajectories=3, steps=25, h=0.2, gaps=gaps, noise=noise, seed=4)
+    if n == 1:
+        return one
+    return Trajectories.of(one.t, torch.cat([one.q, one.q.cos()], -1), one.lengths, angles=(True, False))
+
+
+def prior_of(model, data, departure=0.1):
+    return Prior(model, data.q.amin(0), data.q.amax(0), departure=departure, weight=1.0, rate_spread=0.1)
+
+
+def residual_problem(level, n=1):
+    model, data = model_of(level, n), data_of(n)
+    problem = ResidualProblem(model, data, max_step=0.35, sigma=0.1, prior=prior_of(model, data), chunk=20)
+    x = problem.start()
+    return problem, torch.cat([x[: len(x) - problem.latents], torch.full((problem.latents,), 0.3).to(x)])
+
+
+def shooting_problem(level, n=1):
+    model, data = model_of(level, n), data_of(n)
+    problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=0.1, prior=prior_of(model, data), chunk=20)
+    starts = problem.grid.start_sample
+    velocity = (data.q[starts + 1] - data.q[starts]) / (data.t[starts + 1] - data.t[starts])[:, None]
+    return problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], velocity))
+
+
+@pytest.mark.parametrize("make", [residual_problem, shooting_problem])
+@pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("linear", 2)])
+def test_gradients_match_finite_differences(make, level, n):
+    # fails if a term of the implicit-function theorem, of the recurrence for s, or of the prior is missing
+    problem, x = make(level, n)
+    cost, A, b = problem.normal_equations(x)
+    assert float(cost) == pytest.approx(float(problem.cost(x)), rel=1e-12)
+    make_noise = torch.Generator().manual_seed(0)
+    for _ in range(3):
+        d = torch.randn(len(x), generator=make_noise, dtype=x.dtype)
+        e = 1e-6
+        slope = (float(problem.cost(x + e * d)) - float(problem.cost(x - e * d))) / (2 * e)
+        assert float(b @ d) == pytest.approx(slope, rel=2e-5, abs=1e-6 * float(cost))
+    assert float(torch.linalg.eigvalsh(A).min()) > -1e-9 * float(A.diagonal().max())
+
+
+def test_gradient_for_adam_is_the_same_gradient():
+    # fails if the Jacobian-free path optimises another function
+    for level in ("linear", "affine"):
+        problem, x = residual_problem(level)
+        cost, gradient = problem.cost_and_gradient(x)
+        reference_cost, _, reference = problem.normal_equations(x)
+        assert float(cost) == pytest.approx(float(reference_cost))
+        torch.testing.assert_close(gradient, reference, rtol=1e-8, atol=1e-8)
+
+
+def test_position_metric_is_the_prediction_error():
+    # fails if r is not J⁻¹R: to first order, the distance from the recorded q_{k+1} to the predicted one
+    model, data = model_of("linear", correction_width=4), data_of(gaps=0, noise=1e-5)
+    problem = ResidualProblem(model, data)
+    r = problem.residuals(problem.start())[:, 0]
+    t = problem.triples
+    with torch.no_grad():
+        _, q2, _ = Stepper(model).step_pair(t.q0, t.q1, torch.zeros(len(t), dtype=t.q0.dtype), t.h0, t.h1)
+    assert float(r.abs().max()) > 1e-3  # the model is wrong, so there is something to compare
+    torch.testing.assert_close(r, (t.q2 - q2)[:, 0], rtol=0.05, atol=1e-5)
+
+
+def test_position_metric_does_not_see_the_scale_of_the_lagrangian():
+    # fails if shrinking L_d lowers the objective: the collapse trap; the raw residual does shrink
+    data = data_of(gaps=0)
+
+    class Scaled(ContactLagrangian):
+        factor = 1.0
+
+        def partials(self, q0, q1, s0, h, order=1):
+            P = super().partials(q0, q1, s0 / self.factor, h, order)
+            f = self.factor  # ε L_d(·, ·, s/ε): the scale gauge of trap 2
+            power = {"L": f, "D1": f, "D2": f, "D3": 1, "D11": f, "D12": f, "D22": f, "D13": 1, "D23": 1, "D33": 1 / f}
+            return type(P)(**{k: None if v is None else v * power[k] for k, v in vars(P).items()})
+
+    rms = {}
+    for metric in ("position", "raw"):
+        for factor in (1.0, 1e-3):
+            model = Scaled(model_of("linear").config)
+            model.factor = factor
+            problem = ResidualProblem(model, data, metric=metric)
+            rms[metric, factor] = float(problem.residuals(problem.start()).square().mean().sqrt())
+    assert rms["position", 1e-3] == pytest.approx(rms["position", 1.0], rel=1e-9)
+    assert rms["raw", 1e-3] == pytest.approx(1e-3 * rms["raw", 1.0], rel=1e-9)
+
+
+def test_gaps_are_left_out_of_triples_and_crossed_in_substeps():
+    # fails if a gap enters the one-step objective, or is crossed in one long step
+    data = data_of()
+    assert data.gaps > 0
+    assert float(ResidualProblem(model_of("linear"), data, max_step=0.3).triples.h1.max()) < 0.3
+    grid = segment_grid(data, 10, 0.3)
+    assert float(grid.h.max()) <= 0.3
+    assert grid.node.numel() == data.samples == grid.sample.unique().numel()  # every sample observed exactly once
+    for s in range(grid.segments):
+        first, own = grid.start_sample[s], (grid.node // (grid.h.shape[1] + 1) == s).nonzero()[:, 0]
+        time = torch.cat([torch.zeros(1, dtype=data.t.dtype), grid.h[s].cumsum(0)]) + data.t[first]
+        k = grid.node[own] - s * (grid.h.shape[1] + 1)
+        torch.testing.assert_close(time[k], data.t[grid.sample[own]])
+
+
+def test_lifted_solution_is_the_stepped_one():
+    # fails if the all-at-once solve stops before it has converged
+    for level in ("linear", "affine"):
+        problem, x = shooting_problem(level)
+        theta, states = problem.unpack(x)
+        start = torch.cat([states, states.new_zeros(len(states), 3 - states.shape[1])], -1)
+        rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
+        path = solve_path(problem.flat, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
+        with torch.no_grad():
+            out = Stepper(problem.flat.at(theta)).rollout(start[:, :1], start[:, 1:2], start[:, 2], h=problem.grid.h)
+        assert path is not None
+        torch.testing.assert_close(path.x[..., 0], out.q[..., 0], rtol=1e-9, atol=1e-10)
+        torch.testing.assert_close(path.x[..., 2], out.s, rtol=1e-9, atol=1e-10)
+
+
+class Rosenbrock:
+    """A curved valley: r = (10 (y − x²), 1 − x)."""
+
+    def cost(self, x):
+        return (100 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2) / 2
+
+    def normal_equations(self, x):
+        r = torch.stack([10 * (x[1] - x[0] ** 2), 1 - x[0]])
+        J = torch.tensor([[-20 * float(x[0]), 10.0], [-1.0, 0.0]], dtype=x.dtype)
+        return self.cost(x), J.T @ J, J.T @ r
+
+    def cost_and_gradient(self, x):
+        cost, _, gradient = self.normal_equations(x)
+        return cost, gradient
+
+
+def test_levenberg_marquardt_finds_the_minimum():
+    # fails if the gain ratio or the damping update has the wrong sign
+    result = levenberg_marquardt(Rosenbrock(), torch.tensor([-1.2, 1.0], dtype=torch.float64))
+    torch.testing.assert_close(result.x, torch.ones(2, dtype=torch.float64), rtol=1e-8, atol=1e-8)
+    assert result.history == sorted(result.history, reverse=True)
+
+
+def test_levenberg_marquardt_is_scale_free():
+    # fails without Marquardt's scaling: with the identity, a parameter in other units changes the path
+    class Scaled(Rosenbrock):
+        def cost(self, x):
+            return super().cost(x * torch.tensor([1.0, 1e-6], dtype=x.dtype))
+
+        def normal_equations(self, x):
+            D = torch.diag(torch.tensor([1.0, 1e-6], dtype=x.dtype))
+            cost, A, b = Rosenbrock.normal_equations(self, D @ x)
+            return super().cost(D @ x), D @ A @ D, D @ b
+
+    plain = levenberg_marquardt(Rosenbrock(), torch.tensor([-1.2, 1.0], dtype=torch.float64), max_iterations=10)
+    scaled = levenberg_marquardt(Scaled(), torch.tensor([-1.2, 1e6], dtype=torch.float64), max_iterations=10)
+    assert scaled.history == pytest.approx(plain.history, rel=1e-6)
+
+
+def test_optimisers_survive_a_cliff():
+    # fails if a non-finite trial point is accepted or a non-finite start raises
+    class Cliff(Rosenbrock):
+        def cost(self, x):
+            return super().cost(x) if x[0] < 0.5 else x.new_full((), math.nan)
+
+    start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
+    result = levenberg_marquardt(Cliff(), start)
+    assert math.isfinite(result.cost)
+    assert float(result.x[0]) < 0.5
+    assert levenberg_marquardt(Cliff(), torch.ones(2, dtype=torch.float64)).reason == "not_finite"
+    assert adam(Cliff(), torch.ones(2, dtype=torch.float64), max_iterations=5).reason == "not_finite"
+
+
+def test_adam_descends():
+    # fails if Adam returns its last point instead of its best, or never steps
+    start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
+    result = adam(Rosenbrock(), start, max_iterations=500, learning_rate=0.05)
+    assert result.cost < 0.05 * float(Rosenbrock().cost(start))
+
+
+def test_held_out_errors_are_those_of_a_refit():
+    # fails if the block formula is wrong: on a problem close to linear, refitting without the block must agree
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=40, h=0.2, noise=0.005, seed=1)
+    model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0, scale=(2.5,), speed=(2.0,)))
+
+    def fitted(weights):
+        problem = ShootingProblem(model, data, segment_grid(data, 40, 0.3), sigma=0.005, prior=prior_of(model, data))
+        plain = ShootingProblem._residuals
+        problem._residuals = lambda x: (plain(problem, x)[0] * weights[:, None], plain(problem, x)[1])
+        rows = ShootingProblem._sensitivities
+        if bool((weights == 0).any()):
+            held = problem.grid.node[weights == 0]
+            def masked(theta, path):
+                Z = rows(problem, theta, path)
+                Z.view(-1, *Z.shape[2:])[held] = 0
+                return Z
+            problem._sensitivities = masked
+        starts = problem.grid.start_sample
+        v = (data.q[starts + 1] - data.q[starts]) / 0.2
+        result = levenberg_marquardt(problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], v)))
+        return problem, result.x
+
+    everything = torch.ones(data.samples, dtype=torch.float64)
+    problem, x = fitted(everything)
+    _, A, _ = problem.normal_equations(x)
+    assert problem.path is not None
+    predicted = held_out_errors(problem, problem.path, problem.unpack(x)[0], A)
+    fold = torch.cat([torch.arange(41) * 5 // 41] * 2)[problem.grid.sample]
+    for k in (2, 4):
+        refit, y = fitted(torch.where(fold == k, 0.0, 1.0).double())
+        path = refit.solve(y)
+        assert path is not None
+        error = refit.misfit(path)[fold == k].square().mean().sqrt()
+        assert float(predicted[k]) == pytest.approx(float(error), rel=0.05)
+
+
+def test_simplest_not_beaten():
+    # fails if noise in the folds makes the rule pick a weaker prior than the data ask for
+    same = torch.tensor([1.0, 1.2, 0.9, 1.1, 1.0])
+    assert simplest_not_beaten({0.1: same, 1.0: same + torch.tensor([0.1, -0.2, 0.1, -0.1, 0.0])}) == 0.1
+    assert simplest_not_beaten({0.1: same + 0.5, 1.0: same}) == 1.0
+
+
+def test_baseline_finds_stiffness_tilt_and_rate():
+    # fails if a column of the regression has the wrong sign
+    data = simulate(scene("damped_pendulum", gamma=0.3), trajectories=4, steps=200, h=0.02, seed=0)
+    shifted = Trajectories.of(data.t, data.q + 0.3, data.lengths, angles=(True,))
+    base = estimate_baseline(shifted)
+    assert base.stiffness[0] == pytest.approx(math.cos(0.3), abs=1e-3)
+    assert base.tilt[0] == pytest.approx(-math.sin(0.3), abs=1e-3)
+    assert base.rate == pytest.approx(0.3, abs=1e-3)
+
+
+def test_data_that_never_moves_is_refused():
+    # fails if a constant trajectory divides by zero
+    still = Trajectories.of(torch.arange(9.0).double(), torch.ones(9, 1).double())
+    with pytest.raises(InputError, match="coordinate 'q' never moves"):
+        fit(still, FitConfig(train_fraction=1.0))
+
+
+def test_resume_goes_on_where_it_was_interrupted(tmp_path):
+    # fails if a finished stage is run again, or a checkpoint of other data is taken
+    checkpoint = tmp_path / "checkpoint.pt"
+    x, calls = torch.tensor([-1.2, 1.0], dtype=torch.float64), []
+
+    def optimise(x, callback):
+        calls.append(x)
+        return levenberg_marquardt(Rosenbrock(), x, max_iterations=60, callback=callback)
+
+    def broken(x, callback):
+        levenberg_marquardt(Rosenbrock(), x, max_iterations=26, callback=callback)
+        raise KeyboardInterrupt
+
+    first = Stages(False, checkpoint, "key", resume=False)
+    done = first.run("one", x, 60, optimise)
+    with pytest.raises(KeyboardInterrupt):
+        first.run("two", x, 60, broken)
+    again = Stages(False, checkpoint, "key", resume=True)
+    calls.clear()
+    assert torch.equal(again.run("one", x, 60, optimise).x, done.x)
+    assert calls == []
+    again.run("two", x, 60, optimise)
+    assert not torch.equal(calls[0], x)
+    assert [h["stage"] for h in again.history] == sorted(h["stage"] for h in again.history)
+    with pytest.raises(InputError, match="belongs to other data or settings; leave out --resume"):
+        Stages(False, checkpoint, "other", resume=True)
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"level": "cubic"}, "unknown level 'cubic'; choose one of linear, affine"),
+        ({"objective": "best"}, "unknown objective 'best'"),
+        ({"optimiser": "sgd", "objective": "raw"}, "unknown optimiser 'sgd'"),
+        ({"dtype": "float16"}, "unknown dtype 'float16'; choose one of float64, float32"),
+        ({"train_fraction": 0.0}, r"train fraction must be in \(0, 1\], got 0"),
+        ({"optimiser": "adam"}, "adam fits the objectives residual and raw, not 'auto'"),
+        ({"device": "abacus"}, "unknown device 'abacus'; use cpu or cuda"),
+        ({"iterations": 0}, "iterations must be >= 1, got 0"),
+        ({"departures": ()}, "departures must be one or more positive numbers"),
+    ],
+)
+def test_wrong_settings_are_named(settings, message):
+    # fails if a wrong setting is found only after an hour of training
+    with pytest.raises(InputError, match=message):
+        FitConfig(**settings)

@@ -1,0 +1,128 @@
+"""Whether a run predicts: the identities hold for a model of anything, so the data have to be asked."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State
+from herglotz.systems import scene
+from herglotz.training import FitConfig, Run, save_run
+from herglotz.verify import verify
+from herglotz.verify.data_checks import data_checks, noise_level
+
+
+def run_of(noise=0.0, h=0.1, stiffness=1.0, prediction=None, **options):
+    """A hand-made run on simulated pendulum data, with the true states and the model of that stiffness."""
+    options = {"trajectories": 3, "steps": 60, "seed": 3, "q_range": (-1.0, 1.0), **options}
+    clean = simulate(scene("damped_pendulum"), h=h, keep_state=True, **options)
+    assert clean.p is not None
+    data = replace(clean, p=None, s=None)
+    make = torch.Generator().manual_seed(0)
+    data = replace(data, q=data.q + noise * torch.randn(data.q.shape, generator=make, dtype=torch.float64))
+    model = ContactLagrangian(ModelConfig(rate=0.2, stiffness=(stiffness,), potential_width=0))
+    q = clean.q if prediction is None else prediction(clean.q)
+    states = State(q, clean.p, torch.zeros_like(clean.t))
+    train = tuple(40 for _ in data.lengths)
+    return Run(model, FitConfig(), {}, data, train, states, h, {}, [])
+
+
+def named(run):
+    checks, numbers = data_checks(run)
+    return {check.name: check for check in checks}, numbers
+
+
+def test_a_true_model_passes():
+    # fails if J⁻¹R is not the error of the predicted position
+    report = verify(run_of(), samples=16, steps=3)
+    assert report.passed, report.table()
+    assert report["one_step"].value < 0.05
+    assert report["free_run"].value < 1e-12
+
+
+def test_a_model_of_uniform_motion_fails():
+    # fails if the null model is not beaten by a margin: without a potential and damping, J⁻¹R is the null's own error
+    run = run_of(stiffness=0.0)
+    torch.nn.init.zeros_(run.model.damping.rate)
+    checks, numbers = named(run)
+    assert not checks["one_step"].passed
+    assert numbers["one_step_rms"] == pytest.approx(numbers["null_rms"], rel=1e-6)
+
+
+def test_a_collapsed_model_fails():
+    # fails if a model whose kinetic term is cancelled, as the raw residual likes it, passes: here c = 1, M → 0
+    run = run_of(stiffness=4 / 0.1**2)
+    checks, _ = named(run)
+    assert not checks["one_step"].passed
+
+
+@pytest.mark.parametrize(
+    "predict", [lambda q: 0 * q, lambda q: q * torch.nan, lambda q: -q], ids=["rest", "nan", "mirror"]
+)
+def test_a_free_run_that_knows_nothing_fails(predict):
+    # fails if the bound lets the best constant pass, or NaN compares as small
+    checks, _ = named(run_of(prediction=predict))
+    assert not checks["free_run"].passed
+
+
+def test_the_free_run_is_judged_beyond_training_only():
+    # fails if good fitted states inside the training part hide a bad extrapolation
+    def forget(q):
+        inside = torch.arange(len(q)) % 61 < 40
+        return torch.where(inside[:, None], q, 0.0)
+
+    checks, _ = named(run_of(prediction=forget))
+    assert not checks["free_run"].passed
+    assert checks["free_run"].note.startswith("63 samples")
+
+
+def test_a_turn_more_is_no_error():
+    # fails if an angle that is predicted one turn off counts as wrong
+    checks, _ = named(run_of(prediction=lambda q: q + 2 * torch.pi))
+    assert checks["free_run"].passed
+
+
+def test_one_step_below_the_noise_is_not_judged_and_said_so():
+    # fails if a true model is rejected because neither it nor the null model can predict noise
+    checks, numbers = named(run_of(noise=0.02, h=0.05))
+    assert "one_step" not in checks
+    assert numbers["null_rms"] < 1.5 * numbers["noise_rms"]
+    assert "mostly noise" in checks["free_run"].note
+
+
+def test_noise_is_taken_off_before_a_model_fails():
+    # fails if noise alone fails a true model where the null model is still distinguishable from it
+    checks, numbers = named(run_of(noise=0.0013))
+    assert numbers["one_step_rms"] > 0.5 * numbers["null_rms"]
+    assert checks["one_step"].passed
+
+
+@pytest.mark.parametrize("irregular", [False, True])
+def test_the_noise_estimate(irregular):
+    # fails if the weights are not normalised, or are those of equal steps
+    make = torch.Generator().manual_seed(0)
+    h = torch.full((2000,), 0.1, dtype=torch.float64)
+    if irregular:
+        h = h * (0.5 + torch.rand(2000, generator=make, dtype=torch.float64))
+    t = h.cumsum(0)
+    q = torch.sin(t) + 0.01 * torch.randn(2000, generator=make, dtype=torch.float64)
+    data = Trajectories.of(t, q)
+    assert float(noise_level(data.t, data.q, data)) == pytest.approx(0.01, rel=0.1)
+
+
+def test_the_noise_estimate_of_clean_coarse_data_is_small():
+    # fails if the motion itself counts as noise: six samples a period
+    t = torch.arange(200, dtype=torch.float64)
+    data = Trajectories.of(t, torch.sin(t))
+    assert float(noise_level(data.t, data.q, data)) < 0.02
+
+
+def test_a_run_folder(tmp_path):
+    # fails if a folder is verified otherwise than the run it holds
+    run = run_of()
+    run.box.update({f"{x}_{end}": [0.0] for x in "qps" for end in ("low", "high")})
+    save_run(run, tmp_path / "run")
+    from_folder, from_memory = (verify(x, samples=8, steps=2) for x in (tmp_path / "run", run))
+    assert [c.value for c in from_folder.checks] == pytest.approx([c.value for c in from_memory.checks])

@@ -1,0 +1,46 @@
+"""Run one experiment of `configs.py`: data → fit → save → verify → plot."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from configs import CONFIGS
+
+from herglotz.errors import InputError
+from herglotz.plots import save_figures
+from herglotz.training import fit, save_run
+from herglotz.verify import verify
+
+
+def main() -> int:
+    about = "\n".join(f"  {name:15} {make().about}" for name, make in CONFIGS.items())
+    parser = argparse.ArgumentParser(
+        description=__doc__, epilog=f"experiments:\n{about}", formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--config", required=True, choices=CONFIGS, help="which experiment")
+    parser.add_argument("--seed", type=int, default=0, help="of the initial weights (default 0)")
+    parser.add_argument("--out", type=Path, help="folder for the run (default runs/CONFIG)")
+    parser.add_argument("--resume", action="store_true", help="go on from an interrupted run in that folder")
+    arguments = parser.parse_args()
+    experiment = CONFIGS[arguments.config]()
+    out = arguments.out or Path("runs") / arguments.config
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        run = fit(experiment.data(), replace(experiment.fit, seed=arguments.seed), out=out, resume=arguments.resume)
+        save_run(run, out)
+        print(json.dumps(run.metrics, indent=2))
+        report = verify(run)
+        print(report.table())
+        save_figures(run, out)
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
