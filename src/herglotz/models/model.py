@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import torch
@@ -22,7 +22,8 @@ class ModelConfig:
 
     `scale` and `speed` are typical sizes of q and v (data units); `stiffness`, `tilt` and `rate` start the
     baseline.
-    A width of 0 leaves that network out.
+    A width of 0 leaves that network out. Without a `baseline` the correction is the whole of A: no kinetic term, no
+    potential; it is there to show why a baseline is needed (trap 2).
     """
 
     angles: tuple[bool, ...] = (True,)
@@ -37,11 +38,14 @@ class ModelConfig:
     damping_width: int = 8
     correction_width: int = 0
     correction_depth: int = 2
+    baseline: bool = True
     seed: int = 0
 
     def __post_init__(self):
         if self.level not in LEVELS:
             raise InputError(f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}")
+        if not self.baseline and not self.correction_width:
+            raise InputError("a model without a baseline needs a correction network; set correction_width > 0")
         for name in ("scale", "speed", "stiffness", "tilt"):
             if len(getattr(self, name)) != len(self.angles):
                 given = getattr(self, name)
@@ -70,10 +74,10 @@ class Terms:
     """The jets a model is made of at one set of points, for reports and tests."""
 
     g: Tensor | Jet
-    K: Jet
-    V0: Jet
-    V1: Jet
-    N: Jet | None = field(default=None)
+    K: Jet | None
+    V0: Jet | None
+    V1: Jet | None
+    N: Jet | None
 
 
 class ContactLagrangian(nn.Module):
@@ -102,7 +106,7 @@ class ContactLagrangian(nn.Module):
         else:
             self.damping = AffineDamping(c.rate, c.angles, c.scale, c.speed, c.damping_width, 1, make)
         self.correction = (
-            Correction(c.angles, c.scale, c.speed, c.correction_width, c.correction_depth, make)
+            Correction(c.angles, c.scale, c.speed, c.correction_width, c.correction_depth, make, alone=not c.baseline)
             if c.correction_width
             else None
         )
@@ -120,13 +124,17 @@ class ContactLagrangian(nn.Module):
     def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Terms:
         """Evaluate every term once."""
         n = q0.shape[-1]
+        g = self.damping(q0, q1, h, order)
+        N = None if self.correction is None else self.correction(q0, q1, h, order)
+        if not self.config.baseline:
+            return Terms(g, None, None, None, N)
         V = self.potential(torch.stack([q0, q1]), order)  # both ends in one network call
         return Terms(
-            g=self.damping(q0, q1, h, order),
+            g=g,
             K=self.kinetic(q0, q1, h, order),
             V0=Jet(V.data[:, 0], n, order).embed(2 * n, 0),
             V1=Jet(V.data[:, 1], n, order).embed(2 * n, n),
-            N=None if self.correction is None else self.correction(q0, q1, h, order),
+            N=N,
         )
 
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
@@ -136,9 +144,12 @@ class ContactLagrangian(nn.Module):
         h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
         t = self.terms(q0, q1, h, order)
         c = t.g.exp()
-        L = (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - h / 2 * (t.V0 + t.V1)
-        if t.N is not None:
-            L = L + t.N
+        if t.K is None or t.V0 is None or t.V1 is None:
+            assert t.N is not None  # checked by ModelConfig
+            L = t.N + (c - 1.0) * s0
+        else:
+            L = (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - h / 2 * (t.V0 + t.V1)
+            L = L if t.N is None else L + t.N
         return _partials(L, t.g, c, q0.shape[-1], s0)
 
     def forward(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0) -> Tensor | Partials:

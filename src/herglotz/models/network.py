@@ -13,6 +13,8 @@ from herglotz.models.jet import Jet, affine, concatenate, coordinates
 class Network(nn.Module):
     """tanh perceptron R^m → R with a zero-initialised last layer, so that a new model equals its baseline.
 
+    (`zero=False` draws the last layer too, for a model that has no baseline.)
+
     Parameters
     ----------
     inputs
@@ -23,9 +25,13 @@ class Network(nn.Module):
         Size of the initial weights relative to 1/√inputs: below 1 the network starts smooth.
     generator
         Source of the initial weights.
+    zero
+        Start the last layer at zero.
     """
 
-    def __init__(self, inputs: int, width: int, depth: int, gain: float, generator: torch.Generator):
+    def __init__(
+        self, inputs: int, width: int, depth: int, gain: float, generator: torch.Generator, *, zero: bool = True
+    ):
         super().__init__()
         sizes = [inputs] + [width] * depth
         self.weights = nn.ParameterList()
@@ -34,7 +40,10 @@ class Network(nn.Module):
             weight, bias = (torch.randn(b, k, generator=generator, dtype=torch.float64) for k in (a, 1))
             self.weights.append(nn.Parameter(weight * (gain / a**0.5)))
             self.biases.append(nn.Parameter(bias[:, 0] * gain))
-        self.weights.append(nn.Parameter(torch.zeros(1, width, dtype=torch.float64)))
+        last = torch.zeros(1, width, dtype=torch.float64)
+        if not zero:
+            last = torch.randn(1, width, generator=generator, dtype=torch.float64) / width**0.5
+        self.weights.append(nn.Parameter(last))
 
     def forward(self, x: Jet) -> Jet:
         """The network of a jet of features (..., m); the result is a scalar jet, shape (...)."""

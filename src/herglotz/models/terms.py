@@ -167,6 +167,7 @@ class Correction(nn.Module):
 
     E = Σ speed² is a fixed energy scale. The network starts smooth (gain 0.1): where the data leave a hole, near a
     separatrix say, it then fills it in smoothly, which lowers the worst rollout errors by one to two orders.
+    `alone` makes it the whole of A, a plain network without a baseline: the model that collapses (trap 2).
     """
 
     def __init__(
@@ -177,11 +178,13 @@ class Correction(nn.Module):
         width: int,
         depth: int,
         generator: torch.Generator,
+        alone: bool = False,
     ):
         super().__init__()
         self.angles, self.scale, self.speed = angles, scale, speed
         self.energy = sum(v * v for v in speed)
-        self.network = Network(feature_count(angles) + len(angles), width, depth, 0.1, generator)
+        inputs, gain = feature_count(angles) + len(angles), 1.0 if alone else 0.1
+        self.network = Network(inputs, width, depth, gain, generator, zero=not alone)
 
     def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
         """N as a jet over (q0, q1)."""

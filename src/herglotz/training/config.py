@@ -25,7 +25,8 @@ class FitConfig:
         "linear" (one damping rate) or "affine" (damping depends on position and velocity).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
-        "auto": whichever the noise found in the data asks for. "raw": ‖R‖², which collapses; for demonstration.
+        "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses;
+        for demonstration.
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" for the residual objectives.
     train_fraction
@@ -53,7 +54,7 @@ class FitConfig:
     seed: int = 0
     dtype: str = "float64"
     device: str = "cpu"
-    iterations: int = 200
+    iterations: int = 400
     departures: tuple[float, ...] = (2e-4, 6e-4, 2e-3, 6e-3)
     potential_width: int = 8
     damping_width: int = 6

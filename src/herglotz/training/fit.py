@@ -16,6 +16,7 @@ from torch import Tensor
 
 import herglotz
 from herglotz.data import Trajectories
+from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training.adam import adam
@@ -38,7 +39,7 @@ class _Fitted:
     """What a fit of the training part hands to the judgement."""
 
     model: ContactLagrangian
-    states: TrajectoryFit  # the states at the training samples
+    states: Tensor  # (N_train, 2n+1) states at the training samples
     objective: str
     sigma: float
     notes: dict[str, Any]
@@ -104,9 +105,8 @@ def fit(
             "python": platform.python_version(),
         },
     }
-    x = fitted.states.path.x
-    n = data.dof
-    box = box_of(x[..., :n].flatten(0, 1), x[..., n : 2 * n].flatten(0, 1), x[..., 2 * n].flatten())
+    x, n = fitted.states, data.dof
+    box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
     return Run(fitted.model, config, metrics, data, train.lengths, states, train.typical_step, box, stages.history)
 
 
@@ -119,7 +119,7 @@ def _fit_training_part(train: Trajectories, base: Baseline, config: FitConfig, s
         model = _model(base, config, "potential")
         result, rms = _fit_residual(model, train, base, config, stages, "one-step start", PROBE, sigma=0.02 * size)
         return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
-    model = _model(base, config, "correction")
+    model = _model(base, config, "plain" if objective == "raw" else "correction")
     if objective == "auto":
         result, rms = _fit_residual(model, train, base, config, stages, "one-step probe", PROBE, sigma=exact)
         enough = len(train.triples(base.max_step)) * train.dof >= 2 * result.x.numel()
@@ -134,8 +134,9 @@ def _fit_training_part(train: Trajectories, base: Baseline, config: FitConfig, s
     )
     noise = max(rms / 6**0.5, exact) if metric == "position" else exact
     # The states are fitted too (parameters held), so that the free run does not start from two noisy samples.
-    states = fit_trajectories(model, train, base, noise, config.departures, config.iterations, stages, frozen=True)
-    notes = {"iterations": result.iterations, "reason": result.reason}
+    found = fit_trajectories(model, train, base, noise, config.departures, config.iterations, stages, frozen=True)
+    notes = {"iterations": result.iterations, "reason": result.reason, "follows_data": found is not None}
+    states = _fitted_states(found) if found is not None else _states_of_pairs(model, train)
     return _Fitted(model, states, "raw" if metric == "raw" else "residual", noise, notes)
 
 
@@ -143,14 +144,42 @@ def _fit_by_trajectory(
     model: ContactLagrangian, train: Trajectories, base: Baseline, config: FitConfig, stages: Stages, sigma: float
 ) -> _Fitted:
     found = fit_trajectories(model, train, base, sigma, config.departures, config.iterations, stages)
+    if found is None:  # the model keeps the parameters of the one-step fit
+        notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}
+        return _Fitted(model, _states_of_pairs(model, train), "trajectory", sigma, notes)
     found.problem.flat.set(found.theta)
     held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
     notes = {"departure": found.departure, "held_out_rms": held_out, "reason": found.result.reason}
-    return _Fitted(model, found, "trajectory", found.sigma, notes)
+    return _Fitted(model, _fitted_states(found), "trajectory", found.sigma, notes | {"follows_data": True})
+
+
+def _fitted_states(found: TrajectoryFit) -> Tensor:
+    """The fitted trajectory at the samples, (N, 2n+1)."""
+    grid, x = found.problem.grid, found.path.x.flatten(0, 1)
+    out = x.new_empty(found.problem.data.samples, x.shape[-1])
+    out[grid.sample] = x[grid.node]
+    return out
+
+
+def _states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
+    """The recorded positions with the momenta that FL⁺ gives each pair and s = 0, for a model that follows no data."""
+    out = data.q.new_zeros(data.samples, 2 * data.dof + 1)
+    steps = data.steps()
+    i, zero = steps.index, torch.zeros_like(steps.h)
+    with torch.no_grad():
+        _, p, _ = legendre_plus(model, data.q[i], data.q[i + 1], zero, steps.h)
+        first = torch.tensor(data.offsets, device=i.device)
+        h = data.t[first + 1] - data.t[first]
+        _, p_first, _ = legendre_minus(model, data.q[first], data.q[first + 1], torch.zeros_like(h), h)
+    n = data.dof
+    out[:, :n] = data.q
+    out[i + 1, n : 2 * n] = p
+    out[first, n : 2 * n] = p_first
+    return out
 
 
 def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian:
-    """A model with the network that the objective needs: the correction, or the potential's."""
+    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone."""
     model = ContactLagrangian(
         ModelConfig(
             angles=base.angles,
@@ -162,7 +191,8 @@ def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian
             rate=base.rate,
             potential_width=config.potential_width if network == "potential" else 0,
             damping_width=config.damping_width,
-            correction_width=config.correction_width if network == "correction" else 0,
+            correction_width=config.correction_width if network != "potential" else 0,
+            baseline=network != "plain",
             seed=config.seed,
         )
     )
@@ -204,14 +234,7 @@ def _states_everywhere(
     fitted: _Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
     """States at every sample: fitted ones on the training part, a free run from the last of them after it."""
-    fit_, n = fitted.states, data.dof
-    problem = fit_.problem
-    rows = torch.arange(problem.data.samples, device=data.t.device)
-    known = problem.states_at(fit_.path, rows)
-    if problem.d == 2 * n:
-        full = torch.zeros(problem.data.samples, dtype=torch.long, device=rows.device)
-        full[problem.grid.sample] = problem.grid.node
-        known = torch.cat([known, fit_.path.x[..., 2 * n].flatten()[full][:, None]], -1)
+    known, n = fitted.states, data.dof
     out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
     stepper, status, done = Stepper(fitted.model), "ok", 0
     for first, length, trained in zip(data.offsets, data.lengths, train_lengths, strict=True):

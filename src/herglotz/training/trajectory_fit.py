@@ -84,7 +84,7 @@ def fit_trajectories(
     stages: Stages,
     *,
     frozen: bool = False,
-) -> TrajectoryFit:
+) -> TrajectoryFit | None:
     """Fit parameters and states to positions (or, `frozen`, the states alone).
 
     Segments grow from 20 steps to whole trajectories, each stage started from the states of the one before. Then every
@@ -93,8 +93,8 @@ def fit_trajectories(
 
     Returns
     -------
-    TrajectoryFit
-        From the longest segments that could be fitted.
+    TrajectoryFit or None
+        From the longest segments that could be fitted; None if the model cannot follow even the shortest.
     """
     if model.potential.network is None or frozen:
         departures = departures[:1]
@@ -110,7 +110,7 @@ def fit_trajectories(
             break
         theta, last = theta_new, (problem, path, result)
     if last is None:
-        raise FloatingPointError("no segment of the data could be followed; the steps are too long for this model")
+        return None
     if frozen:
         problem, path, result = last
         return TrajectoryFit(theta, problem, path, sigma, None, {}, result)
