@@ -7,7 +7,6 @@ import time
 from pathlib import Path
 
 from configs import demo
-
 from herglotz.export import export_pt2
 from herglotz.plots import save_figures
 from herglotz.training import fit, save_run

@@ -9,7 +9,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from configs import CONFIGS
-
 from herglotz.errors import InputError
 from herglotz.plots import save_figures
 from herglotz.training import fit, save_run

@@ -91,7 +91,7 @@ def test_a_step_is_a_contact_map(settings):
     model, (q, _, s, h) = random_model(settings), points(settings.dof)
     p = 0.5 * torch.cos(q)
     stepper = Stepper(model)
-    (q1, p1, _), D = flow_derivative(lambda q, p, s: tuple(stepper.step(State(q, p, s), h).state), q, p, s)
+    (q1, p1, _), D = flow_derivative(lambda q, p, s: stepper.step(State(q, p, s), h).state, q, p, s)
     c = partials(model, q, q1, s, h).c
     assert contact_defect(D, p, p1, c).abs().max().item() < 1e-12
     torch.testing.assert_close(torch.linalg.det(D), c ** (settings.dof + 1), rtol=1e-11, atol=1e-12)
@@ -148,7 +148,7 @@ def test_unknown_level_and_settings_are_named():
     # fails if a typo is accepted silently
     with pytest.raises(InputError, match="unknown level 'cubic'; choose one of linear, affine"):
         ModelConfig(level="cubic")
-    with pytest.raises(InputError, match="unknown model setting colour"):
+    with pytest.raises(InputError, match="unknown setting colour for ModelConfig"):
         ModelConfig.from_dict({"colour": 1})
     with pytest.raises(InputError, match="speed needs one number a coordinate"):
         ModelConfig(angles=(True, False), scale=(1.0, 1.0), speed=(1.0,))

@@ -16,7 +16,7 @@ from herglotz.verify import verify
 
 ROOT = Path(__file__).resolve().parents[2]
 REAL = ROOT.parent / "shared" / "data" / "schmidt_lipson_2009" / "real_pend_h_1.txt"
-needs_real = pytest.mark.skipif(not REAL.exists(), reason="the measured pendulum is not redistributed; see data/README.md")
+needs_real = pytest.mark.skipif(not REAL.exists(), reason="the measured pendulum is not redistributed: data/README.md")
 
 
 def rollout_rms(model, h, seed, steps=100):
@@ -51,14 +51,17 @@ def test_exact_positions_give_an_accurate_stepper(exact_run):
     assert rollout_rms(exact_run.model, 0.5, seed=1000) < 2e-4
 
 
-def test_raw_residual_collapses_and_verify_says_so(exact_data, exact_run):
+@pytest.mark.parametrize("seed", range(3))
+def test_raw_residual_collapses_and_verify_says_so(exact_data, seed):
     # fails if ‖R‖² is as good as ‖M⁻¹R‖², or if `verify` passes a model that predicts nothing
-    raw = fit(exact_data, FitConfig(train_fraction=1.0, objective="raw"))
-    raw_cost = raw.history[-1]["cost"]
-    assert raw_cost < raw.history[0]["cost"]
-    assert rollout_rms(raw.model, 0.5, seed=1000) > 100 * rollout_rms(exact_run.model, 0.5, seed=1000)
-    report = verify(raw)
+    settings = FitConfig(train_fraction=1.0, objective="raw", optimiser="adam", iterations=50, seed=seed)
+    run = fit(exact_data, settings)
+    costs = [h["cost"] for h in run.history if h["stage"] == "one-step error"]
+    assert costs[-1] < 1e-3 * costs[0]  # the objective says that training went well ...
+    assert run.metrics["one_step_rms"] > 0.1 * run.metrics["one_step_rms_constant_velocity"]  # ... and it did not
+    report = verify(run)
     assert not report.passed, report.table()
+    assert not report["follow"].passed
 
 
 def test_noisy_data_are_fitted_to_the_noise(demo_run):
@@ -84,8 +87,9 @@ def test_saved_run_is_the_same_run(demo_run, tmp_path):
     assert again.config == demo_run.config
     assert again.train_lengths == demo_run.train_lengths
     state = [x[:1] for x in again.states]
-    for a, b in zip(again.stepper.rollout(*state, h=0.1, steps=5).q, demo_run.stepper.rollout(*state, h=0.1, steps=5).q, strict=True):  # fmt: skip
-        assert torch.equal(a, b)
+    assert torch.equal(
+        again.stepper.rollout(*state, h=0.1, steps=5).q, demo_run.stepper.rollout(*state, h=0.1, steps=5).q
+    )
     stored = json.loads((tmp_path / "run" / "metrics.json").read_text())
     assert {"one_step_rms", "extrapolation_rms", "train_rms", "seconds", "seed", "versions"} <= stored.keys()
 
@@ -121,7 +125,8 @@ def test_other_levels_and_precisions_end_finite(settings):
 
 def test_adam_trains_too(exact_data):
     # fails if the option is accepted and ignored
-    run = fit(exact_data.select(range(4)), FitConfig(train_fraction=1.0, objective="residual", optimiser="adam", iterations=20))
+    settings = FitConfig(train_fraction=1.0, objective="residual", optimiser="adam", iterations=20)
+    run = fit(exact_data.select(range(4)), settings)
     history = [h["cost"] for h in run.history if h["stage"] == "one-step error"]
     assert history[-1] < 0.1 * history[0]
 

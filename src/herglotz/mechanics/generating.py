@@ -56,7 +56,9 @@ def generating_function(
     D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
     D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
     D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
-    spread = torch.linalg.svdvals(Y_p)[..., -1]
+    # A failed step is NaN, which svdvals refuses for the whole batch; NaN there is at a caustic here.
+    finite = torch.isfinite(Y_p).all(-1).all(-1)
+    spread = torch.linalg.svdvals(torch.where(finite[..., None, None], Y_p, 0.0))[..., -1]
     return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, spread)
 
 

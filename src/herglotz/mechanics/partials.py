@@ -143,4 +143,4 @@ def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = 
 def _detach(P: Partials, keep_graph: bool) -> Partials:
     if keep_graph:
         return P
-    return Partials(**{k: None if v is None else v.detach() for k, v in vars(P).items()})
+    return Partials(**{k: v.detach() for k, v in vars(P).items() if v is not None})

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
@@ -12,6 +12,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import Partials
 from herglotz.models.jet import Jet
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
+from herglotz.settings import from_plain
 
 LEVELS = ("linear", "affine")
 
@@ -63,10 +64,7 @@ class ModelConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
         """Inverse of `to_dict`; unknown keys are an error."""
-        unknown = set(values) - {f.name for f in fields(cls)}
-        if unknown:
-            raise InputError(f"unknown model setting {', '.join(sorted(unknown))}; written by another version?")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        return from_plain(cls, values)
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
+from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
 OPTIMISERS = ("lm", "adam")
@@ -93,10 +94,7 @@ class FitConfig:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> FitConfig:
         """Inverse of `to_dict`; unknown keys are an error."""
-        unknown = set(values) - {f.name for f in fields(cls)}
-        if unknown:
-            raise InputError(f"unknown setting {', '.join(sorted(unknown))}; written by another version of herglotz?")
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        return from_plain(cls, values)
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -43,7 +43,7 @@ class Stages:
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
         if resume and checkpoint is not None and checkpoint.exists():
-            stored = torch.load(checkpoint, weights_only=True)
+            stored = _read(checkpoint)
             if stored["key"] != key:
                 raise InputError(
                     f"{checkpoint}: belongs to other data or settings; leave out --resume or choose another folder"
@@ -87,3 +87,13 @@ class Stages:
             buffer = BytesIO()
             torch.save({"key": self.key, "stages": self.done}, buffer)
             write_atomically(self.checkpoint, buffer.getvalue())
+
+
+def _read(checkpoint: Path) -> dict[str, Any]:
+    try:
+        stored = torch.load(checkpoint, weights_only=True)
+        return {"key": stored["key"], "stages": stored["stages"]}
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise InputError(
+            f"{checkpoint}: cannot be read ({type(error).__name__}); delete it and fit from the start"
+        ) from None

@@ -132,7 +132,7 @@ def test_step_derivative_is_the_derivative_of_the_step():
         return h * ((v**2).sum(-1) / 2 - torch.cos(m).sum(-1) - 0.3 * torch.sin(s0) * (1 + 0.2 * m.sum(-1)))
 
     q, p, s, _ = points(seed=3)
-    flow = lambda q, p, s: tuple(Stepper(L_d).step(State(q, p, s), 0.2).state)  # noqa: E731
+    flow = lambda q, p, s: Stepper(L_d).step(State(q, p, s), 0.2).state  # noqa: E731
     (q1, _, _), D = flow_derivative(flow, q, p, s)
     closed = step_derivative(autograd_partials(L_d, q, q1, s, 0.2, 2), p)
     torch.testing.assert_close(closed, D, rtol=1e-11, atol=1e-12)

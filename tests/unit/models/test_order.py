@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.terms import AffineDamping
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
 
@@ -37,6 +38,7 @@ def test_affine_level_is_second_order_on_the_parachute():
         ModelConfig(angles=(False,), level="affine", rate=0.0, damping_width=0, potential_width=0, stiffness=(0.0,))
     )
     # V = (mg/2λ)(e^{2λq} − 1) is no polynomial: check the drag alone, g = 0
+    assert isinstance(model.damping, AffineDamping)
     with torch.no_grad():
         model.damping.drag.fill_(2 * lam)
     flow = scene("parachute", g=0.0, lam=lam).flow
