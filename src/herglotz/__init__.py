@@ -1,3 +1,78 @@
-"""herglotz: learned discrete contact Lagrangians. Positions in, a verified stepper out."""
+"""herglotz: learned discrete contact Lagrangians. Positions in, a verified stepper out.
+
+import herglotz as hz
+
+run = hz.fit(hz.load("motion.csv"))
+rollout = run.stepper.rollout(*run.states_at_end(), h=run.h, steps=100)
+print(hz.verify(run).table())
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+
+if TYPE_CHECKING:
+    from herglotz.data import Trajectories, load, save, simulate
+    from herglotz.errors import InputError
+    from herglotz.export import export_pt2, load_pt2
+    from herglotz.mechanics import partials
+    from herglotz.models import ContactLagrangian, ModelConfig
+    from herglotz.stepping import State, Status, Stepper
+    from herglotz.systems import scene, scene_names
+    from herglotz.training import FitConfig, Run, fit, load_run, save_run
+    from herglotz.verify import verify
+
+# Loaded at first use, so that `herglotz --help` does not wait for torch.
+_HOME = {
+    "Trajectories": "data",
+    "load": "data",
+    "save": "data",
+    "simulate": "data",
+    "InputError": "errors",
+    "export_pt2": "export",
+    "load_pt2": "export",
+    "partials": "mechanics",
+    "ContactLagrangian": "models",
+    "ModelConfig": "models",
+    "State": "stepping",
+    "Status": "stepping",
+    "Stepper": "stepping",
+    "scene": "systems",
+    "scene_names": "systems",
+    "FitConfig": "training",
+    "Run": "training",
+    "fit": "training",
+    "load_run": "training",
+    "save_run": "training",
+    "verify": "verify",
+}
+__all__ = [
+    "ContactLagrangian",
+    "FitConfig",
+    "InputError",
+    "ModelConfig",
+    "Run",
+    "State",
+    "Status",
+    "Stepper",
+    "Trajectories",
+    "export_pt2",
+    "fit",
+    "load",
+    "load_pt2",
+    "load_run",
+    "partials",
+    "save",
+    "save_run",
+    "scene",
+    "scene_names",
+    "simulate",
+    "verify",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'herglotz' has no attribute {name!r}")
+    return getattr(import_module(f"herglotz.{_HOME[name]}"), name)

@@ -125,10 +125,10 @@ def test_other_levels_and_precisions_end_finite(settings):
 
 def test_adam_trains_too(exact_data):
     # fails if the option is accepted and ignored
-    settings = FitConfig(train_fraction=1.0, objective="residual", optimiser="adam", iterations=20)
+    settings = FitConfig(train_fraction=1.0, objective="residual", optimiser="adam", iterations=100)
     run = fit(exact_data.select(range(4)), settings)
     history = [h["cost"] for h in run.history if h["stage"] == "one-step error"]
-    assert history[-1] < 0.1 * history[0]
+    assert history[-1] < 0.05 * history[0]
 
 
 @needs_real

@@ -89,7 +89,7 @@ def test_one_step_below_the_noise_is_not_judged_and_said_so():
     checks, numbers = named(run_of(noise=0.02, h=0.05))
     assert "one_step" not in checks
     assert numbers["null_rms"] < 1.5 * numbers["noise_rms"]
-    assert "mostly noise" in checks["free_run"].note
+    assert "mostly noise" in checks["follow"].note
 
 
 def test_noise_is_taken_off_before_a_model_fails():

@@ -1,0 +1,57 @@
+"""The house rules that a reader relies on, held by the source itself."""
+
+import ast
+import sys
+from pathlib import Path
+
+import pytest
+
+SOURCE = Path(__file__).resolve().parents[2] / "src" / "herglotz"
+# A ← B: B may import A. Rooms between two bars may not import one another; `errors` and `settings` serve all.
+ORDER = "mechanics | systems models | stepping | data | training | export | verify | plots | cli"
+LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.split()}
+RUNTIME = {"torch", "numpy", "matplotlib", "tqdm", "herglotz"} | set(sys.stdlib_module_names)
+FILES = sorted(SOURCE.rglob("*.py"))
+
+
+def imports(path):
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            yield node.module or ""
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
+def test_imports_point_one_way(path):
+    # fails if a lower room imports a higher one, or a room its neighbour
+    room = path.relative_to(SOURCE).parts[0]
+    for name in imports(path):
+        parts = name.split(".")
+        assert parts[0] in RUNTIME, f"{path} imports {name}, which is no runtime dependency"
+        assert parts[0] != "train", f"{path} imports a script"
+        if parts[0] == "herglotz" and len(parts) > 1 and parts[1] in LEVEL and room in LEVEL and parts[1] != room:
+            assert LEVEL[parts[1]] < LEVEL[room], f"{path} imports {name}"
+
+
+def test_only_the_door_differentiates_lagrangians():
+    # fails if a module calls autograd on its own; the exceptions differentiate maps, objectives or parameters
+    allowed = {
+        "mechanics/partials.py",  # the door
+        "mechanics/contact.py",  # the derivative of a flow
+        "mechanics/continuous.py",  # a continuous Hamiltonian
+        "systems/rules.py",  # the scalar equation of the implicit midpoint rule
+        "training/residual.py",  # with respect to parameters
+    }
+    used = {str(p.relative_to(SOURCE)) for p in FILES if "autograd.grad" in p.read_text(encoding="utf-8")}
+    assert used <= allowed, used - allowed
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(SOURCE)))
+def test_modules_stay_small_and_load_safely(path):
+    # fails if a module outgrows one idea, or loads a pickle
+    text = path.read_text(encoding="utf-8")
+    assert len(text.splitlines()) <= 350
+    assert text.count("torch.load(") == text.count("weights_only=True"), "torch.load without weights_only=True"
+    assert "allow_pickle=True" not in text
