@@ -97,12 +97,12 @@ def test_long_rollout_keeps_sigma():
 
 def test_float32_follows_float64():
     # fails if float32 loses more than rounding over a damped rollout
-    wide = model(0.1)
+    wide = model(0.1, rate=0.4)
     q, p, s = starts(10)
     with torch.no_grad():
         exact = Stepper(wide).rollout(q, p, s, h=0.2, steps=100)
-        single = Stepper(model(0.1).float()).rollout(q.float(), p.float(), s.float(), h=0.2, steps=100)
+        single = Stepper(model(0.1, rate=0.4).float()).rollout(q.float(), p.float(), s.float(), h=0.2, steps=100)
     both = exact.ok & single.ok
     assert int(both.sum()) >= 9
     error = (exact.q[both] - single.q[both].double()).abs() / (1 + exact.q[both].abs())
-    assert error.max().item() < 1e-4
+    assert error.max().item() < 1e-5

@@ -19,7 +19,7 @@ OPTIMISERS = ("lm", "adam")
 DTYPES = ("float64", "float32")
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
-Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz and figures/.
+Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz and the figures (*.png).
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q) or a
 Schmidt & Lipson .txt. Steps may differ and samples may be missing.
@@ -91,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
             with suppress(OSError):
                 folder.rmdir()
     result = load_run(out)  # what later commands will see, and on the cpu
-    drawn = _draw(result, out) if not arguments.no_plots else None
+    drawn = _draw(result, out) if not arguments.no_plots else []
     if arguments.json:
         print_json(result.metrics)
     else:
@@ -106,7 +106,7 @@ def parse_angles(text: str | None) -> list[str] | None:
     return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
 
 
-def report(result: Run, out: Path, drawn: Path | None) -> None:
+def report(result: Run, out: Path, drawn: list[Path]) -> None:
     """Print what was reached, for people, and what to do next."""
     m, data = result.metrics, result.data
     unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
@@ -117,14 +117,14 @@ def report(result: Run, out: Path, drawn: Path | None) -> None:
         ("extrapolation RMS", f"{_show(m.get('extrapolation_rms'), unit)}  free run over the unseen samples"),
         ("training RMS", _show(m.get("train_rms"), unit)),
         ("one-step RMS", _show(m.get("one_step_rms"), unit)),
-        ("damping rate", _show(m.get("rate"), f"per {data.time_unit}")),
+        ("damping rate", _show(m.get("rate"), "per unit of time" if data.time_unit == "1" else f"per {data.time_unit}")),
         ("time", _show(m.get("seconds"), "s")),
     ]
     print_table([row for row in rows if not row[1].startswith("None")])
     if m.get("extrapolation_status") not in (None, "ok"):
         print(f"Note: {m['extrapolation_status']}")
-    if drawn is not None:
-        print(f"Figures: {drawn}")
+    if drawn:
+        print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 
@@ -133,11 +133,10 @@ def _show(value: Any, unit: str) -> str:
     return "None" if value is None else f"{value:.3g} {unit}".rstrip()
 
 
-def _draw(result: Run, out: Path) -> Path:
+def _draw(result: Run, out: Path) -> list[Path]:
     from herglotz.plots import save_figures
 
-    save_figures(result, out / "figures")
-    return out / "figures"
+    return save_figures(result, out)
 
 
 def _make(folder: Path) -> list[Path]:

@@ -23,7 +23,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("source", metavar="RUN|DATA", type=Path, help="folder of a run, or a data file")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER",
-        help="folder for the figures, made if missing (default: RUN/figures, or the current folder for DATA)",
+        help="folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
     )  # fmt: skip
     parser.set_defaults(run=run)
 
@@ -31,7 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw and say where."""
     source: Path = arguments.source
-    folder = arguments.out or (source / "figures" if is_run(source) else Path())
+    folder = arguments.out or (source if is_run(source) else Path())
     check_output_folder(folder)
     if is_run(source):
         from herglotz.training import load_run

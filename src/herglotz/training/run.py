@@ -44,6 +44,11 @@ class Run:
         """Predicted positions at every sample, (N, n)."""
         return self.states.q
 
+    def states_at_end(self) -> State:
+        """The state at the last sample of every trajectory, (B, n), (B, n), (B,): where to go on from."""
+        last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
+        return State(*(x[last] for x in self.states))
+
     @property
     def stepper(self) -> Stepper:
         """The trained time stepper."""

@@ -83,8 +83,8 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "extrapolation RMS" in out
     assert f"Next: herglotz verify {folder}" in out
     assert err == ""  # quiet when not a terminal
-    assert {"model.pt", "metrics.json", "config.json", "fit.npz", "figures"} <= {x.name for x in folder.iterdir()}
-    assert len(list((folder / "figures").glob("*.png"))) == 5
+    assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
+    assert len(list(folder.glob("*.png"))) == 5
     run = load_run(folder)
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
 
@@ -98,7 +98,7 @@ def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an
     run = load_run(folder)
     assert next(run.model.parameters()).dtype == torch.float32
     assert run.data.angles == (False,)
-    assert not (folder / "figures").exists()
+    assert not list(folder.glob("*.png"))
     code, again = run_json(capsys, *arguments, "--resume")
     assert code == 0
     assert again["train_rms"] == pytest.approx(found["train_rms"], abs=1e-4)
