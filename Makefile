@@ -5,7 +5,7 @@ WORKERS ?= 2
 # One thread a test worker: two workers on two cores do not fight over them.
 ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-slow lint clean
+.PHONY: demo test test-slow mutants lint clean
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -25,6 +25,10 @@ test: lint
 
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow
+
+# Break the geometry line by line; every mutant must be noticed (several minutes).
+mutants: .venv/installed
+	$(ENV) $(PY) tests/mutants.py
 
 clean:
 	rm -rf .venv runs build dist .pytest_cache .ruff_cache

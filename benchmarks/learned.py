@@ -48,6 +48,7 @@ def simulated(seed: int) -> dict:
 
 
 def main() -> None:
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds (default 5)")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "learned.json")

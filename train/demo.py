@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import sys
 import time
 from pathlib import Path
+
+import torch
 
 from configs import demo
 from herglotz.export import export_pt2
@@ -16,6 +19,7 @@ OUT = Path("runs/demo")
 
 
 def main() -> int:
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
     started = time.perf_counter()
     experiment = demo()
     data = experiment.data()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import sys
 from dataclasses import replace
 from pathlib import Path
+
+import torch
 
 from configs import CONFIGS
 from herglotz.errors import InputError
@@ -16,6 +19,7 @@ from herglotz.verify import verify
 
 
 def main() -> int:
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
     about = "\n".join(f"  {name:15} {make().about}" for name, make in CONFIGS.items())
     parser = argparse.ArgumentParser(
         description=__doc__, epilog=f"experiments:\n{about}", formatter_class=argparse.RawDescriptionHelpFormatter

@@ -117,7 +117,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         ("extrapolation RMS", f"{_show(m.get('extrapolation_rms'), unit)}  free run over the unseen samples"),
         ("training RMS", _show(m.get("train_rms"), unit)),
         ("one-step RMS", _show(m.get("one_step_rms"), unit)),
-        ("damping rate", _show(m.get("rate"), "per unit of time" if data.time_unit == "1" else f"per {data.time_unit}")),
+        ("damping rate", _show(m.get("rate"), f"per {'unit of time' if data.time_unit == '1' else data.time_unit}")),
         ("time", _show(m.get("seconds"), "s")),
     ]
     print_table([row for row in rows if not row[1].startswith("None")])

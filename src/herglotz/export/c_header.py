@@ -15,7 +15,7 @@ from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 from herglotz.export.c_model import flags_of, terms_source
 from herglotz.export.c_solver import ADVANCE, API, ELIMINATION
-from herglotz.export.c_template import finish, number, numbers, render, text_constant
+from herglotz.export.c_template import fill, finish, number, numbers, render, text_constant
 from herglotz.export.pt2 import _metadata
 from herglotz.models import ContactLagrangian
 
@@ -77,7 +77,7 @@ enum {
   NAME_OUTSIDE_BOX = 16   /* a separate bit: a state outside the box of the fitted data; the step is done */
 };
 
-/* A state. q in @UNITS@; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
+/* A state. q in NAME_units; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
    steps so far (start it at 1). */
 typedef struct {
   real q[NAME_N], p[NAME_N], s, sigma;
@@ -174,11 +174,9 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str) ->
         "MARK": MARK,
         "REAL": "double" if dtype == "float64" else "float",
         "N": str(entries["dof"]),
-        "UNITS": "the units below",
         "SHA": text_constant(entries["weights_sha256"]),
         "LEVEL": text_constant(entries["level"]),
         "DTYPE": text_constant(dtype),
-        "UNIT_LIST": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
         "ANGLES": ", ".join(str(int(a)) for a in entries["angles"]),
         "H": number(entries["h"], dtype),
         "TOLERANCE": number(entries["newton_tolerance"], dtype),
@@ -191,8 +189,14 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str) ->
     body = render(ELIMINATION + ADVANCE + API, None, flags)
     tail = "\n#undef NAME_RESTRICT\n#endif\n"
     text = finish(head + terms_source(model, dtype) + body + tail, entries["name"], dtype)
-    last = {"NAME": entries["name"], "VERSION": entries["herglotz_version"], "FILE": _plain(file), "METADATA": comment}
-    return render(text, last)  # after `finish`, so that no user's text is taken for a template
+    last = {
+        "NAME": entries["name"],
+        "VERSION": entries["herglotz_version"],
+        "FILE": _plain(file),
+        "UNIT_LIST": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
+        "METADATA": comment,
+    }
+    return fill(text, last)  # after `finish`, so that no user's text is taken for a template
 
 
 def read_metadata(text: str, path: PathLike) -> dict[str, Any]:

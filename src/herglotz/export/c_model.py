@@ -292,7 +292,7 @@ def _position_features(model: ContactLagrangian, dtype: str) -> str:
 
 
 def _baseline(model: ContactLagrangian, dtype: str) -> str:
-    """k (1 − cos q) + b sin q of angles, k q² / 2 + b q of the others."""
+    """K (1 − cos q) + b sin q of angles, k q² / 2 + b q of the others."""
     lines, f = [], 0
     stiffness, tilt = (x.detach().cpu().double().tolist() for x in (model.potential.stiffness, model.potential.tilt))
     for i, angle in enumerate(model.config.angles):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from itertools import pairwise
 from math import factorial
 
-import torch
 from torch import Tensor
 
 from herglotz.export.c_template import numbers, render
@@ -16,6 +15,8 @@ _TANH = {
     "float64": ("40.0", "6.93147180369123816490e-01", "1.90821492927058770002e-10", 1023, 52, 13),
     "float32": ("20.0", "6.93359375e-01", "-2.12194440e-04", 127, 23, 7),
 }
+
+BLOCK = 32  # outputs of a matrix product that are summed in registers
 
 _ARITHMETIC = """
 /* tanh x = e / (e + 2) with e = exp(2x) - 1 = 2^k (exp(r) - 1) + 2^k - 1 and |r| <= ln(2)/2: a few units in the last
@@ -37,19 +38,22 @@ static inline real NAME_tanh(real x) {
   return e / (e + R(2.0));
 }
 
-/* y_k += sum_j w_jk x_j; k runs fastest, so the inner loop needs no reduction. */
-static inline void NAME_product(int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
-  int j, k, first;
-  for (first = 0; first + @BLOCK@ <= outputs; first += @BLOCK@) {
-    real sum[@BLOCK@];
-    for (k = 0; k < @BLOCK@; k++) sum[k] = y[first + k];
-    for (j = 0; j < inputs; j++)
-      for (k = 0; k < @BLOCK@; k++) sum[k] += w[j * outputs + first + k] * x[j];
-    for (k = 0; k < @BLOCK@; k++) y[first + k] = sum[k];
-  }
-  if (first < outputs)
-    for (j = 0; j < inputs; j++)
-      for (k = first; k < outputs; k++) y[k] += w[j * outputs + k] * x[j];
+/* y_k += sum_j w_jk x_j for @BLOCK@ neighbouring k; k runs fastest, so the inner loop needs no reduction. */
+static inline void NAME_block(int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
+  real sum[@BLOCK@];
+  int j, k;
+  for (k = 0; k < @BLOCK@; k++) sum[k] = y[k];
+  for (j = 0; j < inputs; j++)
+    for (k = 0; k < @BLOCK@; k++) sum[k] += w[j * outputs + k] * x[j];
+  for (k = 0; k < @BLOCK@; k++) y[k] = sum[k];
+}
+
+/* The same for the last `count` k. */
+static inline void NAME_rest(int count, int inputs, int outputs, const real *w, const real *x,
+    real *NAME_RESTRICT y) {
+  int j, k;
+  for (j = 0; j < inputs; j++)
+    for (k = 0; k < count; k++) y[k] += w[j * outputs + k] * x[j];
 }
 """
 
@@ -63,7 +67,7 @@ static inline void NAME_@WHICH@_network(const real x[@M@], real *value, real dx[
 
 
 def arithmetic(dtype: str) -> str:
-    """`tanh` and the matrix product in C for one number type."""
+    """`tanh` and the parts of a matrix product in C for one number type."""
     limit, high, low, bias, mantissa, terms = _TANH[dtype]
     series = "\n".join(f"  e = e * r + R({1 / factorial(k)!r});" for k in range(terms - 1, 1, -1))
     values = {
@@ -75,7 +79,7 @@ def arithmetic(dtype: str) -> str:
         "SERIES": series,
         "BIAS": str(bias),
         "MANTISSA": str(mantissa),
-        "BLOCK": "8" if dtype == "float64" else "16",
+        "BLOCK": str(BLOCK),
     }
     return render(_ARITHMETIC, values)
 
@@ -114,13 +118,13 @@ def _body(which: str, sizes: list[int], tangents: bool) -> str:
     for layer, (a, b) in enumerate(pairwise(sizes)):
         before = "x" if layer == 0 else f"a{layer - 1}"
         C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_{which}_b{layer}[k];")
-        C.append(f"NAME_product({a}, {b}, NAME_{which}_t{layer}, {before}, a{layer});")
+        C += _product(a, b, f"NAME_{which}_t{layer}", before, f"a{layer}")
         C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_tanh(a{layer}[k]);")
         if tangents:
             before = "tx[j]" if layer == 0 else f"ta{layer - 1}[j]"
             C.append("for (j = 0; j < count; j++) {")
             C.append(f"  for (k = 0; k < {b}; k++) ta{layer}[j][k] = R(0.0);")
-            C.append(f"  NAME_product({a}, {b}, NAME_{which}_t{layer}, {before}, ta{layer}[j]);")
+            C += [f"  {line}" for line in _product(a, b, f"NAME_{which}_t{layer}", before, f"ta{layer}[j]")]
             C.append(f"  for (k = 0; k < {b}; k++) ta{layer}[j][k] *= R(1.0) - a{layer}[k] * a{layer}[k];")
             C.append("}")
     top, last = depth - 1, sizes[-1]
@@ -132,7 +136,7 @@ def _body(which: str, sizes: list[int], tangents: bool) -> str:
         below = "dx" if layer == 0 else f"u{layer - 1}"
         C.append(f"for (k = 0; k < {b}; k++) g{layer}[k] = u{layer}[k] * (R(1.0) - a{layer}[k] * a{layer}[k]);")
         C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
-        C.append(f"NAME_product({b}, {a}, NAME_{which}_w{layer}, g{layer}, {below});")
+        C += _product(b, a, f"NAME_{which}_w{layer}", f"g{layer}", below)
     if tangents:
         C.append("for (j = 0; j < count; j++) {")
         C += [f"  {line}" for line in _backward_tangents(which, sizes)]
@@ -151,8 +155,18 @@ def _backward_tangents(which: str, sizes: list[int]) -> list[str]:
         C.append(f"for (k = 0; k < {b}; k++)")
         C.append(f"  tg{layer}[k] = {first}- R(2.0) * a{layer}[k] * ta{layer}[j][k] * u{layer}[k];")
         C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
-        C.append(f"NAME_product({b}, {a}, NAME_{which}_w{layer}, tg{layer}, {below});")
+        C += _product(b, a, f"NAME_{which}_w{layer}", f"tg{layer}", below)
     return C
+
+
+def _product(inputs: int, outputs: int, w: str, x: str, y: str) -> list[str]:
+    """Y += x w for a matrix w of (inputs, outputs): calls for the full blocks and the rest."""
+    full = outputs - outputs % BLOCK
+    calls = [f"NAME_block({inputs}, {outputs}, {w} + {k}, {x}, {y} + {k});" for k in range(0, full, BLOCK)]
+    if full < outputs:
+        rest = f"{w} + {full}, {x}, {y} + {full}" if full else f"{w}, {x}, {y}"
+        calls.append(f"NAME_rest({outputs - full}, {inputs}, {outputs}, {rest});")
+    return calls
 
 
 def _array(name: str, values: Tensor, dtype: str) -> str:

@@ -34,10 +34,12 @@ def render(template: str, values: Mapping[str, str] | None = None, flags: Mappin
             active.append(active[-1] and value)
     out.append(template[position:])
     assert len(active) == 1, "unbalanced conditions in a template"
-    text = "".join(out)
-    for key, value in (values or {}).items():
-        text = text.replace(f"@{key}@", value)
-    return text
+    return fill("".join(out), values or {})
+
+
+def fill(text: str, values: Mapping[str, str]) -> str:
+    """Put values in for `@KEY@`s, in one pass; keys that are not given stay."""
+    return re.sub(r"@(\w+)@", lambda m: values.get(m[1], m[0]), text)
 
 
 def finish(text: str, name: str, dtype: str) -> str:

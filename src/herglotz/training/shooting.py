@@ -4,6 +4,7 @@ Unknowns are the parameters and the state (q, p[, s]) at the start of every segm
 
     (q_model − q_data) / σ     at every sample,
     (end of a segment − start of the next) / weight     between segments,
+    s / (speed · size)                                  at the start of a trajectory, where the motion depends on s,
 
 and the prior. Derivatives run through every implicit step by the implicit-function theorem: with
 F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ. Segments grow until each trajectory is one.
@@ -64,6 +65,7 @@ class ShootingProblem:
         scale = data.q.new_tensor(model.config.scale)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = sigma / scale
+        self.action = float((speed * scale).sum())  # natural size of s
         action = (speed * scale * relative)[: self.d - 2 * self.n]
         self.joint_weight = torch.cat([scale * relative, speed * relative, action])
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
@@ -100,7 +102,8 @@ class ShootingProblem:
         if path is None:
             return x.new_full((), torch.inf)
         fit, joints = self._residuals(path.x)
-        cost = (fit.square().sum() + joints.square().sum()) / 2
+        anchor = x[self._anchored()] / self.action
+        cost = (fit.square().sum() + joints.square().sum() + anchor.square().sum()) / 2
         return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -125,7 +128,11 @@ class ShootingProblem:
             J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
             columns = torch.cat([self._columns(before, x), self._columns(k, x)[P:]])
             self._add(A, b, J / self.joint_weight[:, None], joints[k], columns)
-        cost = (fit.square().sum() + joints.square().sum()) / 2
+        anchored = self._anchored()
+        A[anchored, anchored] += 1 / self.action**2
+        b[anchored] += x[anchored] / self.action**2
+        anchor = x[anchored] / self.action
+        cost = (fit.square().sum() + joints.square().sum() + anchor.square().sum()) / 2
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
             A[:P, :P] += prior_A
@@ -161,6 +168,11 @@ class ShootingProblem:
         ends = x[before, self.grid.end[before], : self.d]
         joints = (ends - x[:, 0, : self.d]) / self.joint_weight
         return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+
+    def _anchored(self) -> Tensor:
+        """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
+        first = (self.grid.joined_to < 0).nonzero()[:, 0]
+        return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
     def _columns(self, segment: int, x: Tensor) -> Tensor:
         """Columns of the unknowns that a segment's trajectory depends on: parameters, then its own state."""

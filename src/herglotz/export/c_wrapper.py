@@ -1,0 +1,175 @@
+"""The compiled header: a C compiler, a cache of shared libraries, and loops over samples around the header."""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import os
+import platform
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+from herglotz.export.c_template import finish
+
+# No -ffast-math: it removes the checks for NaN. Fused multiply-adds are what -std=c99 alone would turn off.
+FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast")
+
+LOOPS = """
+#include "stepper.h"
+
+static void load(const real *q, const real *p, const real *s, long b, NAME_state *x) {
+  int i;
+  for (i = 0; i < NAME_N; i++) {
+    x->q[i] = q[b * NAME_N + i];
+    x->p[i] = p[b * NAME_N + i];
+  }
+  x->s = s[b];
+  x->sigma = R(1.0);
+}
+
+/* Rollouts of `batch` samples; outputs are (batch, steps + 1, ...), statuses and residuals (batch, steps). The outputs
+   arrive full of NaN and the statuses full of NAME_DIVERGED: nothing is written after a failure but its own status. */
+void herglotz_rollouts(long batch, long steps, const real *q, const real *p, const real *s, const real *h,
+    long h_sample, long h_step, real *q_out, real *p_out, real *s_out, real *sigma_out, unsigned char *status_out,
+    real *residual_out) {
+  long b, k;
+  int i;
+  for (b = 0; b < batch; b++) {
+    NAME_state x;
+    NAME_track track;
+    int status = 0;
+    load(q, p, s, b, &x);
+    NAME_track_start(&x, &track);
+    for (k = 0; k <= steps; k++) {
+      const long at = b * (steps + 1) + k;
+      if (k > 0) {
+        const long step = b * steps + k - 1;
+        real left = R(0.0);
+        status = NAME_advance(&x, &track, h[b * h_sample + (k - 1) * h_step], &left);
+        status_out[step] = (unsigned char)status;
+        residual_out[step] = left;
+        if (status) break;
+      }
+      for (i = 0; i < NAME_N; i++) {
+        q_out[at * NAME_N + i] = x.q[i];
+        p_out[at * NAME_N + i] = x.p[i];
+      }
+      s_out[at] = x.s;
+      sigma_out[at] = x.sigma;
+    }
+  }
+}
+
+void herglotz_inits(long batch, const real *q0, const real *q1, const real *s0, const real *h, long h_sample,
+    real *p_out, real *s_out, unsigned char *status_out) {
+  long b;
+  int i;
+  for (b = 0; b < batch; b++) {
+    NAME_state x;
+    int status = NAME_init(q0 + b * NAME_N, q1 + b * NAME_N, s0[b], h[b * h_sample], &x) & 15;
+    status_out[b] = (unsigned char)status;
+    if (status) continue;
+    for (i = 0; i < NAME_N; i++) p_out[b * NAME_N + i] = x.p[i];
+    s_out[b] = x.s;
+  }
+}
+
+void herglotz_outside_box(long batch, const real *q, const real *p, const real *s, unsigned char *out) {
+  long b;
+  for (b = 0; b < batch; b++) {
+    NAME_state x;
+    load(q, p, s, b, &x);
+    out[b] = NAME_outside_box(&x) != 0;
+  }
+}
+"""
+
+
+def compiler() -> list[str]:
+    """The C compiler: $CC, or cc, gcc or clang from the PATH.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    given = shlex.split(os.environ.get("CC", ""))
+    for words in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+        found = shutil.which(words[0])
+        if found:
+            return [found, *words[1:]]
+    missing = f"$CC names '{given[0]}', which is not there" if given else "no C compiler (cc, gcc, clang) in the PATH"
+    raise InputError(f"{missing}; install one, for example with: apt install gcc")
+
+
+def build(header: str, name: str, dtype: str) -> ctypes.CDLL:
+    """Compile the header with its loops, or take the library from the cache, and load it.
+
+    Raises
+    ------
+    InputError
+        If there is no compiler, or it does not compile the header.
+    """
+    words = compiler()
+    loops = finish(LOOPS, name, dtype)
+    key = "\0".join([header, loops, *words, *FLAGS, sys.platform, _processor()])
+    digest = hashlib.sha256(key.encode()).hexdigest()[:32]
+    folder = _cache()
+    library = folder / f"{digest}.so"
+    if not library.exists():
+        write_atomically(library, _compile(words, header, loops))
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError:  # a damaged file
+        write_atomically(library, _compile(words, header, loops))
+    try:
+        return ctypes.CDLL(str(library))
+    except OSError as error:
+        raise InputError(f"{library}: cannot be loaded ({error}); check the compiler {words[0]}") from None
+
+
+def _compile(words: list[str], header: str, loops: str) -> bytes:
+    """The shared library, as bytes; without -march=native where the compiler does not know it."""
+    message = ""
+    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+        source, library = Path(folder, "loops.c"), Path(folder, "loops.so")
+        Path(folder, "stepper.h").write_text(header)
+        source.write_text(loops)
+        for flags in (FLAGS, [f for f in FLAGS if f != "-march=native"]):
+            command = [*words, *flags, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
+            try:
+                done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+            except (OSError, subprocess.TimeoutExpired) as error:
+                raise InputError(f"{words[0]}: cannot be run ({error}); set CC to a C compiler") from None
+            if done.returncode == 0:
+                return library.read_bytes()
+            message = (done.stderr.strip().splitlines() or ["no message"])[0]
+    raise InputError(f"{words[0]}: does not compile the header ({message[:200]}); export the model again")
+
+
+def _cache() -> Path:
+    """A folder that only this user can write to."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
+    folder = Path(base, "herglotz", "c")
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        if os.access(folder, os.W_OK):
+            return folder
+    except OSError:
+        pass
+    return Path(tempfile.mkdtemp(prefix="herglotz-c-"))
+
+
+def _processor() -> str:
+    """What -march=native depends on: a home folder may be shared by machines."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.platform() + platform.processor()
+    return platform.machine() + "".join(sorted({x for x in lines if x.startswith(("model name", "flags", "Features"))}))
