@@ -16,8 +16,6 @@ _TANH = {
     "float32": ("20.0", "6.93359375e-01", "-2.12194440e-04", 127, 23, 7),
 }
 
-BLOCK = 32  # outputs of a matrix product that are summed in registers
-
 _ARITHMETIC = """
 /* tanh x = e / (e + 2) with e = exp(2x) - 1 = 2^k (exp(r) - 1) + 2^k - 1 and |r| <= ln(2)/2: a few units in the last
    place, and without branches or calls, so that compilers vectorise loops of it. Needs IEEE 754 numbers. NaN stays. */
@@ -38,29 +36,41 @@ static inline real NAME_tanh(real x) {
   return e / (e + R(2.0));
 }
 
-/* y_k += sum_j w_jk x_j for @BLOCK@ neighbouring k; k runs fastest, so the inner loop needs no reduction. */
-static inline void NAME_block(int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
-  real sum[@BLOCK@];
-  int j, k;
-  for (k = 0; k < @BLOCK@; k++) sum[k] = y[k];
-  for (j = 0; j < inputs; j++)
-    for (k = 0; k < @BLOCK@; k++) sum[k] += w[j * outputs + k] * x[j];
-  for (k = 0; k < @BLOCK@; k++) y[k] = sum[k];
-}
-
-/* The same for the last `count` k. */
-static inline void NAME_rest(int count, int inputs, int outputs, const real *w, const real *x,
-    real *NAME_RESTRICT y) {
-  int j, k;
-  for (j = 0; j < inputs; j++)
-    for (k = 0; k < count; k++) y[k] += w[j * outputs + k] * x[j];
+/* y_k += sum_j w_jk x_j for k < count; k runs fastest, so nothing is summed across lanes. With GCC's and clang's vector
+   types sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
+static inline void NAME_product(int count, int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
+  int j, k = 0;
+#ifdef __GNUC__
+  typedef real lanes __attribute__((vector_size(32), aligned(sizeof(real)), may_alias));
+  enum { L = (int)(32 / sizeof(real)) };
+  for (; k + 4 * L <= count; k += 4 * L) {
+    lanes *to = (lanes *)(y + k), a = to[0], b = to[1], c = to[2], d = to[3];
+    for (j = 0; j < inputs; j++) {
+      const lanes *from = (const lanes *)(w + j * outputs + k);
+      a += from[0] * x[j];
+      b += from[1] * x[j];
+      c += from[2] * x[j];
+      d += from[3] * x[j];
+    }
+    to[0] = a;
+    to[1] = b;
+    to[2] = c;
+    to[3] = d;
+  }
+  for (; k + L <= count; k += L) {
+    lanes *to = (lanes *)(y + k), a = to[0];
+    for (j = 0; j < inputs; j++) a += *(const lanes *)(w + j * outputs + k) * x[j];
+    to[0] = a;
+  }
+#endif
+  for (; k < count; k++)
+    for (j = 0; j < inputs; j++) y[k] += w[j * outputs + k] * x[j];
 }
 """
 
 _HEAD = """
 /* The @WHICH@ network of @M@ features x: value, gradient dx{%if tangents}, and the derivatives ddx of that gradient
-   along `count` directions tx{%end}. Backward through the layers, with the directions carried forward{%if tangents} and
-   back{%end}. */
+   along `count` directions tx{%end}: forward, then backward through the layers. */
 static inline void NAME_@WHICH@_network(const real x[@M@], real *value, real dx[@M@]{%if tangents},
     int count, real tx[NAME_N][@M@], real ddx[NAME_N][@M@]{%end}) {
 """
@@ -79,7 +89,6 @@ def arithmetic(dtype: str) -> str:
         "SERIES": series,
         "BIAS": str(bias),
         "MANTISSA": str(mantissa),
-        "BLOCK": str(BLOCK),
     }
     return render(_ARITHMETIC, values)
 
@@ -106,28 +115,21 @@ def _body(which: str, sizes: list[int], tangents: bool) -> str:
     """Forward and backward through the layers, written out; sizes = (features, width, ..., width)."""
     depth = len(sizes) - 1
     depth = len(sizes) - 1
+    top, last = depth - 1, sizes[-1]
     C: list[str] = []
     for k, size in enumerate(sizes[1:]):
         C.append(f"real a{k}[{size}], u{k}[{size}], g{k}[{size}];  /* activation, its adjoint, its argument's */")
         if tangents:
-            below_top = "" if k == depth - 1 else f" tu{k}[{size}],"
-            C.append(f"real ta{k}[NAME_N][{size}],{below_top} tg{k}[{size}];  /* their derivatives */")
+            below_top = "" if k == top else f" tu{k}[{size}],"
+            C.append(f"real ta{k}[{size}],{below_top} tg{k}[{size}];  /* their derivatives */")
     C += ["int k;", "real sum = R(0.0);"]
     if tangents:
         C.append("int j;")
     for layer, (a, b) in enumerate(pairwise(sizes)):
-        before = "x" if layer == 0 else f"a{layer - 1}"
+        below = "x" if layer == 0 else f"a{layer - 1}"
         C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_{which}_b{layer}[k];")
-        C += _product(a, b, f"NAME_{which}_t{layer}", before, f"a{layer}")
+        C.append(_product(a, b, f"NAME_{which}_t{layer}", below, f"a{layer}"))
         C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_tanh(a{layer}[k]);")
-        if tangents:
-            before = "tx[j]" if layer == 0 else f"ta{layer - 1}[j]"
-            C.append("for (j = 0; j < count; j++) {")
-            C.append(f"  for (k = 0; k < {b}; k++) ta{layer}[j][k] = R(0.0);")
-            C += [f"  {line}" for line in _product(a, b, f"NAME_{which}_t{layer}", before, f"ta{layer}[j]")]
-            C.append(f"  for (k = 0; k < {b}; k++) ta{layer}[j][k] *= R(1.0) - a{layer}[k] * a{layer}[k];")
-            C.append("}")
-    top, last = depth - 1, sizes[-1]
     C.append(f"for (k = 0; k < {last}; k++) sum += NAME_{which}_last[k] * a{top}[k];")
     C.append("*value = sum;")
     C.append(f"for (k = 0; k < {last}; k++) u{top}[k] = NAME_{which}_last[k];")
@@ -136,37 +138,37 @@ def _body(which: str, sizes: list[int], tangents: bool) -> str:
         below = "dx" if layer == 0 else f"u{layer - 1}"
         C.append(f"for (k = 0; k < {b}; k++) g{layer}[k] = u{layer}[k] * (R(1.0) - a{layer}[k] * a{layer}[k]);")
         C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
-        C += _product(b, a, f"NAME_{which}_w{layer}", f"g{layer}", below)
+        C.append(_product(b, a, f"NAME_{which}_w{layer}", f"g{layer}", below))
     if tangents:
         C.append("for (j = 0; j < count; j++) {")
-        C += [f"  {line}" for line in _backward_tangents(which, sizes)]
+        C += [f"  {line}" for line in _tangents(which, sizes)]
         C.append("}")
     return "".join(f"  {line}\n" for line in C) + "}\n"
 
 
-def _backward_tangents(which: str, sizes: list[int]) -> list[str]:
-    """The derivative along direction j of g = u (1 − a²), layer by layer: g′ = u′ (1 − a²) − 2 a a′ u."""
+def _tangents(which: str, sizes: list[int]) -> list[str]:
+    """Along direction j: a′ = (1 − a²) (W a′ of the layer below), then g = u (1 − a²) gives u′ (1 − a²) − 2 a a′ u."""
     C: list[str] = []
     top = len(sizes) - 2
+    for layer, (a, b) in enumerate(pairwise(sizes)):
+        below = "tx[j]" if layer == 0 else f"ta{layer - 1}"
+        C.append(f"for (k = 0; k < {b}; k++) ta{layer}[k] = R(0.0);")
+        C.append(_product(a, b, f"NAME_{which}_t{layer}", below, f"ta{layer}"))
+        C.append(f"for (k = 0; k < {b}; k++) ta{layer}[k] *= R(1.0) - a{layer}[k] * a{layer}[k];")
     for layer in reversed(range(top + 1)):
         a, b = sizes[layer], sizes[layer + 1]
         below = "ddx[j]" if layer == 0 else f"tu{layer - 1}"
         first = "" if layer == top else f"tu{layer}[k] * (R(1.0) - a{layer}[k] * a{layer}[k]) "
         C.append(f"for (k = 0; k < {b}; k++)")
-        C.append(f"  tg{layer}[k] = {first}- R(2.0) * a{layer}[k] * ta{layer}[j][k] * u{layer}[k];")
+        C.append(f"  tg{layer}[k] = {first}- R(2.0) * a{layer}[k] * ta{layer}[k] * u{layer}[k];")
         C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
-        C += _product(b, a, f"NAME_{which}_w{layer}", f"tg{layer}", below)
+        C.append(_product(b, a, f"NAME_{which}_w{layer}", f"tg{layer}", below))
     return C
 
 
-def _product(inputs: int, outputs: int, w: str, x: str, y: str) -> list[str]:
-    """Y += x w for a matrix w of (inputs, outputs): calls for the full blocks and the rest."""
-    full = outputs - outputs % BLOCK
-    calls = [f"NAME_block({inputs}, {outputs}, {w} + {k}, {x}, {y} + {k});" for k in range(0, full, BLOCK)]
-    if full < outputs:
-        rest = f"{w} + {full}, {x}, {y} + {full}" if full else f"{w}, {x}, {y}"
-        calls.append(f"NAME_rest({outputs - full}, {inputs}, {outputs}, {rest});")
-    return calls
+def _product(inputs: int, outputs: int, w: str, x: str, y: str) -> str:
+    """Y += x w for a matrix w of (inputs, outputs)."""
+    return f"NAME_product({outputs}, {inputs}, {outputs}, {w}, {x}, {y});"
 
 
 def _array(name: str, values: Tensor, dtype: str) -> str:

@@ -129,7 +129,8 @@ def test_step_derivative_is_the_derivative_of_the_step():
     # fails if a term of the implicit-function theorem is missing, for an L_d that is nonlinear in s
     def L_d(q0, q1, s0, h):
         v, m = (q1 - q0) / h, (q0 + q1) / 2
-        return h * ((v**2).sum(-1) / 2 - torch.cos(m).sum(-1) - 0.3 * torch.sin(s0) * (1 + 0.2 * m.sum(-1)))
+        twist = q0[..., 0] * torch.sin(q1[..., 1])  # so that D1D2 is not symmetric
+        return h * ((v**2).sum(-1) / 2 - torch.cos(m).sum(-1) - 0.3 * torch.sin(s0) * (1 + 0.2 * m.sum(-1)) + twist)
 
     q, p, s, _ = points(seed=3)
     flow = lambda q, p, s: Stepper(L_d).step(State(q, p, s), 0.2).state  # noqa: E731
