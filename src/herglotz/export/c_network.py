@@ -36,14 +36,14 @@ static inline real NAME_tanh(real x) {
   return e / (e + R(2.0));
 }
 
-/* y_k += sum_j w_jk x_j for k < count; k runs fastest, so nothing is summed across lanes. With GCC's and clang's vector
+/* y_k += sum_j w_jk x_j where k runs fastest: nothing is summed across lanes. With GCC's and clang's vector
    types sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
-static inline void NAME_product(int count, int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
+static inline void NAME_product(int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
   int j, k = 0;
 #ifdef __GNUC__
   typedef real lanes __attribute__((vector_size(32), aligned(sizeof(real)), may_alias));
   enum { L = (int)(32 / sizeof(real)) };
-  for (; k + 4 * L <= count; k += 4 * L) {
+  for (; k + 4 * L <= outputs; k += 4 * L) {
     lanes *to = (lanes *)(y + k), a = to[0], b = to[1], c = to[2], d = to[3];
     for (j = 0; j < inputs; j++) {
       const lanes *from = (const lanes *)(w + j * outputs + k);
@@ -57,13 +57,13 @@ static inline void NAME_product(int count, int inputs, int outputs, const real *
     to[2] = c;
     to[3] = d;
   }
-  for (; k + L <= count; k += L) {
+  for (; k + L <= outputs; k += L) {
     lanes *to = (lanes *)(y + k), a = to[0];
     for (j = 0; j < inputs; j++) a += *(const lanes *)(w + j * outputs + k) * x[j];
     to[0] = a;
   }
 #endif
-  for (; k < count; k++)
+  for (; k < outputs; k++)
     for (j = 0; j < inputs; j++) y[k] += w[j * outputs + k] * x[j];
 }
 """
@@ -168,7 +168,7 @@ def _tangents(which: str, sizes: list[int]) -> list[str]:
 
 def _product(inputs: int, outputs: int, w: str, x: str, y: str) -> str:
     """Y += x w for a matrix w of (inputs, outputs)."""
-    return f"NAME_product({outputs}, {inputs}, {outputs}, {w}, {x}, {y});"
+    return f"NAME_product({inputs}, {outputs}, {w}, {x}, {y});"
 
 
 def _array(name: str, values: Tensor, dtype: str) -> str:

@@ -49,8 +49,9 @@ class CompiledStepper:
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0)
         h = self._checked_h(h).expand(s0.shape).contiguous()
-        p, s = torch.full_like(q0, torch.nan, memory_format=torch.contiguous_format), torch.full(
-            s0.shape, torch.nan, dtype=self.dtype
+        p, s = (
+            torch.full_like(q0, torch.nan, memory_format=torch.contiguous_format),
+            torch.full(s0.shape, torch.nan, dtype=self.dtype),
         )
         status = torch.zeros(s0.shape, dtype=torch.uint8)
         inputs = [x.contiguous() for x in (q0, q1, s0)]
@@ -142,9 +143,7 @@ class CompiledStepper:
         return Rollout(q_out, p_out, s_out, sigma, status, residual)
 
     def _call(self, function: str, *arguments: Tensor | int) -> None:
-        converted = (
-            ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else ctypes.c_long(x) for x in arguments
-        )
+        converted = (ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else ctypes.c_long(x) for x in arguments)
         getattr(self._library, function)(*converted)
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor) -> None:
@@ -157,7 +156,9 @@ class CompiledStepper:
             if x.dtype != self.dtype:
                 raise InputError(f"{name} must be {self.dtype}, got {x.dtype}; convert it with .to({self.dtype})")
             if x.device.type != "cpu" or x.requires_grad:
-                raise InputError(f"{name} must be on the CPU and without gradient; use Stepper, or {name}.detach().cpu()")
+                raise InputError(
+                    f"{name} must be on the CPU and without gradient; use Stepper, or {name}.detach().cpu()"
+                )
             if not bool(torch.isfinite(x).all()):
                 raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
 

@@ -1,0 +1,350 @@
+"""The generated C header: what it computes, what it says of itself, and what is refused."""
+
+import json
+import math
+import re
+import shutil
+import subprocess
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export import CompiledStepper, compile_c, export_c, weights_digest
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Status, Stepper
+
+CC = next((c for c in ("cc", "gcc", "clang") if shutil.which(c)), None)
+CXX = next((c for c in ("c++", "g++", "clang++") if shutil.which(c)), None)
+needs_compiler = pytest.mark.skipif(CC is None, reason="no C compiler in the PATH")
+BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-5.0], "s_high": [5.0]}
+KINDS = {"linear": ("linear", 0, True), "affine": ("affine", 0, True), "correction": ("linear", 6, True)}
+KINDS |= {"both": ("affine", 3, True), "alone": ("linear", 6, False)}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def damped(n, kind, dtype=torch.float64):
+    """A damped model whose every parameter is random; angles and lengths alternate."""
+    level, correction, baseline = KINDS[kind]
+    make, size = torch.Generator().manual_seed(n), tuple(1.0 + 0.1 * i for i in range(n))
+    config = ModelConfig(
+        tuple(i % 2 == 0 for i in range(n)), level, size, size, size, (0.0,) * n, 0.3, 4, 2, 4, correction, 2, baseline
+    )
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        if not baseline:  # a network that bends enough to have a mixed Hessian
+            assert model.correction is not None
+            model.correction.network.weights[-1].mul_(3.0)
+    return model.to(dtype)
+
+
+def states_of(n, batch, dtype=torch.float64):
+    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype)
+    return State(0.5 * x[:, :n], 0.5 * x[:, n : 2 * n], x[:, -1])
+
+
+def relative(a, b):
+    return float((a - b).abs().max() / b.abs().max())
+
+
+def eager_rollout(model, states, **options):
+    with torch.no_grad():
+        return Stepper(model).rollout(*states, **options)
+
+
+@needs_compiler
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("kind", ["linear", "affine", "correction", "both"])
+def test_many_steps_agree_with_the_eager_stepper(n, kind):
+    # fails if a derivative of a term, a feature's chain rule or a carried potential is wrong
+    steps = 1000 if (n, kind) in ((2, "linear"), (1, "both"), (2, "correction")) else 100  # the eager ones are slow
+    model, states = damped(n, kind), states_of(n, 2)
+    eager = eager_rollout(model, states, h=0.1, steps=steps)
+    ours = compile_c(model).rollout(*states, h=0.1, steps=steps)
+    assert eager.ok.all()
+    assert ours.ok.all()
+    for name in ("q", "p", "s", "sigma"):
+        assert relative(getattr(ours, name), getattr(eager, name)) <= 1e-12, name
+    assert ours.residual.max() <= 1e-13
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", ["linear", "affine", "correction"])
+def test_float32_agrees_over_many_steps(kind):
+    # fails if a step is taken in positions instead of increments, which loses digits in float32
+    model, states = damped(2, kind, torch.float32), states_of(2, 2, torch.float32)
+    ours = compile_c(model).rollout(*states, h=0.1, steps=150)
+    eager = eager_rollout(model.double(), State(*(x.double() for x in states)), h=0.1, steps=150)
+    assert ours.q.dtype == torch.float32
+    assert ours.ok.all()
+    for name in ("q", "p", "s", "sigma"):
+        assert relative(getattr(ours, name).double(), getattr(eager, name)) <= 1e-5, name
+
+
+@needs_compiler
+def test_irregular_steps_and_single_steps():
+    # fails if the guess extrapolates over unequal steps, e^(-γh) is kept when h changes, or step differs from rollout
+    model, states = damped(2, "correction"), states_of(2, 3)
+    h = torch.tensor([[0.1, 0.3, 0.1, 0.1, 0.2], [0.2] * 5, [0.05, 0.1, 0.1, 0.1, 0.1]], dtype=torch.float64)
+    compiled = compile_c(model)
+    ours, eager = compiled.rollout(*states, h=h), eager_rollout(model, states, h=h)
+    assert relative(ours.q, eager.q) <= 1e-13
+    step = compiled.step(states, h[:, 0])
+    assert relative(step.state.p, eager.p[:, 1]) <= 1e-13
+    assert relative(step.c, eager.sigma[:, 1]) <= 1e-14
+
+
+@needs_compiler
+@pytest.mark.parametrize("kind", KINDS)
+def test_init_from_two_positions(kind):
+    # fails if FL⁺ uses D1, or s1 instead of s0 (erratum E3)
+    model, (q, p, s) = damped(2, kind), states_of(2, 4)
+    with torch.no_grad():
+        eager = Stepper(model).init(q, q + 0.1 * p, s, 0.1)
+    ours = compile_c(model).init(q, q + 0.1 * p, s, 0.1)
+    for a, b in zip(ours, eager, strict=True):
+        assert relative(a, b) <= 1e-13
+
+
+@needs_compiler
+def test_a_plain_network_agrees_with_the_eager_stepper():
+    # fails if the model without a baseline gets a kinetic term, or a failure is not reported as the eager one does
+    model, states = damped(1, "alone"), states_of(1, 20)
+    eager = eager_rollout(model, states, h=0.5, steps=3)
+    ours = compile_c(model).rollout(*states, h=0.5, steps=3)
+    both = ours.ok & eager.ok
+    assert both.any()
+    with torch.no_grad():  # the guesses differ, and so may the root: each must solve the step equation
+        assert ours.residual[both].max() <= 1e-12
+    assert torch.isfinite(ours.q[ours.ok]).all()
+    assert torch.isnan(ours.q[~ours.ok][:, -1]).all()
+
+
+@needs_compiler
+def test_wide_networks():
+    # fails if a block of a matrix product is skipped or summed twice: widths of one, several and odd blocks
+    for width in (3, 16, 37):
+        size = (1.0,)
+        config = ModelConfig((True,), "affine", size, size, size, (0.0,), 0.3, width, 3, width, width, 3)
+        model = ContactLagrangian(config)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter += 0.05 * torch.randn(
+                    parameter.shape, generator=torch.Generator().manual_seed(width), dtype=torch.float64
+                )
+        states = states_of(1, 2)
+        ours, eager = compile_c(model).rollout(*states, h=0.1, steps=20), eager_rollout(model, states, h=0.1, steps=20)
+        assert relative(ours.q, eager.q) <= 1e-13, width
+
+
+@needs_compiler
+@pytest.mark.parametrize("language", ["c", "c++"])
+@pytest.mark.parametrize("dtype", ["float64", "float32"])
+def test_no_compiler_warnings(tmp_path, language, dtype):
+    # fails if the header is not clean C99 or C++: unused names, shadowing, implicit conversions of types
+    tool = [CC, "-std=c99"] if language == "c" else [CXX, "-x", "c++"]
+    if tool[0] is None:
+        pytest.skip("no C++ compiler in the PATH")
+    source = tmp_path / "use.c"
+    source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
+    for kind in KINDS:
+        export_c(damped(2, kind), tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
+        for level in ("-O2", "-O3"):
+            command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", level, "-c", str(source), "-o", "/dev/null"]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, (kind, level, done.stderr[:2000])
+
+
+@needs_compiler
+def test_the_example_in_the_comment_runs(tmp_path):
+    # fails if the example at the top of the header no longer compiles
+    path = export_c(damped(1, "linear"), tmp_path / "stepper.h", h=0.1, name="arm")
+    comment = path.read_text().split("*/")[0]
+    code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
+    (tmp_path / "example.c").write_text(code)
+    command = [CC, "-std=c99", "-Wall", "-Wextra", str(tmp_path / "example.c"), "-lm", "-o", str(tmp_path / "example")]
+    built = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert built.returncode == 0, built.stderr
+    assert not built.stderr
+    done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
+    assert len(done.stdout.splitlines()) == 100
+
+
+STATUSES = """
+#include <stdio.h>
+#include "stepper.h"
+int main(void) {
+  arm_state x = {{0.1}, {0.2}, 0.0, 1.0}, y;
+  double q[5], p[5], s[5], left;
+  int status;
+  printf("%d ", arm_step(&x, 0.1, &left));
+  y = x;
+  printf("%d %d %d ", arm_step(&y, 0.0, 0), arm_step(&y, -1.0, 0), arm_step(&y, NAN, 0));
+  y.q[0] = NAN; printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; y.p[0] = INFINITY; printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; y.q[0] = 2.0; printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; y.q[0] += 8 * atan(1.0); printf("%d ", arm_step(&y, 0.1, 0));
+  y = x; y.p[0] = 1e308; status = arm_step(&y, 10.0, 0); printf("%d %d ", status & 15, y.p[0] == 1e308);
+  y = x; status = arm_rollout(&y, 0.1, 8, 2, q, p, s);
+  printf("%d %d %d ", status, q[0] == x.q[0], q[4] == y.q[0]);
+  y = x; y.p[0] = 1e308; status = arm_rollout(&y, 10.0, 8, 2, q, p, s);
+  printf("%d %d %d ", status & 15, p[0] == 1e308, q[1] != q[1] && p[4] != p[4] && s[4] != s[4]);
+  printf("%d %d\\n", arm_rollout(&x, 0.1, -1, 1, q, p, s), arm_rollout(&x, 0.1, 1, 0, q, p, s));
+  return 0;
+}
+"""
+
+
+@needs_compiler
+def test_statuses_in_c(tmp_path):
+    # fails if bad input, overflow or the box goes unnoticed, an angle is not wrapped, or a failed step moves the state
+    export_c(damped(1, "linear"), tmp_path / "stepper.h", h=0.1, box=BOX, name="arm")
+    (tmp_path / "use.c").write_text(STATUSES)
+    command = [CC, "-std=c99", "-O2", str(tmp_path / "use.c"), "-lm", "-o", str(tmp_path / "use")]
+    subprocess.run(command, check=True)
+    words = subprocess.run([tmp_path / "use"], capture_output=True, text=True, check=True).stdout.split()
+    expected = "0 | 5 5 5 | 5 | 5 | 16 | 0 | 3 1 | 0 1 1 | 3 1 1 | 5 5"
+    assert words == expected.replace("|", "").split()
+
+
+@needs_compiler
+def test_a_singular_step_is_reported():
+    # fails if a zero pivot is divided by: a plain network with a zero last layer has J = 0
+    for n in (1, 2):
+        model = damped(n, "alone")
+        with torch.no_grad():
+            assert model.correction is not None
+            model.correction.network.weights[-1].zero_()
+        states = states_of(n, 1)
+        step = compile_c(model).step(states, 0.1)
+        with torch.no_grad():
+            assert step.status.tolist() == Stepper(model).step(states, 0.1).status.tolist() == [Status.SINGULAR]
+        assert torch.isnan(step.state.q).all()
+
+
+@needs_compiler
+def test_a_failing_sample_does_not_touch_its_neighbours():
+    # fails if a diverging sample stops the loop, or what follows a failure is not NaN with its status
+    model, states = damped(2, "affine"), states_of(2, 3)
+    states.p[1] = 1e200
+    ours = compile_c(model).rollout(*states, h=0.2, steps=10)
+    eager = eager_rollout(model, states, h=0.2, steps=10)
+    assert ours.ok.tolist() == eager.ok.tolist() == [True, False, True]
+    assert relative(ours.q[eager.ok], eager.q[eager.ok]) <= 1e-12
+    assert (ours.status[1] != Status.CONVERGED).all()
+    assert torch.isnan(ours.q[1, 1:]).all()
+    assert torch.equal(ours.q[1, 0], states.q[1])
+
+
+def test_metadata(tmp_path):
+    # fails if the header does not say which weights, number type, box or versions it holds
+    model = damped(1, "affine")
+    path = export_c(model, tmp_path / "stepper.h", h=0.25, box=BOX, units=["rad"], metadata={"note": "*/ ?"})
+    text = path.read_text()
+    entries = json.loads(re.search(r"herglotz-metadata: (.*)", text)[1])
+    assert entries["weights_sha256"] == weights_digest(model)
+    assert (entries["level"], entries["h"], entries["units"], entries["note"]) == ("affine", 0.25, ["rad"], "*/ ?")
+    assert entries["box"] == BOX
+    assert f'_weights_sha256[] = "{weights_digest(model)}"' in text
+    assert "herglotz_stepper_q_low[herglotz_stepper_N] = {-1.0}" in text
+    assert "@" not in text
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"h": 0.0}, "h must be"),
+        ({"h": math.nan}, "h must be"),
+        ({"name": "3d"}, "C identifier"),
+        ({"name": "a-b"}, "C identifier"),
+        ({"dtype": "float16"}, "dtype must be"),
+        ({"units": ["m", "m"]}, "units needs one"),
+        ({"box": {"q_low": [0.0]}}, "box needs exactly"),
+        ({"path": "missing/stepper.h"}, "cannot be written"),
+        ({"path": "."}, "cannot be written"),
+    ],
+)
+def test_unusable_arguments_are_refused(tmp_path, change, message):
+    # fails if a wrong argument or an unwritable path ends in another exception, or in a file
+    path = tmp_path / change.get("path", "stepper.h")
+    options: dict[str, Any] = {"h": 0.1} | {k: v for k, v in change.items() if k != "path"}
+    with pytest.raises(InputError, match=message):
+        export_c(damped(1, "linear"), path, **options)
+    assert not list(tmp_path.iterdir())
+
+
+def test_weights_that_are_not_finite_are_refused(tmp_path):
+    # fails if `nan` or `inf` is written as a C constant, or a float64 weight overflows in float32
+    model = damped(1, "linear")
+    with torch.no_grad():
+        model.damping.rate.fill_(1e39)
+    with pytest.raises(InputError, match="not finite in float32"):
+        export_c(model, tmp_path / "stepper.h", h=0.1, dtype="float32")
+
+
+def test_no_compiler(monkeypatch):
+    # fails if a missing compiler is a stack trace instead of what to install
+    monkeypatch.delenv("CC", raising=False)
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(InputError, match="install one"):
+        compile_c(damped(1, "linear"))
+
+
+def test_a_file_that_is_not_ours(tmp_path):
+    # fails if any text is taken for a header
+    (tmp_path / "other.h").write_text("#define X 1\n")
+    with pytest.raises(InputError, match="no herglotz metadata"):
+        compile_c(tmp_path / "other.h")
+
+
+@needs_compiler
+def test_wrong_states_are_refused(tmp_path):
+    # fails if a wrong dtype or shape reaches C, where it would read other memory
+    path = export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1)
+    compiled = compile_c(path)
+    assert isinstance(compiled, CompiledStepper)
+    q, p, s = states_of(2, 3)
+    for state, h, message in (
+        (State(q.float(), p, s), 0.1, "must be torch.float64"),
+        (State(q[:, :1], p, s), 0.1, "need shapes"),
+        (State(q, p * math.nan, s), 0.1, "must be finite"),
+        (State(q.clone().requires_grad_(), p, s), 0.1, "without gradient"),
+        (State(q, p, s), 0.0, "h must be"),
+        (State(q, p, s), torch.full((2,), 0.1), "match the batch"),
+    ):
+        with pytest.raises(InputError, match=message):
+            compiled.step(state, h)
+    with pytest.raises(InputError, match="records no box"):
+        compiled.outside_box(State(q, p, s))
+
+
+@needs_compiler
+def test_views_and_batches_of_any_shape():
+    # fails if strides are ignored: a transposed view would be read in the wrong order
+    model, states = damped(2, "affine"), states_of(2, 6)
+    compiled = compile_c(model)
+    plain = compiled.rollout(*states, h=0.1, steps=5)
+    view = State(*(x.reshape(2, 3, *x.shape[1:]).transpose(0, 1) for x in states))
+    shaped = compiled.rollout(*view, h=0.1, steps=5)
+    assert torch.equal(shaped.q.transpose(0, 1).reshape(plain.q.shape), plain.q)
+    single = compiled.rollout(*(x[0] for x in states), h=0.1, steps=5)
+    assert torch.equal(single.q, plain.q[0])
+
+
+@needs_compiler
+def test_the_box_of_a_compiled_stepper():
+    # fails if angles are not taken modulo a turn, or p and s are not looked at
+    compiled = compile_c(damped(1, "linear"), box=BOX)
+    q = torch.tensor([0.0, 2.0, 2 * math.pi, 0.0, 0.0], dtype=torch.float64)[:, None]
+    p = torch.tensor([0.0, 0.0, 0.0, 1.5, 0.0], dtype=torch.float64)[:, None]
+    s = torch.tensor([0.0, 0.0, 0.0, 0.0, -6.0], dtype=torch.float64)
+    assert compiled.outside_box(State(q, p, s)).tolist() == [False, True, False, True, True]
