@@ -13,8 +13,9 @@ import torch
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
+from herglotz.export.c_api import API
 from herglotz.export.c_model import flags_of, terms_source
-from herglotz.export.c_solver import ADVANCE, API, ELIMINATION
+from herglotz.export.c_solver import ADVANCE, ELIMINATION
 from herglotz.export.c_template import fill, finish, number, numbers, render, text_constant
 from herglotz.export.pt2 import _metadata
 from herglotz.models import ContactLagrangian

@@ -14,8 +14,9 @@ from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
 from herglotz.export.c_wrapper import build
+from herglotz.export.inputs import check_state, checked_h
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Rollout, State, Status, Step
+from herglotz.stepping import Rollout, State, Status, Step, step_sizes
 
 
 class CompiledStepper:
@@ -48,7 +49,7 @@ class CompiledStepper:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. NaN where it is not finite."""
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0)
-        h = self._checked_h(h).expand(s0.shape).contiguous()
+        h = checked_h(h, self.dtype).expand(s0.shape).contiguous()
         p, s = (
             torch.full_like(q0, torch.nan, memory_format=torch.contiguous_format),
             torch.full(s0.shape, torch.nan, dtype=self.dtype),
@@ -80,7 +81,7 @@ class CompiledStepper:
         """
         q, p, s = state
         self._check(q, p, s)
-        h = self._checked_h(h)
+        h = checked_h(h, self.dtype)
         out = self._rollout(q, p, s, _expand(h, s)[..., None])
         return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS)
 
@@ -105,13 +106,7 @@ class CompiledStepper:
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, p, s)
-        h = self._checked_h(h)
-        if h.ndim == 0:
-            if steps is None or steps < 1:
-                raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")
-            h = h.expand(steps)
-        elif steps is not None and steps != h.shape[-1]:
-            raise InputError(f"h lists {h.shape[-1]} steps but steps={steps}; give one of the two")
+        h = step_sizes(checked_h(h, self.dtype), steps)
         return self._rollout(q, p, s, h)
 
     def outside_box(self, state: State) -> Tensor:
@@ -147,26 +142,12 @@ class CompiledStepper:
         getattr(self._library, function)(*converted)
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor) -> None:
-        if q.ndim < 1 or q.shape[-1] != self.dof or p.shape != q.shape or s.shape != q.shape[:-1]:
-            shapes = [tuple(x.shape) for x in (q, p, s)]
-            raise InputError(f"q, p, s need shapes (..., {self.dof}), (..., {self.dof}), (...); got {shapes}")
-        if s.numel() == 0:
-            raise InputError("q, p, s hold no samples; give at least one")
+        check_state(q, p, s, self.dof, self.dtype)
         for name, x in (("q", q), ("p", p), ("s", s)):
-            if x.dtype != self.dtype:
-                raise InputError(f"{name} must be {self.dtype}, got {x.dtype}; convert it with .to({self.dtype})")
             if x.device.type != "cpu" or x.requires_grad:
                 raise InputError(
                     f"{name} must be on the CPU and without gradient; use Stepper, or {name}.detach().cpu()"
                 )
-            if not bool(torch.isfinite(x).all()):
-                raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
-
-    def _checked_h(self, h: Tensor | float) -> Tensor:
-        h = torch.as_tensor(h, dtype=self.dtype)
-        if h.numel() == 0 or not bool(((h > 0) & torch.isfinite(h)).all()):
-            raise InputError(f"h must be finite and > 0, got {float(h.min()) if h.numel() else 'none'}")
-        return h
 
 
 def _expand(h: Tensor, like: Tensor) -> Tensor:

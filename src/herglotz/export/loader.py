@@ -12,8 +12,9 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
+from herglotz.export.inputs import check_state, checked_h
 from herglotz.export.pt2 import FORMAT, METADATA
-from herglotz.stepping import Rollout, State, Step
+from herglotz.stepping import Rollout, State, Step, step_sizes
 
 REQUIRED = ("format", "dof", "dtype", "h", "box", "newton_iterations", "newton_tolerance")
 
@@ -60,8 +61,8 @@ class ExportedStepper:
             If a shape, the dtype or a value is not what the file takes.
         """
         q, p, s = state
-        self._check(q, p, s)
-        return self._step(state, self._checked_h(h))
+        check_state(q, p, s, self.dof, self.dtype)
+        return self._step(state, checked_h(h, self.dtype))
 
     def rollout(
         self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
@@ -83,20 +84,13 @@ class ExportedStepper:
             As `step`, and if the length of h and `steps` disagree.
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
-        self._check(q, p, s)
-        h_all = self._steps(h, steps)
+        check_state(q, p, s, self.dof, self.dtype)
+        h_all = step_sizes(checked_h(h, self.dtype), steps)
         states, results = [State(q, p, s)], []
         for k in range(h_all.shape[-1]):
             results.append(self._step(states[-1], h_all[..., k]))
             states.append(results[-1].state)
-        return Rollout(
-            q=torch.stack([x.q for x in states], -2),
-            p=torch.stack([x.p for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=torch.stack([torch.ones_like(s), *(r.c for r in results)], -1).cumprod(-1),
-            status=torch.stack([r.status for r in results], -1),
-            residual=torch.stack([r.residual for r in results], -1),
-        )
+        return Rollout.of(states, results)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
@@ -130,34 +124,6 @@ class ExportedStepper:
         new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
         c, residual, status = (x.reshape(s.shape) for x in (c, residual, status))
         return Step(new, c, status, residual, self.metadata["newton_iterations"])
-
-    def _check(self, q: Tensor, p: Tensor, s: Tensor) -> None:
-        if q.ndim < 1 or q.shape[-1] != self.dof or p.shape != q.shape or s.shape != q.shape[:-1]:
-            shapes = [tuple(x.shape) for x in (q, p, s)]
-            raise InputError(f"q, p, s need shapes (..., {self.dof}), (..., {self.dof}), (...); got {shapes}")
-        if s.numel() == 0:
-            raise InputError("q, p, s hold no samples; give at least one")
-        for name, x in (("q", q), ("p", p), ("s", s)):
-            if x.dtype != self.dtype:
-                raise InputError(f"{name} must be {self.dtype}, got {x.dtype}; convert it with .to({self.dtype})")
-            if not bool(torch.isfinite(x).all()):
-                raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
-
-    def _checked_h(self, h: Tensor | float) -> Tensor:
-        h = torch.as_tensor(h, dtype=self.dtype)
-        if h.numel() == 0 or not bool(((h > 0) & torch.isfinite(h)).all()):
-            raise InputError(f"h must be finite and > 0, got {float(h.min()) if h.numel() else 'none'}")
-        return h
-
-    def _steps(self, h: Tensor | float, steps: int | None) -> Tensor:
-        h = self._checked_h(h)
-        if h.ndim == 0:
-            if steps is None or steps < 1:
-                raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")
-            return h.expand(steps)
-        if steps is not None and steps != h.shape[-1]:
-            raise InputError(f"h lists {h.shape[-1]} steps but steps={steps}; give one of the two")
-        return h
 
 
 def load_pt2(path: PathLike) -> ExportedStepper:

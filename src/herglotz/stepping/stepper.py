@@ -53,6 +53,19 @@ class Rollout:
     status: Tensor  # (..., K)
     residual: Tensor  # (..., K)
 
+    @classmethod
+    def of(cls, states: list[State], steps: list[Step]) -> Rollout:
+        """Join K+1 states and the K steps between them."""
+        factors = torch.stack([torch.ones_like(states[0].s), *(step.c for step in steps)], -1)
+        return cls(
+            q=torch.stack([x.q for x in states], -2),
+            p=torch.stack([x.p for x in states], -2),
+            s=torch.stack([x.s for x in states], -1),
+            sigma=factors.cumprod(-1),
+            status=torch.stack([step.status for step in steps], -1),
+            residual=torch.stack([step.residual for step in steps], -1),
+        )
+
     @property
     def final(self) -> State:
         """The last state."""
@@ -162,7 +175,7 @@ class Stepper:
             If h is not positive or its length and `steps` disagree.
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
-        h_all = _steps(h, steps, q)
+        h_all = step_sizes(torch.as_tensor(h, dtype=q.dtype, device=q.device), steps)
         states, guess = [State(q, p, s)], q
         results: list[Step] = []
         for k in range(h_all.shape[-1]):
@@ -173,15 +186,7 @@ class Stepper:
             results.append(out)
             states.append(out.state)
             guess = _extrapolate([x.q.detach() for x in states[-4:]], h_all[..., max(0, k - 2) : k + 2])
-        factors = torch.stack([torch.ones_like(s), *(r.c for r in results)], -1)
-        return Rollout(
-            q=torch.stack([x.q for x in states], -2),
-            p=torch.stack([x.p for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=factors.cumprod(-1),
-            status=torch.stack([r.status for r in results], -1),
-            residual=torch.stack([r.residual for r in results], -1),
-        )
+        return Rollout.of(states, results)
 
     def _attach(self, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, q1: Tensor) -> Tensor:
         """Give the solved q1 its derivative: one Newton step, which is zero in value and dq1 = −J⁻¹ dF in slope."""
@@ -205,8 +210,14 @@ def _checked(state: State, h: Tensor | float) -> tuple[Tensor, Tensor, Tensor, T
     return q, p, s, h
 
 
-def _steps(h: Tensor | float, steps: int | None, q: Tensor) -> Tensor:
-    h = torch.as_tensor(h, dtype=q.dtype, device=q.device)
+def step_sizes(h: Tensor, steps: int | None) -> Tensor:
+    """All K steps, (K,) or (..., K), from a scalar and a count or from a list.
+
+    Raises
+    ------
+    InputError
+        If a scalar comes without a count, or a list with another one.
+    """
     if h.ndim == 0:
         if steps is None or steps < 1:
             raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")

