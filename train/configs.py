@@ -34,7 +34,7 @@ def pendulum() -> Experiment:
     return Experiment(
         lambda: simulate(scene("damped_pendulum"), trajectories=40, steps=40, h=0.5, seed=0),
         FitConfig(train_fraction=1.0),
-        "exact damped pendulum, 40 trajectories of 41 positions at h = 0.5: one eighth of a period a step",
+        "exact damped pendulum, 40 trajectories of 41 positions at h = 0.5: about thirteen steps a period",
     )
 
 

@@ -42,7 +42,7 @@ def main() -> int:
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    return 0
+    return 0 if report.passed else 1
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 """herglotz: learned discrete contact Lagrangians. Positions in, a verified stepper out.
 
-import herglotz as hz
-
-run = hz.fit(hz.load("motion.csv"))
-rollout = run.stepper.rollout(*run.states_at_end(), h=run.h, steps=100)
-print(hz.verify(run).table())
+>>> import herglotz as hz
+>>> from herglotz.verify import verify
+>>> run = hz.fit(hz.load("motion.csv"))
+>>> rollout = run.stepper.rollout(*run.states_at_end(), h=run.h, steps=100)
+>>> print(verify(run).table())
 """
 
 from importlib import import_module
@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     from herglotz.stepping import State, Status, Stepper
     from herglotz.systems import scene, scene_names
     from herglotz.training import FitConfig, Run, fit, load_run, save_run
-    from herglotz.verify import verify
 
-# Loaded at first use, so that `herglotz --help` does not wait for torch.
+# Loaded at first use, so that `herglotz --help` does not wait for torch. (`verify` is a room of the same
+# name, and stays one: `from herglotz.verify import verify`.)
 _HOME = {
     "Trajectories": "data",
     "load": "data",
@@ -45,7 +45,6 @@ _HOME = {
     "fit": "training",
     "load_run": "training",
     "save_run": "training",
-    "verify": "verify",
 }
 __all__ = [
     "ContactLagrangian",
@@ -68,7 +67,6 @@ __all__ = [
     "scene",
     "scene_names",
     "simulate",
-    "verify",
 ]
 
 

@@ -19,7 +19,8 @@ OPTIMISERS = ("lm", "adam")
 DTYPES = ("float64", "float32")
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
-Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz and the figures (*.png).
+Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
+(*.png).
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q) or a
 Schmidt & Lipson .txt. Steps may differ and samples may be missing.
@@ -41,7 +42,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",
         help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. auto: measure "
-        "the noise and choose. raw: the residual that collapses, for demonstration (default %(default)s)",
+        "the noise and choose. raw: a plain network on |R|, which collapses, for demonstration (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--optimiser", choices=OPTIMISERS, default="lm",

@@ -33,8 +33,8 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
-    if min(arguments.samples, arguments.steps) < 1:
-        raise InputError(f"--samples and --steps must be at least 1, got {arguments.samples} and {arguments.steps}")
+    if arguments.samples < 1 or arguments.steps < 2:
+        raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
 
     from herglotz.verify import verify
 

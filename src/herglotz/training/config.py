@@ -26,8 +26,8 @@ class FitConfig:
         "linear" (one damping rate) or "affine" (damping depends on position and velocity).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
-        "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses;
-        for demonstration.
+        "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
+        (always seen with Adam, at some seeds with Levenberg–Marquardt); for demonstration.
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" for the residual objectives.
     train_fraction
@@ -37,7 +37,8 @@ class FitConfig:
     dtype, device
         Of the whole fit and of the model it returns.
     iterations
-        Bound on the iterations of the residual objectives, and on those of each stage of trajectory fitting.
+        Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
+        fitting takes 40 at the most.
     departures
         Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
         value fixes it.

@@ -36,7 +36,7 @@ class Run:
     train_lengths: tuple[int, ...]  # leading samples of each trajectory that were trained on
     states: State  # (N, n), (N, n), (N,) at every sample
     h: float  # typical model step
-    box: dict[str, list[float]]  # range of q, p, s over the data: where the model can be trusted
+    box: dict[str, list[float]]  # range of q, p, s over the training part: where the model can be trusted
     history: list[dict[str, Any]]  # stage, iteration, cost
 
     @property

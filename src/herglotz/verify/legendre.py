@@ -11,7 +11,8 @@ from herglotz.verify.report import Check
 from herglotz.verify.subject import Subject
 from herglotz.verify.walk import Walk, worst
 
-MARGIN = 1e-3  # rounding aside, a kinetic term gives about 1; the collapsed models of trap 2 give 0 or change sign
+# A kinetic term gives 1/3 (1/2 for a file); the collapsed models of trap 2 give 0 or change sign.
+MARGIN = 1e-3
 
 
 def momentum_matching(subject: Subject, w: Walk, bound: float) -> Check:
