@@ -98,7 +98,7 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["simulate", "parachute", "--out", "OUT.csv", "--trajectories", "0"], "trajectories"),
         (["verify", "double_pendulum"], "double_pendulum"),
         (["verify", "missing.pt2"], "no such file"),
-        (["verify", "damped_oscillator", "--samples", "0"], "at least 1"),
+        (["verify", "damped_oscillator", "--samples", "0"], "--samples must be >= 1 and --steps >= 2"),
         (["fit", "missing.csv", "--out", "OUT"], "no such file"),
         (["plot", "missing.csv", "--out", "OUT"], "no such file"),
         (["plot", "OUT", "--out", "OUT2"], "OUT"),
