@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
 from typing import Any
 
@@ -136,6 +137,9 @@ def load_pt2(path: PathLike) -> ExportedStepper:
     """
     content = read_bytes(path)
     extra = {METADATA: ""}
+    log = logging.getLogger("torch.export")
+    level = log.level
+    log.setLevel(logging.CRITICAL)  # torch logs a traceback of its own for a damaged file; one line is enough
     try:
         module = torch.export.load(io.BytesIO(content), extra_files=extra).module()
     except Exception as error:  # torch raises whatever its zip, JSON and graph readers raise
@@ -143,6 +147,8 @@ def load_pt2(path: PathLike) -> ExportedStepper:
         raise InputError(
             f"{path}: is not a readable .pt2 file ({type(error).__name__}: {line[0][:120]}); export the model again"
         ) from error
+    finally:
+        log.setLevel(level)
     return ExportedStepper(module, _read_metadata(extra[METADATA], path), str(path))
 
 
