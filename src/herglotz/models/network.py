@@ -7,7 +7,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.jet import Jet, affine, concatenate, coordinates
+from herglotz.models.jet import Jet, affine, concatenate
 
 
 class Network(nn.Module):
@@ -65,11 +65,6 @@ def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]
 def feature_count(angles: tuple[bool, ...]) -> int:
     """How many features `position_features` makes."""
     return sum(2 if angle else 1 for angle in angles)
-
-
-def position_jet(q: Tensor, order: int) -> Jet:
-    """Q as a jet over its own n components."""
-    return coordinates(q, order)
 
 
 def midpoint_velocity_jets(q0: Tensor, q1: Tensor, h: Tensor, order: int) -> tuple[Jet, Jet]:

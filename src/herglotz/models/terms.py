@@ -11,13 +11,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.jet import Jet, pairs
+from herglotz.models.jet import Jet, concatenate, coordinates, pairs
 from herglotz.models.network import (
     Network,
     feature_count,
     midpoint_velocity_jets,
     position_features,
-    position_jet,
 )
 
 
@@ -102,7 +101,7 @@ class Potential(nn.Module):
 
     def forward(self, q: Tensor, order: int) -> Jet:
         """V as a jet over the n components of q."""
-        x = position_jet(q, order)
+        x = coordinates(q, order)
         V = self.baseline(x)
         departure = self.departure(x)
         return V if departure is None else V + departure
@@ -199,4 +198,4 @@ def _phase_features(
     """Features of the position, then v / speed: what a network of (q̄, v) reads."""
     x = position_features(mean, angles, scale)
     v = Jet(velocity.data / velocity.data.new_tensor(speed), velocity.tangents, velocity.order)
-    return Jet(torch.cat([x.data, v.data], -1), x.tangents, x.order)
+    return concatenate([x, v])

@@ -8,9 +8,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
-
-GAP = 1.5  # a step longer than this many typical steps is crossed in several
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ def estimate_baseline(data: Trajectories) -> Baseline:
     InputError
         If nothing moves.
     """
-    max_step = GAP * data.typical_step
+    max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
     t = data.triples(max_step)
     if len(t) == 0:
         raise InputError(f"{data.source or 'data'}: no three samples in a row without a gap; record at equal steps")

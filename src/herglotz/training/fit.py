@@ -117,7 +117,7 @@ def _fit_training_part(train: Trajectories, base: Baseline, config: FitConfig, s
     exact = EXACT * size if config.dtype == "float64" else 1e-5 * size
     if objective == "trajectory":
         model = _model(base, config, "potential")
-        result, rms = _fit_residual(model, train, base, config, stages, "one-step start", PROBE, sigma=0.02 * size)
+        _, rms = _fit_residual(model, train, base, config, stages, "one-step start", PROBE, sigma=0.02 * size)
         return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
     model = _model(base, config, "plain" if objective == "raw" else "correction")
     if objective == "auto":

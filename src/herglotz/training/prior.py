@@ -7,7 +7,7 @@ from torch import Tensor
 from torch.func import functional_call, jacrev
 
 from herglotz.models import ContactLagrangian
-from herglotz.models.network import position_jet
+from herglotz.models.jet import coordinates
 from herglotz.models.terms import AffineDamping
 from herglotz.training.flat import FlatModel
 
@@ -68,7 +68,7 @@ class Prior:
 
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():
-            return self.flat.model.potential.baseline(position_jet(self.grid, 1)).gradient
+            return self.flat.model.potential.baseline(coordinates(self.grid, 1)).gradient
 
     def _departures(self, theta: Tensor) -> list[Tensor]:
         """Network outputs on the grid, each relative to its natural size."""
@@ -86,7 +86,7 @@ class _Departures(torch.nn.Module):
         self.model = model
 
     def forward(self, q: Tensor, v: Tensor) -> tuple[Tensor | None, Tensor | None]:
-        jet = self.model.potential.departure(position_jet(q, 1))
+        jet = self.model.potential.departure(coordinates(q, 1))
         force = None if jet is None else jet.gradient
         damping = self.model.damping
         rate = damping.departure(q, v) if isinstance(damping, AffineDamping) else None

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_residual, partials
 from herglotz.stepping import solve
 from herglotz.training import Run
@@ -65,7 +66,7 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
 
 def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
     """RMS over spread of free runs that start afresh from the run's state every `WINDOW` recorded steps."""
-    grid = segment_grid(run.data, WINDOW, 1.5 * run.h)
+    grid = segment_grid(run.data, WINDOW, GAP * run.h)
     states = [x[grid.start_sample] for x in run.states]
     if not all(bool(torch.isfinite(x).all()) for x in states):
         return math.inf
@@ -80,7 +81,7 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
     """RMS errors of the model, of uniform motion and of the noise in either, in units of the spread."""
     t = run.data.unwrapped().triples()
     dtype = next(run.model.parameters()).dtype
-    keep = (t.h0 <= 1.5 * run.h) & (t.h1 <= 1.5 * run.h)  # no single step across a gap
+    keep = (t.h0 <= GAP * run.h) & (t.h1 <= GAP * run.h)  # no single step across a gap
     if not bool(keep.any()):
         keep = torch.ones_like(keep)
     q0, q1, q2, h0, h1, s0 = (x[keep].to(dtype) for x in (t.q0, t.q1, t.q2, t.h0, t.h1, run.states.s[t.index]))
