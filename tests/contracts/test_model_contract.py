@@ -101,7 +101,7 @@ def test_float32(settings):
     # fails if a float64 constant sneaks into a float32 model
     model, x = random_model(settings, dtype=torch.float32), points(settings.dof, dtype=torch.float32)
     P = partials(model, *x, order=2)
-    assert all(value.dtype == torch.float32 for value in vars(P).values())
+    assert all(value.dtype == torch.float32 for value in vars(P).values() if value is not None)
     exact = partials(random_model(settings), *points(settings.dof), order=2)
     torch.testing.assert_close(P.D1.double(), exact.D1, rtol=1e-4, atol=1e-4)
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials, momentum_jacobian, momentum_residual
+from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Status, solve
 
@@ -63,7 +63,7 @@ class StepModule(nn.Module):
         residual = _length(self._newton_move(P, p))
         status = _status(P, p, residual, FLOOR * eps * scale)
         nan = torch.where(status == Status.CONVERGED, 0.0, torch.nan).to(q.dtype)
-        return q1 + nan[..., None], P.D2 + nan[..., None], s + P.L + nan, P.c + nan, residual, status
+        return q1 + nan[..., None], momentum_plus(P) + nan[..., None], s + P.L + nan, P.c + nan, residual, status
 
     @staticmethod
     def _newton_move(P: Partials, p: Tensor) -> Tensor:

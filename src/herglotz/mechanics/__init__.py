@@ -16,14 +16,27 @@ from herglotz.mechanics.legendre import (
     mixed_hessian,
     momentum_jacobian,
     momentum_minus,
+    momentum_plus,
     momentum_residual,
 )
-from herglotz.mechanics.partials import ClosedForm, DiscreteLagrangian, Partials, autograd_partials, partials
+from herglotz.mechanics.partials import (
+    ClosedForm,
+    DiscreteLagrangian,
+    Driven,
+    Forced,
+    Forces,
+    Partials,
+    autograd_partials,
+    partials,
+)
 from herglotz.mechanics.tangent import step_derivative
 
 __all__ = [
     "ClosedForm",
     "DiscreteLagrangian",
+    "Driven",
+    "Forced",
+    "Forces",
     "GeneratingFunction",
     "Partials",
     "autograd_partials",
@@ -40,6 +53,7 @@ __all__ = [
     "mixed_hessian",
     "momentum_jacobian",
     "momentum_minus",
+    "momentum_plus",
     "momentum_residual",
     "partials",
     "right_hamiltonian",

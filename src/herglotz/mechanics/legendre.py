@@ -8,8 +8,14 @@ from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 
 
 def momentum_minus(P: Partials) -> Tensor:
-    """p_k = −D1 L_d / c, the momentum of FL⁻ at (q_k, q_{k+1}, s_k); shape (..., n)."""
-    return -P.D1 / P.c[..., None]
+    """p_k = −(D1 L_d + F⁻) / c, the momentum of FL⁻ at (q_k, q_{k+1}, s_k); F⁻ = 0 without forces; shape (..., n)."""
+    D1 = P.D1 if P.force is None else P.D1 + P.force.minus
+    return -D1 / P.c[..., None]
+
+
+def momentum_plus(P: Partials) -> Tensor:
+    """p_{k+1} = D2 L_d + F⁺, the momentum of FL⁺ at (q_k, q_{k+1}, s_k); F⁺ = 0 without forces; shape (..., n)."""
+    return P.D2 if P.force is None else P.D2 + P.force.plus
 
 
 def legendre_minus(
@@ -38,7 +44,7 @@ def legendre_plus(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """FL⁺(q0, q1, s0) = (q1, D2 L_d, s0 + L_d); the s argument is s0, not s1 (erratum E3).
+    """FL⁺(q0, q1, s0) = (q1, D2 L_d, s0 + L_d), plus F⁺ where there are forces; s is taken at s0 (erratum E3).
 
     Returns
     -------
@@ -46,7 +52,7 @@ def legendre_plus(
         (q1, p1, s1) with shapes (..., n), (..., n), (...).
     """
     P = partials(L_d, q0, q1, s0, h)
-    return q1, P.D2, s0 + P.L
+    return q1, momentum_plus(P), s0 + P.L
 
 
 def herglotz_residual(
@@ -73,17 +79,19 @@ def herglotz_residual(
 
 
 def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
-    """F = D1 + c p0, the equation that a step solves for q1; shape (..., n)."""
-    return P.D1 + P.c[..., None] * p0
+    """F = D1 + c p0 (+ F⁻), the equation that a step solves for q1; shape (..., n)."""
+    F = P.D1 + P.c[..., None] * p0
+    return F if P.force is None else F + P.force.minus
 
 
 def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
-    """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3, shape (..., n, n). Equal to M where F = 0. Needs order 2."""
-    return P.D12 + p0[..., :, None] * P.D23[..., None, :]
+    """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3 (+ ∂F⁻/∂q1), shape (..., n, n). Equal to M where F = 0. Needs order 2."""
+    J = P.D12 + p0[..., :, None] * P.D23[..., None, :]
+    return J if P.force is None else J + P.force.minus_2
 
 
 def mixed_hessian(P: Partials) -> Tensor:
-    """M = D1D2 − D1 ⊗ D3D2 / c, shape (..., n, n). Needs order 2.
+    """M = D1D2 − D1 ⊗ D3D2 / c, shape (..., n, n); with forces J at p0 = momentum_minus. Needs order 2.
 
     FL⁻ and FL⁺ are local diffeomorphisms exactly where c ≠ 0 and det M ≠ 0 (erratum E4).
     """

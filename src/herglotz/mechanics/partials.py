@@ -7,8 +7,9 @@ differentiates with autograd. No other module calls autograd on a Lagrangian.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol, cast, runtime_checkable
+from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -19,6 +20,24 @@ class DiscreteLagrangian(Protocol):
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, /) -> Tensor:
         """Return L_d, shape (...)."""
+        ...
+
+
+@runtime_checkable
+class Forced(Protocol):
+    """A discrete Lagrangian that comes with discrete forces F⁻ and F⁺ (Lagrange–d'Alembert–Herglotz)."""
+
+    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, /) -> tuple[Tensor, Tensor] | None:
+        """Return F⁻ and F⁺, each (..., n); None where this model has none."""
+        ...
+
+
+@runtime_checkable
+class Driven(Protocol):
+    """A family of discrete Lagrangians L_d^k: time-dependent, or with an input u_k (a motor's torque) at each step."""
+
+    def at(self, u: Tensor, /) -> DiscreteLagrangian:
+        """The discrete Lagrangian of a step whose input is u, (..., m)."""
         ...
 
 
@@ -36,6 +55,23 @@ ABSENT: Tensor = cast(Tensor, None)
 
 
 @dataclass(frozen=True)
+class Forces:
+    """Discrete forces at (q0, q1, s0), in units of momentum; derivatives only when order 2 was asked for.
+
+    They change the momenta, p_k = −(D1 + F⁻)/c and p_{k+1} = D2 + F⁺ (trap 4 of `mathematics.md`), not the action.
+    """
+
+    minus: Tensor  # (..., n) F⁻
+    plus: Tensor  # (..., n) F⁺
+    minus_1: Tensor = ABSENT  # (..., n, n) [i, j] = ∂F⁻_i/∂q0_j
+    minus_2: Tensor = ABSENT  # (..., n, n) ∂F⁻/∂q1
+    minus_3: Tensor = ABSENT  # (..., n) ∂F⁻/∂s0
+    plus_1: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q0
+    plus_2: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q1
+    plus_3: Tensor = ABSENT  # (..., n) ∂F⁺/∂s0
+
+
+@dataclass(frozen=True)
 class Partials:
     """Value and partial derivatives of L_d at (q0, q1, s0); second derivatives only when order 2 was asked for."""
 
@@ -49,11 +85,27 @@ class Partials:
     D13: Tensor = ABSENT  # (..., n)
     D23: Tensor = ABSENT  # (..., n)
     D33: Tensor = ABSENT  # (...)
+    force: Forces | None = None  # only where the Lagrangian comes with forces
 
     @property
     def c(self) -> Tensor:
         """One-step conformal factor c = 1 + D3, shape (...)."""
         return 1.0 + self.D3
+
+    def map(self, change: Callable[..., Tensor], *others: Partials) -> Partials:
+        """`change` applied to every tensor, beside the same tensors of `others`."""
+        return _map(self, change, others)
+
+
+def _map(record: Any, change: Callable[..., Tensor], others: tuple[Any, ...]) -> Any:
+    entries: dict[str, Any] = {}
+    for name, value in vars(record).items():
+        beside = tuple(getattr(other, name) for other in others)
+        if isinstance(value, Forces):
+            entries[name] = _map(value, change, beside)
+        elif value is not None:
+            entries[name] = change(value, *beside)
+    return type(record)(**entries)
 
 
 def partials(
@@ -103,9 +155,11 @@ def autograd_partials(
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1
         L = L_d(a, b, s, h)
+        forces = L_d.forces(a, b, s, h) if isinstance(L_d, Forced) else None
+        force = None if forces is None else _autograd_forces(forces, (a, b, s), order, keep_graph)
         D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)
         if order == 1:
-            return _detach(Partials(L, D1, D2, D3), keep_graph)
+            return _detach(Partials(L, D1, D2, D3, force=force), keep_graph)
         n = q0.shape[-1]
         rows0 = [_grad(D1[..., i], (a, b, s), keep_graph, retain=True) for i in range(n)]
         rows1 = [_grad(D2[..., i], (b, s), keep_graph, retain=True) for i in range(n)]
@@ -121,8 +175,24 @@ def autograd_partials(
             D13=torch.stack([r[2] for r in rows0], -1),
             D23=torch.stack([r[1] for r in rows1], -1),
             D33=D33,
+            force=force,
         )
         return _detach(second, keep_graph)
+
+
+def _autograd_forces(
+    forces: tuple[Tensor, Tensor], xs: tuple[Tensor, Tensor, Tensor], order: int, keep_graph: bool
+) -> Forces:
+    """F⁻ and F⁺ with their derivatives by rows."""
+    minus, plus = forces
+    if order == 1:
+        return Forces(minus, plus)
+    blocks = []
+    for F in forces:
+        rows = [_grad(F[..., i], xs, keep_graph, retain=True) for i in range(F.shape[-1])]
+        blocks += [torch.stack([r[0] for r in rows], -2), torch.stack([r[1] for r in rows], -2)]
+        blocks += [torch.stack([r[2] for r in rows], -1)]
+    return Forces(minus, plus, *blocks)
 
 
 def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
@@ -143,4 +213,4 @@ def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = 
 def _detach(P: Partials, keep_graph: bool) -> Partials:
     if keep_graph:
         return P
-    return Partials(**{k: v.detach() for k, v in vars(P).items() if v is not None})
+    return P.map(Tensor.detach)

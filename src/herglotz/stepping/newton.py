@@ -72,7 +72,7 @@ def solve_step(
         stalled = ~better & (_length(delta) <= floor * scale)  # rounding, not a wrong direction
         accept = ~done & (better | settled)
         q1 = _where(accept, trial, q1)
-        P = Partials(**{k: _where(accept, v, getattr(P, k)) for k, v in vars(P_trial).items()})
+        P = P_trial.map(lambda new, old, accept=accept: _where(accept, new, old), P)
         delta, merit = _where(accept, delta_trial, delta), torch.where(accept, merit_trial, merit)
         length = torch.where(accept, 1.0, length / 2)
         done = done | settled | stalled

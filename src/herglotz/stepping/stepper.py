@@ -13,6 +13,7 @@ from herglotz.mechanics import (
     DiscreteLagrangian,
     legendre_plus,
     momentum_jacobian,
+    momentum_plus,
     momentum_residual,
     partials,
 )
@@ -137,7 +138,7 @@ class Stepper:
         if self.throw and bool(failed.any()):
             raise StepError(_failure_message(solution.status, solution.residual))
         nan = torch.where(failed, torch.nan, torch.zeros_like(s0))
-        new = State(q1 + nan[..., None], P.D2 + nan[..., None], s0 + P.L + nan)
+        new = State(q1 + nan[..., None], momentum_plus(P) + nan[..., None], s0 + P.L + nan)
         return Step(new, P.c + nan, solution.status, solution.residual, solution.iterations)
 
     def step_pair(

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import step_derivative
+from herglotz.mechanics import momentum_plus, step_derivative
 from herglotz.stepping import Status, solve_step
 from herglotz.training.flat import FlatModel
 
@@ -66,5 +66,5 @@ def _all_steps(flat: FlatModel, theta: Tensor, x: Tensor, h: Tensor) -> tuple[Te
     if not bool((solution.status == Status.CONVERGED).all()):
         return None
     P = solution.P
-    y = torch.cat([solution.q1, P.D2, (s0 + P.L)[..., None]], -1)
+    y = torch.cat([solution.q1, momentum_plus(P), (s0 + P.L)[..., None]], -1)
     return y, step_derivative(P, p0)

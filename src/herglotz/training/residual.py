@@ -13,7 +13,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.windows import Triples
-from herglotz.mechanics import momentum_jacobian, momentum_residual
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
 from herglotz.training.flat import FlatModel
@@ -128,8 +128,9 @@ class ResidualProblem:
         """J⁻¹R (or R) of one triple or of a batch of them."""
         before = self.flat.partials(theta, q0, q1, s0, h0, 1)
         after = self.flat.partials(theta, q1, q2, s0 + before.L, h1, 2)
-        R = momentum_residual(after, before.D2)
-        return R if self.metric == "raw" else solve(momentum_jacobian(after, before.D2), R)
+        p = momentum_plus(before)
+        R = momentum_residual(after, p)
+        return R if self.metric == "raw" else solve(momentum_jacobian(after, p), R)
 
     def _action(self, theta: Tensor, latent: Tensor) -> Tensor:
         """S at every sample, (N,): integrated along the recorded positions; zero where it does not matter."""

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.data import Trajectories
-from herglotz.mechanics import momentum_jacobian, partials
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.training.flat import FlatModel
@@ -214,7 +214,7 @@ class ShootingProblem:
 
         def step_functions(theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor) -> Tensor:
             P = self.flat.partials(theta, q0, q1, s0, h, 1)
-            return torch.cat([P.D1 + P.c[..., None] * p0, P.D2, P.L[..., None]], -1)
+            return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
 
         per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0))
         out = []
@@ -225,7 +225,8 @@ class ShootingProblem:
                 P = partials(self.flat.at(theta), here[0], here[1], here[3], here[4], order=2)
                 J = momentum_jacobian(P, here[2])
                 dq1 = -torch.linalg.solve_ex(J, G[:, :n])[0]
-                dp1 = G[:, n : 2 * n] + P.D22 @ dq1
+                p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
+                dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
                 ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
             out.append(torch.cat([dq1, dp1, ds1], 1))
         return torch.cat(out).reshape(S, K, 2 * n + 1, self.P)

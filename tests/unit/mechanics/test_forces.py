@@ -1,0 +1,111 @@
+"""Discrete forces: p_k = −(D1L + F⁻)/c, p_{k+1} = D2L + F⁺ (trap 4 of `mathematics.md`)."""
+
+import math
+
+import torch
+
+from herglotz.mechanics import (
+    Forced,
+    contact_defect,
+    flow_derivative,
+    herglotz_residual,
+    partials,
+    step_derivative,
+)
+from herglotz.stepping import State, Stepper
+
+H = 0.2
+
+
+class ForcedPendula:
+    """Two coupled pendula; viscous friction at each joint of its own, on top of the damping by s."""
+
+    def __init__(self, gamma=0.1, friction=(0.3, 0.05)):
+        self.gamma, self.friction = gamma, torch.tensor(friction, dtype=torch.float64)
+
+    def __call__(self, q0, q1, s0, h):
+        h = torch.as_tensor(h, dtype=q0.dtype)
+        v, q = (q1 - q0) / h[..., None], (q0 + q1) / 2
+        L = v.square().sum(-1) / 2 + 0.2 * v[..., 0] * v[..., 1] * torch.cos(q[..., 0]) + torch.cos(q).sum(-1)
+        return torch.expm1(-self.gamma * h) * s0 + h * L
+
+    def forces(self, q0, q1, s0, h):
+        h = torch.as_tensor(h, dtype=q0.dtype)
+        force = -self.friction.to(q0) * (q1 - q0) / h[..., None] * (1 + 0.1 * torch.sin(s0))[..., None]
+        c = torch.exp(-self.gamma * h)
+        return (c * h / 2)[..., None] * force, (h / 2)[..., None] * force
+
+
+def states(count=5):
+    make = torch.Generator().manual_seed(0)
+    q, p = (torch.randn(count, 2, generator=make, dtype=torch.float64) for _ in range(2))
+    return State(q, p, torch.randn(count, generator=make, dtype=torch.float64))
+
+
+def test_a_step_solves_the_forced_equations():
+    # fails if F⁻ or F⁺ is left out of a momentum, or enters with the wrong sign
+    L_d, state = ForcedPendula(), states()
+    assert isinstance(L_d, Forced)
+    with torch.no_grad():
+        step = Stepper(L_d).step(state, H)
+        q1 = step.state.q
+        P = partials(L_d, state.q, q1, state.s, H)
+        minus, plus = L_d.forces(state.q, q1, state.s, torch.tensor(H, dtype=torch.float64))
+    torch.testing.assert_close(-(P.D1 + minus) / P.c[..., None], state.p, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(P.D2 + plus, step.state.p, rtol=0, atol=1e-13)
+
+
+def test_the_derivative_of_a_forced_step_is_the_closed_form():
+    # fails if a derivative of F⁻ or F⁺ is missing from J or from DΦ̃
+    L_d, state = ForcedPendula(), states()
+    stepper = Stepper(L_d)
+    (q1, _, _), D = flow_derivative(lambda q, p, s: tuple(stepper.step(State(q, p, s), H).state), *state)
+    with torch.no_grad():
+        P = partials(L_d, state.q, q1, state.s, H, 2)
+        torch.testing.assert_close(step_derivative(P, state.p), D, rtol=1e-11, atol=1e-12)
+
+
+def test_the_contact_defect_is_exactly_the_forces():
+    # fails if forces change s, or the defect is not −F⁻dq0 − F⁺dq1
+    L_d, state = ForcedPendula(), states()
+    with torch.no_grad():
+        step = Stepper(L_d).step(state, H)
+        P = partials(L_d, state.q, step.state.q, state.s, H, 2)
+        D = step_derivative(P, state.p)
+        defect = contact_defect(D, state.p, step.state.p, step.c)
+        minus, plus = P.force.minus, P.force.plus
+        expected = -(D[..., :2, :].mT @ plus[..., None])[..., 0]
+        expected[..., :2] -= minus
+    assert defect.abs().max() > 1e-3
+    torch.testing.assert_close(defect, expected, rtol=1e-11, atol=1e-12)
+
+
+def test_the_forced_residual_vanishes_along_steps():
+    # fails if the two-step equation and the one-step map place forces differently
+    L_d, state = ForcedPendula(), states()
+    with torch.no_grad():
+        out = Stepper(L_d).rollout(*state, h=H, steps=2)
+        q0, q1, q2 = out.q.unbind(-2)
+        R = herglotz_residual(L_d, q0, q1, q2, state.s, H, H)
+    assert R.abs().max() < 1e-12
+
+
+def test_joint_friction_is_what_one_scalar_s_cannot_do():
+    # fails if both joints are damped alike, as a contact system without forces must
+    free = State(torch.zeros(2, dtype=torch.float64), torch.ones(2, dtype=torch.float64), torch.tensor(0.0).double())
+
+    class Free(ForcedPendula):
+        def __call__(self, q0, q1, s0, h):
+            h = torch.as_tensor(h, dtype=q0.dtype)
+            return (q1 - q0).square().sum(-1) / (2 * h) + 0.0 * s0
+
+        def forces(self, q0, q1, s0, h):  # noqa: ARG002
+            force = -self.friction * (q1 - q0) / 2
+            return force, force
+
+    h, steps = 0.01, 200
+    with torch.no_grad():
+        out = Stepper(Free(gamma=0.0)).rollout(*free, h=h, steps=steps)
+    speed = out.p[-1]
+    for i, rate in enumerate((0.3, 0.05)):
+        assert abs(float(speed[i]) - math.exp(-rate * h * steps)) < 1e-3
