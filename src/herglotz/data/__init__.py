@@ -2,6 +2,7 @@
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.ibm_double_pendulum import read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.readers import load, save
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
@@ -16,6 +17,7 @@ __all__ = [
     "Triples",
     "load",
     "read_csv",
+    "read_ibm_double_pendulum",
     "read_npz",
     "read_schmidt_lipson",
     "save",

@@ -7,12 +7,16 @@ from pathlib import Path
 
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.files import PathLike, read_bytes
+from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-READS = ".csv (t[s],q[rad],...), .npz (arrays t, q, ...) and Schmidt & Lipson .txt (first line '% o v' or '% x v')"
+READS = (
+    ".csv (t[s],q[rad],...; or six marker columns of the IBM double pendulum), .npz (arrays t, q, ...) and "
+    "Schmidt & Lipson .txt (first line '% o v' or '% x v')"
+)
 WRITES = ".csv and .npz"
 
 
@@ -63,6 +67,8 @@ def _read(path: Path) -> Trajectories:
     if suffix == ".npz":
         return read_npz(path)
     if suffix == ".csv":
+        if looks_like_markers(read_bytes(path)[:200].decode("utf-8", "replace").split("\n")[0]):
+            return read_ibm_double_pendulum(path)
         return read_csv(path)
     start = read_bytes(path).lstrip()[:1]
     if suffix == ".txt" and start == b"%":

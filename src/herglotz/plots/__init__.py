@@ -7,9 +7,11 @@ from typing import TYPE_CHECKING
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
+from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.motion import plot_data, plot_trajectory
 from herglotz.plots.phase import plot_phase_portrait
+from herglotz.plots.selection import plot_selection
 from herglotz.plots.style import save_figure
 from herglotz.plots.training import plot_training
 
@@ -51,10 +53,12 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
 
 __all__ = [
     "FIGURES",
+    "plot_bands",
     "plot_data",
     "plot_hamilton_jacobi_residual",
     "plot_momentum_vs_generating_function",
     "plot_phase_portrait",
+    "plot_selection",
     "plot_training",
     "plot_trajectory",
     "save_figure",

@@ -7,18 +7,25 @@ from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_mar
 from herglotz.training.prior import Prior
 from herglotz.training.residual import ResidualProblem
 from herglotz.training.run import Run, load_run, save_run
+from herglotz.training.selection import Selection, select
 from herglotz.training.shooting import ShootingProblem
+from herglotz.training.uncertainty import Bands, Laplace, laplace
 
 __all__ = [
+    "Bands",
     "FitConfig",
+    "Laplace",
     "OptimiserResult",
     "Prior",
     "ResidualProblem",
     "Run",
+    "Selection",
     "ShootingProblem",
     "adam",
     "fit",
+    "laplace",
     "levenberg_marquardt",
     "load_run",
     "save_run",
+    "select",
 ]

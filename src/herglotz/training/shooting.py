@@ -114,7 +114,7 @@ class ShootingProblem:
             return x.new_full((), torch.inf), x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         self.path = path
         grid, n, d, P = self.grid, self.n, self.d, self.P
-        Z = self._sensitivities(theta, path)  # (S, K+1, d, P + d)
+        Z = self.sensitivities(theta, path)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
         S = grid.segments
         A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
@@ -152,7 +152,7 @@ class ShootingProblem:
 
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples."""
-        Z = self._sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] / self.sigma
+        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] / self.sigma
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
@@ -193,7 +193,7 @@ class ShootingProblem:
         guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
         return solve_path(self.flat, theta, start, self.grid.h, guess, tol)
 
-    def _sensitivities(self, theta: Tensor, path: Path) -> Tensor:
+    def sensitivities(self, theta: Tensor, path: Path) -> Tensor:
         """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
         S, K = self.grid.h.shape
         d = self.d

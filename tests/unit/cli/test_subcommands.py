@@ -32,7 +32,7 @@ def test_version(capsys):  # fails if the version is not the package's
     assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["simulate", "fit", "rollout", "export", "verify", "plot"])
+@pytest.mark.parametrize("command", ["simulate", "fit", "select", "rollout", "export", "verify", "trust", "plot"])
 def test_help_teaches_every_option(capsys, command):  # fails if an option has no help, or there is no example
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
@@ -203,3 +203,22 @@ def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  
     monkeypatch.setattr(herglotz.training, "fit", interrupted)
     assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 130
     assert "--resume" in capsys.readouterr().err
+
+
+def test_select(capsys, tiny_csv, tmp_path):  # fails if the chosen run, the table or the figure is missing
+    out = tmp_path / "selected"
+    code, found = run_json(capsys, "select", tiny_csv, "--out", out, "--levels", "linear", "--seeds", 1)
+    assert code == 0
+    assert found["chosen"] == "linear"
+    assert found["levels"][0]["held_out_rms"] == pytest.approx(load_run(out).metrics["extrapolation_rms"], rel=0.05)
+    assert (out / "selection.png").stat().st_size > 10_000
+
+
+def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or the figure is written into the run
+    code, found = run_json(capsys, "trust", tiny_run, "--out", tmp_path)
+    assert code == 0
+    assert 0.5 <= found["inside_training"] <= 1.0
+    value, std = found["parameters"]["damping.rate"][0]
+    assert 0 < std < 1
+    assert value == load_run(tiny_run).metrics["rate"]
+    assert (tmp_path / "bands.png").stat().st_size > 10_000

@@ -217,8 +217,8 @@ class Weighted(ShootingProblem):
         fit, joints = super()._residuals(x)
         return fit * self.weights[:, None], joints
 
-    def _sensitivities(self, theta, path):
-        Z = super()._sensitivities(theta, path)
+    def sensitivities(self, theta, path):
+        Z = super().sensitivities(theta, path)
         flat = Z.flatten(0, 1).clone()
         flat[self.grid.node] = flat[self.grid.node] * self.weights[:, None, None]
         return flat.reshape(Z.shape)

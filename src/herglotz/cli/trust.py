@@ -1,0 +1,101 @@
+"""`herglotz trust`: how far a fitted model can be trusted, and what its data do not determine."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from herglotz.cli.common import check_output_folder, finite, print_json, print_table
+
+if TYPE_CHECKING:
+    from herglotz.training import Laplace, Run
+
+DESCRIPTION = """\
+Measure how far a run can be trusted: standard deviations of its physical parameters, bands on its prediction with the
+share of held-out samples that really lie inside, and the parameter combinations that the data do not determine.
+Draws bands.png in RUN.
+
+examples:
+  herglotz trust runs/pendulum
+  herglotz trust runs/pendulum --level 0.95 --json
+"""
+UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
+PHYSICAL = ("kinetic.", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag", "force")
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("trust", help="how far to trust a run", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
+    parser.add_argument("--level", type=finite, default=0.9, help="of the bands, in (0, 1) (default %(default)s)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for bands.png (default: RUN)")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Measure, draw, report."""
+    from herglotz.training import laplace, load_run
+
+    result = load_run(arguments.source)
+    folder = arguments.out or arguments.source
+    check_output_folder(folder)
+
+    from herglotz.plots import plot_bands, save_figure
+    from herglotz.plots.motion import trained_mask
+
+    posterior = laplace(result)
+    bands = posterior.bands()
+    inside = bands.inside(result.data.unwrapped().q, arguments.level)
+    held = ~trained_mask(result)
+    numbers: dict[str, Any] = {
+        "level": arguments.level,
+        "inside_training": float(inside[~held].double().mean()),
+        "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
+        "noise": bands.sigma,
+        "held_out_over_noise": posterior.inflation,
+        "parameters": _physical(posterior, result),
+        "not_determined": [
+            {"reduction": d.reduction, "parts": dict(d.parts)}
+            for d in posterior.least_identified()
+            if d.reduction > 0.9
+        ],
+    }
+    folder.mkdir(parents=True, exist_ok=True)
+    save_figure(plot_bands(result, bands, arguments.level), folder / "bands.png")
+    if arguments.json:
+        print_json(numbers)
+    else:
+        _report(numbers, folder / "bands.png")
+    return 0
+
+
+def _physical(posterior: Laplace, result: Run) -> dict[str, list[list[float]]]:
+    """Value and standard deviation of every entry of the parameters that have a meaning of their own."""
+    import torch
+
+    std = posterior.standard_deviations()
+    return {
+        name: torch.stack([value.detach().reshape(-1).double(), std[name].reshape(-1)], 1).tolist()
+        for name, value in result.model.named_parameters()
+        if name.startswith(PHYSICAL) and value.numel()
+    }
+
+
+def _report(numbers: dict[str, Any], figure: Path) -> None:
+    percent = f"{100 * numbers['level']:g} % band"
+    rows = [(f"{percent}, training", f"{100 * numbers['inside_training']:.1f} % of the samples inside")]
+    if numbers["inside_held_out"] is not None:
+        rows.append((f"{percent}, held out", f"{100 * numbers['inside_held_out']:.1f} % of the samples inside"))
+    worse = f"{numbers['held_out_over_noise']:.2f}"
+    rows.append(("noise of a sample", f"{numbers['noise']:.3g}; held-out blocks of time miss {worse} times as much"))
+    for name, entries in numbers["parameters"].items():
+        rows.append((name, ", ".join(f"{value:.5g} ± {std:.2g}" for value, std in entries)))
+    print_table(rows)
+    lost = numbers["not_determined"]
+    if lost:
+        print(f"Not determined by these data: {len(lost)} or more directions, mostly of")
+        for direction in lost:
+            print("  " + ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in direction["parts"].items()))
+    print(f"Figure: {figure}")

@@ -1,0 +1,49 @@
+"""Residuals inside the band that the posterior promises."""
+
+from __future__ import annotations
+
+from statistics import NormalDist
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+
+from herglotz.plots.motion import trained_mask
+from herglotz.plots.style import MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, styled, with_unit
+
+if TYPE_CHECKING:
+    from herglotz.training import Bands, Run
+
+MOST_PANELS = 4
+
+
+def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
+    """Draw data − model against time, with the band for the model's position and the one for a measured value."""
+    data = run.data.unwrapped()
+    inside, held = bands.inside(data.q, level), ~trained_mask(run)
+    part, word = (held, "held-out ") if bool(held.any()) else (~held, "")
+    share = 100 * float(inside[part].double().mean())
+    title = f"{share:.0f} % of the {word}samples lie in the {100 * level:g} % band"
+    cells = [(b, i) for b in range(len(data)) for i in range(data.dof)][:MOST_PANELS]
+    width = NormalDist().inv_cdf(0.5 + level / 2)
+    with styled():
+        figure = new_figure(8.0, 1.2 + 1.8 * len(cells), title)
+        axes = figure.subplots(len(cells), 1, squeeze=False)[:, 0]
+        for (b, i), ax in zip(cells, axes, strict=True):
+            rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
+            t, residual = data.t[rows].cpu(), (data.q - bands.q)[rows, i].cpu()
+            model = width * bands.std[rows, i].cpu()
+            measured = (model.square() + (width * bands.sigma) ** 2).sqrt()
+            trained = run.train_lengths[b]
+            if trained < len(t):
+                ax.axvspan(float(t[trained - 1] + t[trained]) / 2, float(t[-1]), color=SHADE, lw=0, zorder=0)
+            ax.fill_between(t, -measured, measured, color=MODEL, alpha=0.18, lw=0, zorder=1)
+            ax.fill_between(t, -model, model, color=MODEL, alpha=0.45, lw=0, zorder=2)
+            ax.axhline(0.0, color=MUTED, lw=0.8, zorder=3)
+            ax.plot(t[:trained], residual[:trained], ".", color=MODEL, ms=4, zorder=4)
+            ax.plot(t[trained:], residual[trained:], ".", color=UNSEEN, ms=4, zorder=4)
+            reach = 1.5 * float(max(residual.abs().max(), measured.max()))
+            ax.set(xlim=(float(t[0]), float(t[-1])), ylim=(-reach, reach))
+            ax.set_ylabel(with_unit(f"residual of {data.names[i]}", data.units[i]))
+        captions(axes[0], [("● training", MODEL), ("● held out", UNSEEN), ("dark: model, light: measurement", MUTED)])
+        axes[-1].set_xlabel(with_unit("time", data.time_unit))
+    return figure

@@ -1,0 +1,200 @@
+"""`select`: fit the ladder, compare held-out errors, keep the simplest level that is not beaten."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import LEVELS
+from herglotz.training.config import FitConfig
+from herglotz.training.fit import fit
+from herglotz.training.run import Run
+
+BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
+TIMED_STEPS = 20
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One level of the ladder, fitted from several seeds."""
+
+    level: str
+    runs: tuple[Run, ...]
+    errors: Tensor  # (seeds, blocks) held-out RMS of the free run, in units of q; inf where it failed
+    step_us: float  # measured cost of one step of one trajectory, µs
+
+    @property
+    def error(self) -> float:
+        """Median over the seeds of the held-out RMS."""
+        return float(self.of_seeds.median())
+
+    @property
+    def of_seeds(self) -> Tensor:
+        """Held-out RMS of each seed, (seeds,)."""
+        return self.errors.square().mean(1).sqrt()
+
+    @property
+    def best(self) -> Run:
+        """The run of the median seed: representative, not lucky."""
+        return self.runs[int(self.of_seeds.argsort()[(len(self.runs) - 1) // 2])]
+
+    @property
+    def parameters(self) -> int:
+        """Number of trained parameters."""
+        return self.best.metrics["parameters"]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain numbers for JSON; None for an error that is not finite."""
+        seeds = [x if x < float("inf") else None for x in self.of_seeds.tolist()]
+        return {
+            "level": self.level,
+            "held_out_rms": self.error if self.error < float("inf") else None,
+            "held_out_rms_of_seeds": seeds,
+            "parameters": self.parameters,
+            "step_us": self.step_us,
+            "fit_seconds": [run.metrics["seconds"] for run in self.runs],
+        }
+
+
+@dataclass(frozen=True)
+class Selection:
+    """The ladder's table and what it says."""
+
+    candidates: tuple[Candidate, ...]
+    chosen: Candidate
+
+    @property
+    def run(self) -> Run:
+        """The chosen level's representative run."""
+        return self.chosen.best
+
+    def table(self) -> str:
+        """Level × held-out error × spread × parameters × cost, for people."""
+        head = (
+            f"{'level':<14}{'held-out RMS':>13}{'seeds (min … max)':>24}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"
+        )
+        lines = [head]
+        for c in self.candidates:
+            low, high = float(c.of_seeds.min()), float(c.of_seeds.max())
+            seconds = sum(run.metrics["seconds"] for run in c.runs) / len(c.runs)
+            mark = "  <- chosen" if c is self.chosen else ""
+            spread = f"{low:.3g} … {high:.3g}"
+            lines.append(
+                f"{c.level:<14}{c.error:>13.3g}{spread:>24}{c.parameters:>12}{c.step_us:>9.0f}{seconds:>8.1f}{mark}"
+            )
+        return "\n".join(lines)
+
+    def to_json(self) -> str:
+        """The table as JSON."""
+        rows = [c.to_dict() for c in self.candidates]
+        return json.dumps({"chosen": self.chosen.level, "levels": rows}, indent=2, allow_nan=False) + "\n"
+
+
+def select(
+    data: Trajectories,
+    levels: Sequence[str] = LEVELS,
+    seeds: int = 3,
+    config: FitConfig | None = None,
+    *,
+    out: str | Path | None = None,
+    progress: bool | None = None,
+    resume: bool = False,
+) -> Selection:
+    """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
+
+    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. A level
+    is beaten if the best level's score is lower beyond the spread of either kind: the standard error over blocks of the
+    difference of their squared errors (median seed), and the best level's own range over seeds. The first level of the
+    ladder that is not beaten is chosen.
+
+    Parameters
+    ----------
+    data
+        Trajectories of positions.
+    levels
+        Which levels, of `herglotz.models.LEVELS`; tried and preferred in the ladder's order.
+    seeds
+        Fits a level, with seeds config.seed, config.seed + 1, …
+    config
+        Everything else about the fits; `train_fraction` must be below 1.
+    out
+        Folder for one checkpoint a fit, so that `resume` goes on after an interruption.
+    progress, resume
+        As for `fit`.
+
+    Raises
+    ------
+    InputError
+        If a level is unknown or nothing is held out, or no level has a finite held-out error.
+    """
+    config = config or FitConfig()
+    unknown = [level for level in levels if level not in LEVELS]
+    if unknown or not levels:
+        raise InputError(f"unknown level {unknown or 'list'}; choose some of {', '.join(LEVELS)}")
+    if seeds < 1:
+        raise InputError(f"seeds must be >= 1, got {seeds}")
+    if config.train_fraction == 1:
+        raise InputError("train fraction 1 holds nothing out to compare levels on; use 0.667, say")
+    candidates = []
+    for level in (level for level in LEVELS if level in levels):
+        runs = []
+        for seed in range(config.seed, config.seed + seeds):
+            folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
+            if folder is not None:
+                folder.mkdir(parents=True, exist_ok=True)
+            settings = replace(config, level=level, seed=seed)
+            runs.append(fit(data, settings, out=folder, progress=progress, resume=resume))
+        errors = torch.stack([block_errors(run) for run in runs])
+        candidates.append(Candidate(level, tuple(runs), errors, _step_cost(runs[0])))
+    return Selection(tuple(candidates), _simplest(candidates))
+
+
+def block_errors(run: Run) -> Tensor:
+    """RMS of the run's free prediction over each block of held-out time, (blocks,), in units of q; inf if it failed."""
+    error = run.prediction - run.data.unwrapped().q
+    held = [
+        error[first + trained : first + length]
+        for first, length, trained in zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
+    ]
+    pieces = -(-BLOCKS // len(held))
+    blocks = [part for x in held for part in x.tensor_split(min(pieces, len(x))) if len(part)]
+    if not blocks:
+        raise InputError("the data leave no sample to hold out; record longer, or lower the train fraction")
+    rms = torch.stack([x.square().mean().sqrt() for x in blocks])
+    return rms.nan_to_num(nan=torch.inf, posinf=torch.inf).cpu()
+
+
+def _simplest(candidates: list[Candidate]) -> Candidate:
+    best = min(candidates, key=lambda c: c.error)
+    if not best.error < float("inf"):
+        raise InputError("no level predicts the held-out part: every free run failed; check the data and their step")
+    own = best.errors[int(best.of_seeds.argsort()[(len(best.runs) - 1) // 2])]
+    for candidate in candidates:
+        if candidate is best or candidate.error <= float(best.of_seeds.max()):
+            return candidate
+        theirs = candidate.errors[int(candidate.of_seeds.argsort()[(len(candidate.runs) - 1) // 2])]
+        difference = theirs.square() - own.square()
+        if float(difference.mean()) <= float(difference.std()) / len(difference) ** 0.5:
+            return candidate
+    return best
+
+
+def _step_cost(run: Run) -> float:
+    """Microseconds a step of the eager stepper takes, one trajectory, the best of three."""
+    q, p, s = (x[:1] for x in run.states)
+    costs = []
+    with torch.no_grad():
+        for _ in range(3):
+            began = time.perf_counter()
+            run.stepper.rollout(q, p, s, h=run.h, steps=TIMED_STEPS)
+            costs.append((time.perf_counter() - began) / TIMED_STEPS)
+    return 1e6 * min(costs)

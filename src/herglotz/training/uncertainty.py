@@ -1,0 +1,167 @@
+"""How far to trust a fit: the Gauss–Newton (Laplace) posterior, bands on its predictions, and what is not identified.
+
+Around the fit, −log posterior ≈ ½ (x − x̂)ᵀ A (x − x̂) with A = JᵀJ of the trajectory problem, prior included, so the
+unknowns x (parameters and start states) have covariance A⁻¹. What a deterministic model misses is not white, and A⁻¹
+takes it for white: it is multiplied by (held-out RMS / σ)², the factor by which held-out blocks of time are worse than
+residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from statistics import NormalDist
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.cross_validation import held_out_errors
+from herglotz.training.grid import segment_grid
+from herglotz.training.lifted import Path
+from herglotz.training.run import Run
+from herglotz.training.shooting import ShootingProblem
+from herglotz.training.trajectory_fit import make_prior
+
+
+@dataclass(frozen=True)
+class Bands:
+    """A prediction with its uncertainty, at every sample of the data."""
+
+    q: Tensor  # (N, n) free run, in units of q
+    std: Tensor  # (N, n) standard deviation of the model's position
+    sigma: float  # standard deviation of the noise of a measurement
+
+    def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
+        """Lower and upper end of the central interval, (N, n) each; of a measured value, or of the true position."""
+        if not 0 < level < 1:
+            raise InputError(f"level must be between 0 and 1, got {level:g}; 0.9 is usual")
+        width = NormalDist().inv_cdf(0.5 + level / 2)
+        std = (self.std.square() + self.sigma**2).sqrt() if measured else self.std
+        return self.q - width * std, self.q + width * std
+
+    def inside(self, q: Tensor, level: float = 0.9) -> Tensor:
+        """Which measured positions q, (N, n), lie inside their interval; bool (N, n)."""
+        low, high = self.interval(level)
+        return (q >= low) & (q <= high)
+
+
+@dataclass(frozen=True)
+class Direction:
+    """A combination of parameters that the data say little about."""
+
+    reduction: float  # posterior over prior standard deviation along it; 1 means the data say nothing
+    parts: tuple[tuple[str, float], ...]  # the parameters it moves most, with their share
+
+
+class Laplace:
+    """Posterior of a run's parameters and start states.
+
+    Parameters
+    ----------
+    run
+        A fit whose model follows its data (`metrics["follows_data"]`).
+
+    Raises
+    ------
+    InputError
+        If the trajectories cannot be solved from the run's states.
+    """
+
+    def __init__(self, run: Run):
+        self.run = run
+        data = run.data.unwrapped()
+        train = _first(data, run.train_lengths)
+        self.base = estimate_baseline(train)
+        self.sigma = float(run.metrics["sigma"])
+        departure = run.metrics.get("departure") or run.config.departures[-1]
+        self.prior = make_prior(run.model, self.base, departure)
+        self.problem, self.path = self._solved(train, _starts(run))
+        self.theta = self.problem.flat.get()
+        x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
+        _, A, _ = self.problem.normal_equations(x)
+        errors = held_out_errors(self.problem, self.path, self.theta, A)
+        held_out = float(errors.square().mean().sqrt())
+        self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
+        self.covariance = torch.linalg.pinv(A.double(), hermitian=True) * self.inflation**2
+
+    def bands(self) -> Bands:
+        """The run's prediction at every sample with its standard deviation, held-out part included.
+
+        First order in the unknowns: dq_k = Z_k d(θ, start), with Z through every implicit step.
+        """
+        data = self.run.data.unwrapped()
+        whole, path = self._solved(data, self.path.x[:, 0])
+        with torch.no_grad():
+            Z = whole.sensitivities(self.theta, path)[..., : whole.n, :].double()  # (B, K+1, n, P + d)
+            P, d = len(self.theta), whole.d
+            variance = Z.new_zeros(Z.shape[:-1])
+            for b in range(len(Z)):
+                own = torch.cat([torch.arange(P), torch.arange(P + b * d, P + (b + 1) * d)])
+                C = self.covariance[own[:, None], own[None, :]]
+                variance[b] = ((Z[b] @ C) * Z[b]).sum(-1)
+        grid = whole.grid
+        q, std = data.q.new_empty(data.q.shape), data.q.new_empty(data.q.shape)
+        q[grid.sample] = path.x[..., : whole.n].flatten(0, 1)[grid.node]
+        std[grid.sample] = variance.clamp_min(0).sqrt().flatten(0, 1)[grid.node].to(std.dtype)
+        return Bands(q, std, self.sigma)
+
+    def standard_deviations(self) -> dict[str, Tensor]:
+        """Of every parameter, by name, in its own units."""
+        P = len(self.theta)
+        return self.problem.flat.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
+
+    def least_identified(self, count: int = 5) -> list[Direction]:
+        """The parameter combinations that the data determine least, the worst first.
+
+        Eigenvectors of the posterior covariance of θ measured in units of the prior's: an eigenvalue of 1 is a
+        direction of which the data say nothing (gauge freedom, or motion that was never recorded).
+        """
+        P = len(self.theta)
+        _, prior, _ = self.prior.normal_equations(self.theta)
+        values, vectors = torch.linalg.eigh(prior.double())
+        root = vectors * values.clamp_min(values.max() * 1e-14).sqrt()  # prior = root rootᵀ
+        posterior = self.covariance[:P, :P] / self.inflation**2
+        reductions, directions = torch.linalg.eigh(root.T @ posterior @ root)
+        names = [
+            name if size == 1 else f"{name}[{i}]"
+            for name, size in zip(self.problem.flat.names, self.problem.flat.sizes, strict=True)
+            for i in range(size)
+        ]
+        found = []
+        for k in reversed(range(max(0, P - count), P)):
+            share = (torch.linalg.pinv(root.T) @ directions[:, k]).square()
+            share = share / share.sum()
+            top = share.argsort(descending=True)[:3].tolist()
+            parts = tuple((names[i], float(share[i])) for i in top)
+            found.append(Direction(float(reductions[k].clamp(0, 1).sqrt()), parts))
+        return found
+
+    def _solved(self, data: Trajectories, start: Tensor) -> tuple[ShootingProblem, Path]:
+        """Each trajectory as one segment, solved from its start state (B, 2n+1)."""
+        grid = segment_grid(data, max(data.lengths), self.base.max_step)
+        problem = ShootingProblem(self.run.model, data, grid, sigma=self.sigma, prior=self.prior)
+        theta = problem.flat.get()
+        path = problem.solve(problem.pack(theta, start[:, : problem.d]))
+        if path is None:
+            raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")
+        return problem, path
+
+
+def laplace(run: Run) -> Laplace:
+    """The Gauss–Newton posterior of a run; see `Laplace`."""
+    return Laplace(run)
+
+
+def _first(data: Trajectories, lengths: tuple[int, ...]) -> Trajectories:
+    """The leading samples of each trajectory."""
+    index = torch.cat([torch.arange(f, f + k) for f, k in zip(data.offsets, lengths, strict=True)])
+    return replace(data, t=data.t[index], q=data.q[index], s=None, p=None, u=None, lengths=lengths)
+
+
+def _starts(run: Run) -> Tensor:
+    """Start states of the trajectories, (B, 2n+1)."""
+    first = list(run.data.offsets)
+    q, p, s = (x[first] for x in run.states)
+    return torch.cat([q, p, s[:, None]], -1)

@@ -1,0 +1,101 @@
+"""`select`: the simplest level of the ladder that is not beaten beyond its spread."""
+
+import json
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.errors import InputError
+from herglotz.plots import plot_selection, save_figure
+from herglotz.systems import scene
+from herglotz.training import FitConfig, select
+from herglotz.training.run import Run
+from herglotz.training.selection import Candidate, Selection, _simplest, block_errors
+
+
+def candidate(level, *seeds):
+    """Held-out errors a seed and block, and nothing else of a run."""
+    run = SimpleNamespace(metrics={"parameters": 7, "seconds": 1.0}, data=SimpleNamespace(units=("rad",)))
+    return Candidate(level, cast(Any, (run,) * len(seeds)), torch.tensor(seeds, dtype=torch.float64), 10.0)
+
+
+@pytest.mark.parametrize(
+    ("levels", "expected"),
+    [
+        # fails if the lowest error wins although the simpler level is within its spread
+        ([candidate("linear", [1.0, 1.2, 0.9]), candidate("affine", [1.0, 1.0, 0.95])], "linear"),
+        # fails if the simplest level is kept although it is clearly beaten
+        ([candidate("linear", [9.0, 9.5, 9.1]), candidate("affine", [1.0, 1.1, 0.9])], "affine"),
+        # fails if the best level's range over seeds does not count
+        ([candidate("linear", [2.0] * 3), candidate("affine", [1.0] * 3, [2.1] * 3, [1.1] * 3)], "linear"),
+        # fails if a level whose free run failed can be chosen, or spoils the comparison
+        ([candidate("linear", [math.inf] * 3), candidate("affine", [1.0] * 3)], "affine"),
+        ([candidate("linear", [1.0] * 3), candidate("affine", [math.inf] * 3)], "linear"),
+    ],
+)
+def test_the_simplest_level_that_is_not_beaten(levels, expected):
+    assert _simplest(levels).level == expected
+
+
+def test_no_level_that_predicts_is_an_error():
+    # fails if a ladder of failures still chooses one
+    with pytest.raises(InputError, match="every free run failed"):
+        _simplest([candidate("linear", [math.inf] * 3)])
+
+
+def test_table_json_and_figure_say_the_same(tmp_path):
+    # fails if a failed seed breaks the report, or JSON carries Infinity
+    good, bad = candidate("linear", [1.0] * 3, [1.5] * 3), candidate("affine", [math.inf] * 3, [2.0] * 3)
+    selection = Selection((good, bad), good)
+    assert "linear" in selection.table()
+    assert selection.table().count("<- chosen") == 1
+    rows = json.loads(selection.to_json())
+    assert rows["chosen"] == "linear"
+    assert rows["levels"][1]["held_out_rms_of_seeds"] == [None, 2.0]
+    save_figure(plot_selection(selection), tmp_path / "selection.png")
+    assert (tmp_path / "selection.png").stat().st_size > 10_000
+
+
+def test_blocks_are_the_held_out_time():
+    # fails if training samples are scored, or a prediction that failed is not infinitely wrong
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=29, h=0.2, seed=0)
+    wrong = data.q.clone()
+    wrong[:20] += 100.0  # trained on
+    wrong[20:30] += 0.5
+    wrong[50:] = torch.nan
+    run = cast(Run, SimpleNamespace(data=data, prediction=wrong, train_lengths=(20, 20)))
+    errors = block_errors(run)
+    assert len(errors) == 6
+    torch.testing.assert_close(errors[:3], torch.full((3,), 0.5, dtype=torch.float64))
+    assert errors[3:].isinf().all()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"levels": ("linear", "cubic")}, "cubic"),
+        ({"seeds": 0}, "seeds must be >= 1"),
+        ({"config": FitConfig(train_fraction=1.0)}, "holds nothing out"),
+    ],
+)
+def test_settings_are_checked(change, message):
+    # fails if a wrong setting is found only after hours of fitting
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=30, h=0.2, seed=0)
+    with pytest.raises(InputError, match=message):
+        select(data, **change)
+
+
+def test_one_level_end_to_end(tmp_path):
+    # fails if fits, scores and the chosen run do not belong together, or resume fits again
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=30, h=0.2, noise=0.005, seed=0)
+    settings = replace(FitConfig(), departures=(1e-3,))
+    found = select(data, ("linear",), 1, settings, out=tmp_path, progress=False)
+    assert found.chosen.level == found.run.metrics["level"] == "linear"
+    assert abs(found.chosen.error - found.run.metrics["extrapolation_rms"]) < 1e-2 * found.chosen.error
+    again = select(data, ("linear",), 1, settings, out=tmp_path, progress=False, resume=True)
+    assert again.chosen.error == pytest.approx(found.chosen.error, rel=1e-6)

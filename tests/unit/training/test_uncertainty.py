@@ -1,0 +1,95 @@
+"""The posterior of a fit: bands that cover, and directions that the data do not determine."""
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.errors import InputError
+from herglotz.systems import scene
+from herglotz.training import FitConfig, fit, laplace
+
+NOISE = 0.01
+SETTINGS = FitConfig(departures=(6e-4, 2e-3))
+
+
+@pytest.fixture(scope="module")
+def posteriors():
+    """Fits of five noisy data sets, with what the noise hides."""
+    found = []
+    for seed in range(5):
+        data = simulate(scene("damped_pendulum"), trajectories=3, steps=90, h=0.2, noise=NOISE, seed=seed)
+        clean = simulate(scene("damped_pendulum"), trajectories=3, steps=90, h=0.2, seed=seed)
+        run = fit(data, SETTINGS, progress=False)
+        found.append((run, laplace(run), clean.q))
+    return found
+
+
+def held_out(run):
+    rows = [
+        torch.arange(first + trained, first + length)
+        for first, length, trained in zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
+    ]
+    return torch.cat(rows)
+
+
+def test_ninety_per_cent_bands_cover_held_out_samples(posteriors):
+    # fails if sensitivities, the noise or the inflation are wrong: a band half or twice as wide is outside the range
+    inside = [p.bands().inside(run.data.q)[held_out(run)].double().mean() for run, p, _ in posteriors]
+    assert 0.80 <= float(torch.stack(inside).mean()) <= 0.97
+
+
+def test_bands_cover_the_true_position_too(posteriors):
+    # fails if the model's own uncertainty is left out or carries the measurement's noise
+    shares = []
+    for run, posterior, clean in posteriors:
+        low, high = posterior.bands().interval(0.9, measured=False)
+        rows = held_out(run)
+        assert float((high - low)[rows].max()) < 4 * NOISE
+        shares.append(((clean >= low) & (clean <= high))[rows].double().mean())
+    assert 0.6 <= float(torch.stack(shares).mean()) <= 1.0
+
+
+def test_the_band_of_the_start_is_what_sensitivities_say(posteriors):
+    # fails if the covariance's blocks and the columns of the sensitivities are matched wrongly
+    run, posterior, _ = posteriors[0]
+    bands, P, d = posterior.bands(), len(posterior.theta), posterior.problem.d
+    for b, first in enumerate(run.data.offsets):
+        own = posterior.covariance[P + b * d, P + b * d].sqrt()
+        torch.testing.assert_close(bands.std[first, 0], own, rtol=1e-8, atol=0)
+
+
+def test_standard_deviation_of_the_damping_rate(posteriors):
+    # fails if the covariance is off by the noise: γ = 0.2 must lie within a few of its own standard deviations
+    scores = []
+    for run, posterior, _ in posteriors:
+        std = float(posterior.standard_deviations()["damping.rate"])
+        assert 1e-4 < std < 0.02
+        scores.append(abs(run.metrics["rate"] - 0.2) / std)
+    assert sorted(scores)[2] < 2.0
+    assert max(scores) < 5.0
+
+
+def test_directions_without_data_are_reported(posteriors):
+    # fails if a determined direction comes first, or a reduction is not a share of the prior's
+    directions = posteriors[0][1].least_identified(40)
+    reductions = [d.reduction for d in directions]
+    assert reductions == sorted(reductions, reverse=True)
+    assert reductions[0] > 0.99
+    assert reductions[-1] < 0.2
+    assert all("network" in d.parts[0][0] for d in directions[:3])
+
+
+def test_more_noise_means_wider_bands():
+    # fails if the band does not know the data's noise
+    widths = []
+    for noise in (0.003, 0.03):
+        data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=noise, seed=1)
+        run = fit(data, SETTINGS, progress=False)
+        widths.append(float(laplace(run).bands().std[held_out(run)].mean()))
+    assert 3 < widths[1] / widths[0] < 30
+
+
+def test_the_level_is_checked(posteriors):
+    # fails if a percentage is taken for a share
+    with pytest.raises(InputError, match="between 0 and 1"):
+        posteriors[0][1].bands().interval(90)
