@@ -1,4 +1,7 @@
-"""Run one experiment of `configs.py`: data → fit → save → verify → plot."""
+"""Run one experiment of `configs.py`: data → fit → save → verify → plot.
+
+On several processes: torchrun --nproc-per-node 2 train/fit.py --config pendulum (the result is the same).
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,8 @@ import torch
 from configs import CONFIGS
 from herglotz.errors import InputError
 from herglotz.plots import save_figures
-from herglotz.training import fit, save_run
+from herglotz.training import Run, fit, save_run
+from herglotz.training.distributed import is_first, process_group
 from herglotz.verify import verify
 
 
@@ -28,20 +32,29 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0, help="of the initial weights (default 0)")
     parser.add_argument("--out", type=Path, help="folder for the run (default runs/CONFIG)")
     parser.add_argument("--resume", action="store_true", help="go on from an interrupted run in that folder")
+    parser.add_argument("--device", default="cpu", help="cpu or cuda (default cpu)")
+    parser.add_argument("--dtype", default="float64", choices=("float64", "float32"), help="precision")
     arguments = parser.parse_args()
     experiment = CONFIGS[arguments.config]()
+    device = f"cuda:{os.environ.get('LOCAL_RANK', '0')}" if arguments.device == "cuda" else arguments.device
+    settings = {"seed": arguments.seed, "device": device, "dtype": arguments.dtype}
     out = arguments.out or Path("runs") / arguments.config
     try:
-        out.mkdir(parents=True, exist_ok=True)
-        run = fit(experiment.data(), replace(experiment.fit, seed=arguments.seed), out=out, resume=arguments.resume)
-        save_run(run, out)
-        print(json.dumps(run.metrics, indent=2))
-        report = verify(run)
-        print(report.table())
-        save_figures(run, out)
+        with process_group():
+            out.mkdir(parents=True, exist_ok=True)
+            run = fit(experiment.data(), replace(experiment.fit, **settings), out=out, resume=arguments.resume)
+            return _report(run, out) if is_first() else 0
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+
+
+def _report(run: Run, out: Path) -> int:
+    save_run(run, out)
+    print(json.dumps(run.metrics, indent=2))
+    report = verify(run)
+    print(report.table())
+    save_figures(run, out)
     return 0 if report.passed else 1
 
 

@@ -16,6 +16,7 @@ from herglotz.data.windows import Triples
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
+from herglotz.training.distributed import add_over_processes, own_share, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.prior import Prior
 
@@ -82,14 +83,17 @@ class ResidualProblem:
         if self.coupled:  # through the recurrence for s: the normal equations already hold its derivative
             cost, _, gradient = self.normal_equations(x)
             return cost, gradient
-        t = self.triples
+        t, (rank, processes) = self.triples, world()
+        own = slice(rank, None, processes)
         theta = x.detach().requires_grad_()
-        r = self._local(theta, t.q0, t.q1, t.q2, torch.zeros_like(t.h0), t.h0, t.h1)
+        r = self._local(theta, t.q0[own], t.q1[own], t.q2[own], torch.zeros_like(t.h0[own]), t.h0[own], t.h1[own])
         cost = r.square().sum() / (2 * self.sigma**2)
-        if self.prior is not None:
+        if self.prior is not None and rank == 0:
             cost = cost + self.prior.cost(theta)
         (gradient,) = torch.autograd.grad(cost, theta)
-        return cost.detach(), gradient
+        cost = cost.detach()
+        add_over_processes(cost, gradient)
+        return cost, gradient
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(cost, JᵀJ, Jᵀr), accumulated over chunks of triples."""
@@ -99,7 +103,9 @@ class ResidualProblem:
         A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         cost = x.new_zeros(())
         t = self.triples
-        for part in torch.arange(len(t.q0), device=x.device).split(self.chunk):
+        _, processes = world()
+        chunk = min(self.chunk, -(-len(t.q0) // processes))
+        for part in own_share(torch.arange(len(t.q0), device=x.device).split(chunk)):
             arguments = (t.q0[part], t.q1[part], t.q2[part], s[t.index[part]], t.h0[part], t.h1[part])
             r = self._local(theta, *arguments)
             J = vmap(jacrev(self._local), (None, 0, 0, 0, 0, 0, 0))(theta, *arguments)
@@ -112,6 +118,7 @@ class ResidualProblem:
             A += J.T @ J
             b += J.T @ r
             cost += r.square().sum() / 2
+        add_over_processes(A, b, cost)
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
             P = len(theta)

@@ -20,6 +20,7 @@ from herglotz.data import Trajectories
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
+from herglotz.training.distributed import add_over_processes, own_share, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.grid import SegmentGrid
 from herglotz.training.lifted import Path, solve_path
@@ -217,8 +218,9 @@ class ShootingProblem:
             return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
 
         per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0))
-        out = []
-        for part in torch.arange(S * K, device=x.device).split(self.chunk):
+        out = x.new_zeros(S * K, 2 * n + 1, self.P)
+        chunk = min(self.chunk, -(-S * K // world()[1]))
+        for part in own_share(torch.arange(S * K, device=x.device).split(chunk)):
             here = q0[part], q1[part], p0[part], s0[part], h[part]
             G = per_step(theta, *here)  # (chunk, 2n+1, P)
             with torch.no_grad():
@@ -228,5 +230,6 @@ class ShootingProblem:
                 p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
                 dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
                 ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
-            out.append(torch.cat([dq1, dp1, ds1], 1))
-        return torch.cat(out).reshape(S, K, 2 * n + 1, self.P)
+            out[part] = torch.cat([dq1, dp1, ds1], 1)
+        add_over_processes(out)
+        return out.reshape(S, K, 2 * n + 1, self.P)

@@ -13,6 +13,7 @@ from tqdm import tqdm
 
 from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
+from herglotz.training.distributed import is_first
 from herglotz.training.levenberg_marquardt import OptimiserResult
 
 Callback = Callable[[int, float, Tensor], None]
@@ -38,7 +39,7 @@ class Stages:
     """
 
     def __init__(self, progress: bool | None, checkpoint: Path | None, key: str, resume: bool):
-        self.disable = None if progress is None else not progress
+        self.disable = (None if progress is None else not progress) if is_first() else True
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
@@ -83,7 +84,7 @@ class Stages:
             "history": r.history,
             "done": done,
         }
-        if self.checkpoint is not None:
+        if self.checkpoint is not None and is_first():
             buffer = BytesIO()
             torch.save({"key": self.key, "stages": self.done}, buffer)
             write_atomically(self.checkpoint, buffer.getvalue())
