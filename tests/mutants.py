@@ -1,61 +1,167 @@
 """Break the geometry on purpose, one line at a time, and see whether the tests notice: `make mutants`.
 
-Each mutant is a sign, a factor or an index that one could get wrong and still have a program that runs.
+Each mutant is a sign, a factor or an index that one could get wrong and still have a program that runs. It is tried on
+a copy of the sources; the tests that should kill it are named beside it, and the first that does is printed.
 """
 
 from __future__ import annotations
 
+import argparse
+import os
+import re
+import shutil
 import subprocess
 import sys
+import tempfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from queue import Queue
 
 ROOT = Path(__file__).resolve().parents[1]
-SOURCE = ROOT / "src" / "herglotz"
-TESTS = ["tests/unit/mechanics", "tests/contracts", "tests/unit/models", "tests/unit/stepping", "tests/golden"]
-
+M, S, K, V = "tests/unit/mechanics", "tests/unit/systems", "tests/unit/stepping", "tests/verification"
 MUTANTS = [
-    ("mechanics/legendre.py", "return -P.D1 / P.c[..., None]", "return -P.D1"),
-    ("mechanics/legendre.py", "return q1, P.D2, s0 + P.L", "return q1, P.D2 / P.c[..., None], s0 + P.L"),
-    ("mechanics/legendre.py", "return q1, P.D2, s0 + P.L", "return q1, P.D2, s0 - P.L"),
-    ("mechanics/legendre.py", "return P.D1 + P.c[..., None] * p0", "return P.D1 + p0"),
-    ("mechanics/legendre.py", "P.D12 + p0[..., :, None]", "P.D12 - p0[..., :, None]"),
-    ("mechanics/tangent.py", "F_q0 = P.D11 + p0", "F_q0 = P.D11 - p0"),
-    ("mechanics/tangent.py", "torch.cat([P.D12.mT, zero", "torch.cat([P.D12, zero"),
-    ("mechanics/tangent.py", "zero[..., 0], P.c[..., None]], -1)", "zero[..., 0], P.D3[..., None]], -1)"),
-    ("mechanics/hamiltonian.py", "return (p1 * q1).sum(-1) - L", "return (p1 * q1).sum(-1) + L"),
-    ("mechanics/contact.py", "torch.cat([-p, torch.zeros_like(p)", "torch.cat([p, torch.zeros_like(p)"),
-    ("mechanics/continuous.py", "-(H_q + p.detach() * H_s[..., None])", "-H_q"),
-    ("mechanics/partials.py", "stack([r[1] for r in rows0], -2)", "stack([r[1] for r in rows0], -1)"),
-    ("models/model.py", "(c - 1.0) * (s0 - h / 2 * t.V0)", "(c - 1.0) * s0"),
-    ("models/model.py", "(t.g / 2).exp() * t.K", "t.K"),
-    ("models/jet.py", "second = a * other._second + b * self._second", "second = a * other._second - b * self._second"),
-    ("models/jet.py", "return self.map(t, f1, -2 * t * f1)", "return self.map(t, f1, 2 * t * f1)"),
-    ("stepping/stepper.py", "return q1 - solve(J, F - F.detach())", "return q1 + solve(J, F - F.detach())"),
-    ("stepping/stepper.py", "sigma=factors.cumprod(-1)", "sigma=factors"),
-]
+    # mechanics
+    ("mechanics/legendre.py", "return -D1 / P.c[..., None]", "return -D1", f"{M}/test_partials.py::test_legendre_transforms_of_the_exact_lagrangian"),
+    ("mechanics/legendre.py", "P.D1 if P.force is None else P.D1 + P.force.minus", "P.D1", f"{M}/test_forces.py::test_a_step_solves_the_forced_equations"),
+    ("mechanics/legendre.py", "P.D2 if P.force is None else P.D2 + P.force.plus", "P.D2", f"{M}/test_forces.py::test_a_step_solves_the_forced_equations"),
+    ("mechanics/legendre.py", "return q1, momentum_plus(P), s0 + P.L", "return q1, momentum_plus(P), s0 - P.L", f"{M}/test_partials.py::test_legendre_transforms_of_the_exact_lagrangian"),
+    ("mechanics/legendre.py", "F = P.D1 + P.c[..., None] * p0", "F = P.D1 + p0", f"{M}/test_partials.py::test_herglotz_residual_vanishes_along_a_flow_and_only_there"),
+    ("mechanics/legendre.py", "F if P.force is None else F + P.force.minus", "F", f"{M}/test_forces.py::test_a_step_solves_the_forced_equations"),
+    ("mechanics/legendre.py", "J = P.D12 + p0[..., :, None]", "J = P.D12 - p0[..., :, None]", f"{M}/test_partials.py::test_m_is_the_momentum_jacobian_on_the_solution"),
+    ("mechanics/tangent.py", "F_q0 = P.D11 + p0", "F_q0 = P.D11 - p0", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
+    ("mechanics/tangent.py", "p1_q0, p1_q1, p1_s0 = P.D12.mT,", "p1_q0, p1_q1, p1_s0 = P.D12,", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
+    ("mechanics/tangent.py", "p1_q0 + P.force.plus_1", "p1_q0 - P.force.plus_1", f"{M}/test_forces.py::test_the_derivative_of_a_forced_step_is_the_closed_form"),
+    ("mechanics/tangent.py", "zero[..., 0], P.c[..., None]], -1)", "zero[..., 0], P.D3[..., None]], -1)", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
+    ("mechanics/contact.py", "torch.cat([-p, torch.zeros_like(p)", "torch.cat([p, torch.zeros_like(p)", "tests/contracts/test_model_contract.py::test_a_step_is_a_contact_map"),
+    ("mechanics/partials.py", "D12=torch.stack([r[1] for r in rows0], -2)", "D12=torch.stack([r[1] for r in rows0], -1)", f"{M}/test_partials.py::test_d12_is_not_symmetrised"),
+    ("mechanics/hamiltonian.py", "return (p1 * q1).sum(-1) - L", "return (p1 * q1).sum(-1) + L", f"{S}/test_scenes.py::test_right_hamiltonian"),
+    ("mechanics/hamiltonian.py", "return -(p0 * q0).sum(-1) - L", "return (p0 * q0).sum(-1) - L", f"{M}/test_left_formalism.py::test_hamiltonian_derivatives"),
+    ("mechanics/hamiltonian.py", "D11=B @ P.D12.mT - P.D11", "D11=B @ P.D12.mT + P.D11", f"{M}/test_left_formalism.py::test_hamiltonian_derivatives"),
+    ("mechanics/left.py", "(b3 + P.D33[..., None] * b)", "b3", f"{M}/test_left_formalism.py::test_left_second_derivatives_against_autograd"),
+    ("mechanics/hamilton_equations.py", "-P.D2 / (1 + P.D3)[..., None]", "-P.D2 / (1 - P.D3)[..., None]", f"{M}/test_left_formalism.py::test_both_sets_of_equations_on_the_flow"),
+    ("mechanics/hamilton_equations.py", "s1 + P.L - (p0", "s1 - P.L - (p0", f"{M}/test_left_formalism.py::test_both_sets_of_equations_on_the_flow"),
+    ("mechanics/action.py", "P.c[..., 1:].flip(-1)", "P.c[..., :-1].flip(-1)", f"{M}/test_action.py::test_gradient_against_autograd"),
+    ("mechanics/generating.py", "S1 - S0 + (dS0 * q0)", "S1 - S0 - (dS0 * q0)", f"{V}/test_left_rows.py::test_the_left_rows_pass"),
+    ("mechanics/generating.py", "D1 = (1 - D3)[..., None] * D", "D1 = D", f"{V}/test_discrete_hamilton_jacobi.py::test_generating_functions_right_and_left"),
+    ("mechanics/generating.py", "D3 = G_s - 1.0", "D3 = G_s", f"{V}/test_identities.py::test_random_models_are_contact_integrators"),
+    ("mechanics/generating.py", "S1 - S0 - (dS1 * q1)", "S1 - S0 + (dS1 * q1)", f"{V}/test_discrete_hamilton_jacobi.py::test_theorem_2_right_and_left_equations_hold_on_an_open_set"),
+    ("mechanics/hamilton_jacobi.py", "P.D22 - P.D12.mT @ pivot_B", "P.D22 - P.D12 @ pivot_B", f"{K}/test_hopf_lax.py::test_riccati_of_two_coupled_coordinates"),
+    ("mechanics/hamilton_jacobi.py", "c * S.delta - 0.5 * c**2", "c * S.delta - 0.5 * c", f"{K}/test_hopf_lax.py::test_riccati_by_the_formula"),
+    ("mechanics/regularity.py", "return P.D11 + cross + cross.mT", "return P.D11 + cross", f"{M}/test_left_formalism.py::test_the_hessian_that_decides_about_the_left_hamiltonian"),
+    ("mechanics/continuous.py", "-(H_q + p * H_s[..., None])", "-H_q", f"{M}/test_contact_geometry.py::test_the_contact_field_by_its_characterisation"),
+    ("mechanics/continuous.py", "return q_dot, p_dot, heat - H_value", "return q_dot, p_dot, heat", f"{M}/test_contact_geometry.py::test_the_contact_field_by_its_characterisation"),
+    ("mechanics/continuous.py", "(P.D12.mT @ v", "(P.D12 @ v", f"{M}/test_continuous_legendre.py::test_herglotz_equations_are_the_contact_hamilton_equations"),
+    ("mechanics/jacobi.py", "- F.L * G.D3 + G.L * F.D3", "+ F.L * G.D3 - G.L * F.D3", f"{M}/test_contact_geometry.py::test_bracket_is_the_commutator_of_contact_fields"),
+    ("mechanics/legendrian.py", "return -(s0 + S(q0, q1, s0))", "return s0 + S(q0, q1, s0)", f"{M}/test_legendrian.py::test_the_generating_function_has_a_minus_sign"),
+    ("mechanics/hj_on_qxr.py", "- P.L[..., None] * g_s", "+ P.L[..., None] * g_s", f"{M}/test_hj_sections.py::test_the_golden_section_on_QxR"),
+    ("mechanics/noether.py", "value - shift(e[..., 0], q)", "value + shift(e[..., 0], q)", f"{V}/test_contact_noether.py::test_generators_and_momenta"),
+    ("mechanics/jacobi.py", "join(-X_p - along[..., None] * p, X_q", "join(-X_p + along[..., None] * p, X_q", f"{M}/test_contact_geometry.py"),
+    ("mechanics/jacobi.py", "(X_q * Y_p).sum(-1) - (X_p * Y_q)", "(X_q * Y_p).sum(-1) + (X_p * Y_q)", f"{M}/test_contact_geometry.py"),
+    ("mechanics/jacobi.py", "return turned - join(X_p", "return turned + join(X_p", f"{M}/test_contact_geometry.py"),
+    ("mechanics/jacobi.py", "a_s + (p * a_p).sum(-1))", "(p * a_p).sum(-1))", f"{M}/test_contact_geometry.py"),
+    ("mechanics/continuous.py", "force = P.D1 + P.D3[..., None] * P.D2", "force = P.D1 - P.D3[..., None] * P.D2", f"{M}/test_continuous_legendre.py"),
+    ("mechanics/continuous.py", "- L_vq_v - P.L[..., None] * P.D23", "- L_vq_v", f"{M}/test_continuous_legendre.py"),
+    ("mechanics/legendre_dual.py", "(x * y).sum(-1) - f(q, x, s)", "(x * y).sum(-1) + f(q, x, s)", f"{M}/test_continuous_legendre.py"),
+    ("mechanics/hj_on_q.py", "(F_q * v).sum(-1))", "-(F_q * v).sum(-1))", f"{M}/test_hj_sections.py"),
+    ("mechanics/hj_on_qxr.py", "return P.D1 + p * P.D3[..., None]", "return P.D1 - p * P.D3[..., None]", f"{M}/test_hj_sections.py"),
+    ("mechanics/hj_on_qxr.py", "gamma1(q1, s0 + P.L) - momentum_plus(P)", "gamma1(q1, s0) - momentum_plus(P)", f"{M}/test_hj_sections.py"),
+    ("mechanics/legendrian.py", "torch.cat([tau[..., None] * p0, -p1", "torch.cat([p0, -p1", f"{M}/test_legendrian.py"),
+    ("mechanics/noether.py", "+ chi0 - chi1", "- chi0 + chi1", f"{V}/test_contact_noether.py"),
+    ("mechanics/generating.py", "D1 = G_q - (Y_q.mT", "D1 = G_q + (Y_q.mT", f"{V}/test_discrete_hamilton_jacobi.py"),
+    ("mechanics/hamilton_jacobi.py", "return join(q1, p1, s1) - join(*prolongation(S1, q1))", "return join(q1, p1, s1) - join(*prolongation(S1, q))", f"{V}/test_discrete_hamilton_jacobi.py"),
+    ("mechanics/regularity.py", "torch.minimum(*beside) / size", "size / torch.minimum(*beside)", f"{K}/test_explain.py"),
+    ("mechanics/rotations.py", "0.5 * _sinc(0.25 * x) ** 2", "0.5 * _sinc(x) ** 2", f"{M}/test_rotations.py"),
+    # systems
+    ("systems/exact.py", "- (D23 * Y_s).sum(-1)", "", f"{S}/test_exact.py"),
+    ("systems/exact.py", "inverse - p0[..., :, None]", "inverse + p0[..., :, None]", f"{S}/test_exact.py"),
+    ("systems/exact.py", ".real > 0).all(-1)", ".real.prod(-1) > 0)", f"{S}/test_exact.py::test_beyond_a_conjugate_point_is_nan_with_a_reason"),
+    ("systems/galerkin.py", "[..., ends] - moved[..., :-1, :-1]", "[..., ends] + moved[..., :-1, :-1]", f"{S}/test_rules.py"),
+    ("systems/galerkin.py", "0.5 - 0.1 * ROOT5", "0.5 - 0.11 * ROOT5", f"{S}/test_rules.py::test_order_on_the_damped_pendulum"),
+    ("systems/rules.py", "L_d(q1, q0, s0 + x, -h)", "L_d(q1, q0, s0, -h)", f"{S}/test_rules.py"),
+    ("systems/rules.py", "h * L(q1, v, s0 + x)", "h * L(q1, v, s0)", f"{S}/test_rules.py"),
+    ("systems/parachute.py", "B**2 - 4 * (B - a) * p", "B**2 - 4 * (B + a) * p", f"{S}/test_closed_forms.py"),
+    ("systems/linear_drag.py", "h * expm1w(-gamma * h) / (2 * m)", "h * expm1w(gamma * h) / (2 * m)", f"{S}/test_drag.py"),
+    ("systems/path.py", "lagrangian(*path(t[..., 0]), s)", "lagrangian(*path(t[..., 0]), 0 * s)", f"{S}/test_path.py"),
+    # models
+    ("models/model.py", "(c - 1.0) * (s0 - h / 2 * t.V0)", "(c - 1.0) * s0", "tests/unit/models/test_ladder_orders.py::test_every_weight_gives_second_order"),
+    ("models/model.py", "(t.g / 2).exp() * t.K", "t.K", "tests/unit/models/test_ladder_orders.py::test_every_weight_gives_second_order"),
+    ("models/jet.py", "second = a * other._second + b * self._second", "second = a * other._second - b * self._second", "tests/contracts/test_model_contract.py::test_closed_forms_match_autograd"),
+    ("models/action.py", "for j in reversed(order) if backward else order", "for j in order", "tests/unit/models"),
+    ("models/friction.py", "before, after = (c * h / 2)[..., None]", "before, after = (h / 2)[..., None]", "tests/contracts/test_model_contract.py"),
+    ("models/mass.py", "self.network(x) - at_zero", "self.network(x)", "tests/unit/models"),
+    # stepping
+    ("stepping/engine.py", "x = x - solve(J, F - F.detach())", "x = x + solve(J, F - F.detach())", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
+    ("stepping/state.py", "sigma=factors.cumprod(-1)", "sigma=factors", f"{K}/test_boundary_value.py::test_the_cauchy_problem"),
+    ("stepping/evolution.py", "split(x0 + 0.5 * delta)", "split(x0)", f"{K}/test_evolution.py::test_order_two_on_a_nonlinear_damped_problem"),
+    ("stepping/evolution.py", "mean = 0.5 * (H(x0) + H(x1))", "mean = H(x0)", f"{K}/test_evolution.py::test_H_shrinks_by_c_along_the_contact_field"),
+    ("stepping/composition.py", "c * part.c", "part.c", f"{K}/test_composition.py"),
+    ("stepping/splitting.py", "p = c0[..., None] * p + half", "p = p + half", f"{K}/test_composition.py"),
+    ("stepping/rotation.py", "c[..., None] * (F.mT @ M", "(F.mT @ M", f"{K}/test_rigid_body.py"),
+    ("stepping/rotation.py", "g = (h * root)[..., None] * M", "g = h[..., None] * M", f"{K}/test_rigid_body.py"),
+    ("stepping/constrained.py", "(Dg0.mT @ x[..., n:, None])", "(Dg1.mT @ x[..., n:, None])", f"{K}/test_constrained.py"),
+    ("stepping/constrained.py", "p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])", "p1 = momentum_plus(P)", f"{K}/test_constrained.py"),
+    ("stepping/legendrian.py", "q, p, s = q1, momentum_plus(P), s + P.L", "q, p, s = q1, momentum_plus(P), s", f"{K}/test_degenerate.py"),
+    ("stepping/explicit.py", "drag = self.friction * delta / 2", "drag = self.friction * delta", f"{K}/test_explicit.py"),
+    ("stepping/events.py", "first = torch.minimum(first, tau) if", "first = tau if", f"{K}/test_events.py"),
+]  # fmt: skip
+KILLER = re.compile(r"^(?:FAILED|ERROR) (\S+)", re.MULTILINE)
 
 
-def killed(path: Path, old: str, new: str) -> bool:
-    """Apply one mutant, run the tests, restore the file."""
+def copy_of_sources(folder: Path) -> Path:
+    """`src` and `tests` in a folder of their own, so that nothing here is touched."""
+    for name in ("src", "tests"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    return folder
+
+
+def killer(tree: Path, mutant: tuple[str, str, str, str]) -> str | None:
+    """The first test that fails on this mutant, or None if it survives."""
+    name, old, new, tests = mutant
+    path = tree / "src" / "herglotz" / name
     text = path.read_text(encoding="utf-8")
-    if old not in text:
-        raise SystemExit(f"{path}: no line with {old!r}; the list of mutants is out of date")
+    if text.count(old) < 1:
+        raise SystemExit(f"{name}: no line with {old!r}; the list of mutants is out of date")
+    path.write_text(text.replace(old, new, 1), encoding="utf-8")
     try:
-        path.write_text(text.replace(old, new, 1), encoding="utf-8")
-        command = [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *TESTS]
-        return subprocess.run(command, cwd=ROOT, capture_output=True).returncode == 1
+        command = [sys.executable, "-m", "pytest", "-x", "-q", "--tb=no", "-p", "no:cacheprovider", *tests.split()]
+        environment = {**os.environ, "PYTHONPATH": str(tree / "src"), "PYTHONDONTWRITEBYTECODE": "1"}
+        done = subprocess.run(command, cwd=tree, capture_output=True, text=True, env=environment, check=False)
     finally:
         path.write_text(text, encoding="utf-8")
+    if done.returncode not in (0, 1, 2):
+        raise SystemExit(f"{name}: pytest did not run ({done.stdout[-300:]}{done.stderr[-300:]})")
+    found = KILLER.search(done.stdout)
+    return found[1] if found else None
 
 
 def main() -> int:
     """Run all mutants and print a line each."""
-    survivors = 0
-    for name, old, new in MUTANTS:
-        dead = killed(SOURCE / name, old, new)
-        survivors += not dead
-        print(f"{'killed  ' if dead else 'SURVIVED'}  {name}: {old}  →  {new}", flush=True)
-    print(f"{len(MUTANTS) - survivors} of {len(MUTANTS)} mutants killed")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="mutants whose file name contains this")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="at the same time (default: cores)")
+    arguments = parser.parse_args()
+    chosen = [m for m in MUTANTS if arguments.only in m[0]]
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        trees: Queue[Path] = Queue()
+        for k in range(arguments.workers):
+            trees.put(copy_of_sources(Path(folder, str(k))))
+
+        def attempt(mutant: tuple[str, str, str, str]) -> str | None:
+            tree = trees.get()
+            try:
+                return killer(tree, mutant)
+            finally:
+                trees.put(tree)
+
+        survivors = 0
+        with ThreadPoolExecutor(arguments.workers) as pool:
+            for (name, old, new, _), by in zip(chosen, pool.map(attempt, chosen), strict=True):
+                survivors += by is None
+                print(f"{'SURVIVED' if by is None else 'killed  '}  {name}: {old}  →  {new}", flush=True)
+                if by is not None:
+                    print(f"          by {by}", flush=True)
+    print(f"{len(chosen) - survivors} of {len(chosen)} mutants killed")
     return 1 if survivors else 0
 
 

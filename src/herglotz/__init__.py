@@ -15,7 +15,7 @@ __version__ = "0.1.0"
 if TYPE_CHECKING:
     from herglotz.data import Trajectories, load, save, simulate
     from herglotz.errors import InputError
-    from herglotz.export import export_pt2, load_pt2
+    from herglotz.export import compile, export_pt2, load_pt2
     from herglotz.mechanics import partials
     from herglotz.models import ContactLagrangian, ModelConfig
     from herglotz.stepping import State, Status, Stepper
@@ -30,6 +30,7 @@ _HOME = {
     "save": "data",
     "simulate": "data",
     "InputError": "errors",
+    "compile": "export",
     "export_pt2": "export",
     "load_pt2": "export",
     "partials": "mechanics",
@@ -56,6 +57,7 @@ __all__ = [
     "Status",
     "Stepper",
     "Trajectories",
+    "compile",
     "export_pt2",
     "fit",
     "load",

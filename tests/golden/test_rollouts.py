@@ -58,9 +58,11 @@ def nonlinear_in_s(q0, q1, s0, h):
     return h * (kinetic - potential - 0.3 * s0 - 0.1 * torch.sin(s0) * (1 + 0.2 * m2) - 0.05 * s0 * d1)
 
 
-def test_two_degrees_of_freedom_nonlinear_in_s():
-    # fails if D12 is transposed or D13, D23 exchanged: neither shows with one degree of freedom or constant c
-    out = Stepper(nonlinear_in_s).rollout(tensor(0.3, -0.5), tensor(0.7, 0.2), scalar(0.4), h=0.2, steps=8)
+@pytest.mark.parametrize("L_d", [nonlinear_in_s, scene("nonlinear_action").L_d_rules["midpoint_plain"]])
+def test_two_degrees_of_freedom_nonlinear_in_s(L_d):
+    # fails if D12 is transposed or D13, D23 exchanged: neither shows with one degree of freedom or constant c; and if
+    # the scene's L or its plain midpoint is not the one written here
+    out = Stepper(L_d).rollout(tensor(0.3, -0.5), tensor(0.7, 0.2), scalar(0.4), h=0.2, steps=8)
     expected = (
         (0.790147768842206419, -0.321134983997739986),
         (0.105386926461592157, 0.154339975878171863),

@@ -8,13 +8,21 @@ from typing import Any
 
 from herglotz.cli.common import check_output_file, print_json
 
+# Extension of each format, and what may be said of the next thing to do.
+SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
 DESCRIPTION = """\
-Write the model of a run as one .pt2 file: one step (q, p, s, h) -> (q1, p1, s1, c, residual, status), any batch
-size, any step. It loads with torch.export.load(FILE).module() on a machine without herglotz.
-With --format c: one C99 header that steps with <math.h> alone; an example program stands at its top.
+Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
+
+  pt2   graphs of PyTorch operations: one differentiable step, K steps, and a start from two positions. Any batch
+        size, any step; torch.export.load(FILE).module() needs no herglotz
+  onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch
+  aoti  K steps compiled to machine code (needs g++ or clang++, about a minute): the fastest batches
+  c     one C99 header that steps with <math.h> alone: the fastest single steps
 
 examples:
   herglotz export runs/pendulum --out pendulum.pt2
+  herglotz export runs/pendulum --format onnx --out stepper.onnx
+  herglotz export runs/pendulum --format aoti --out stepper.aoti.pt2
   herglotz export runs/pendulum --format c --out stepper.h
 """
 
@@ -23,24 +31,27 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("export", help="write a model as one file", description=DESCRIPTION)
     parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` wrote")
-    parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2 (C: .h)")
-    parser.add_argument("--format", choices=("pt2", "c"), default="pt2", help="of the file (default %(default)s)")
+    parser.add_argument(
+        "--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2, .onnx or (C) .h"
+    )
+    parser.add_argument("--format", choices=tuple(SUFFIX), default="pt2", help="of the file (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, load again and say what it is."""
-    check_output_file(arguments.out, (".h",) if arguments.format == "c" else (".pt2",))
+    check_output_file(arguments.out, (SUFFIX[arguments.format],))
 
     from herglotz.training import load_run
 
     result = load_run(arguments.source)
 
     from herglotz.cli.states import last_fitted
-    from herglotz.export import export_c, export_pt2, load_pt2
+    from herglotz.export import export_aoti, export_c, export_onnx, export_pt2, load_exported
     from herglotz.export.c_header import read_metadata
 
+    write = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}[arguments.format]
     q, p, s = last_fitted(result, 0)
     metadata = {
         "names": list(result.data.names),
@@ -49,12 +60,11 @@ def run(arguments: argparse.Namespace) -> int:
         "metrics": result.metrics,
     }
     described: dict[str, Any] = {"h": result.h, "box": result.box, "units": result.data.units, "metadata": metadata}
-    if arguments.format == "c":
-        export_c(result.model, arguments.out, **described)
+    write(result.model, arguments.out, **described)
+    if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
     else:
-        export_pt2(result.model, arguments.out, **described)
-        found = load_pt2(arguments.out).metadata
+        found = load_exported(arguments.out).metadata
     size = arguments.out.stat().st_size
     if arguments.json:
         print_json({"file": str(arguments.out), "bytes": size, "metadata": found})
@@ -63,5 +73,5 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.format == "c":
             print(f"Next: the example at the top of {arguments.out}, with cc -O3 -march=native")
         else:
-            print(f"Next: herglotz verify {arguments.out}")
+            print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
     return 0

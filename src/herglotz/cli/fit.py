@@ -13,7 +13,8 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     from herglotz.training import Run
 
-LEVELS = ("linear", "affine")  # copies, so that help does not import PyTorch; a test compares them
+# Copies, so that help does not import PyTorch; a test compares them.
+LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
 OPTIMISERS = ("lm", "adam")
 DTYPES = ("float64", "float32")
@@ -37,7 +38,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument(
         "--level", choices=LEVELS, default="linear",
-        help="linear: one damping rate. affine: damping depends on position and velocity (default %(default)s)",
+        help="conservative: no damping. linear: one damping rate. affine: damping depends on position and velocity. "
+        "full: on s as well. forced: one rate, and friction of each joint (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",

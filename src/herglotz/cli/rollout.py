@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import check_output_file, count, finite, is_exported, positive, print_json
+from herglotz.cli.common import check_output_file, count, finite, positive, print_json
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
-    from herglotz.export import ExportedStepper
+    from herglotz.export import CompiledStepper, ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
 
 DESCRIPTION = """\
@@ -25,11 +25,14 @@ examples:
 """
 
 
+SUFFIXES = (".pt2", ".onnx", ".h")
+
+
 @dataclass(frozen=True)
 class Source:
     """A model that can be stepped, and what its file knows."""
 
-    stepper: Stepper | ExportedStepper
+    stepper: Stepper | ExportedStepper | CompiledStepper
     start: State | None
     t0: float
     h: float
@@ -42,7 +45,10 @@ class Source:
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("rollout", help="step a model and write the motion", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN|FILE.pt2", type=Path, help="folder of a run, or an exported model")
+    parser.add_argument(
+        "source", metavar="RUN|FILE", type=Path,
+        help="folder of a run, or an exported model: .pt2, .onnx or a C header .h",
+    )  # fmt: skip
     parser.add_argument("--steps", required=True, type=count, metavar="K", help="number of steps, at least 2")
     parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
     parser.add_argument("--h", type=positive, help="step, in the data's unit of time (default: the model's)")
@@ -113,7 +119,7 @@ def read_source(path: Path, trajectory: int) -> Source:
 
     from herglotz.stepping import State
 
-    if not is_exported(path):
+    if path.is_dir() or path.suffix.lower() not in SUFFIXES:
         from herglotz.cli.states import last_fitted
         from herglotz.training import load_run
 
@@ -122,9 +128,9 @@ def read_source(path: Path, trajectory: int) -> Source:
         t0 = float(data.t[data.offsets[trajectory] + max(run_.train_lengths[trajectory], 1) - 1])
         return Source(run_.stepper, start, t0, run_.h, data.names, data.units, data.angles, data.time_unit)
 
-    from herglotz.export import load_pt2
+    from herglotz.export import load_exported
 
-    stepper = load_pt2(path)
+    stepper = load_exported(path)
     m, n = stepper.metadata, stepper.dof
     stored = m.get("start")
     start = stored and State(*(torch.tensor(stored[name], dtype=stepper.dtype) for name in "qps"))

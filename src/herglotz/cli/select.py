@@ -27,7 +27,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument(
-        "--levels", default=",".join(LEVELS), help="levels to compare, with commas (default %(default)s)"
+        "--levels",
+        default=",".join(level for level in LEVELS if level != "full"),
+        help="levels to compare, with commas (default %(default)s)",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     parser.add_argument("--seed", type=count, default=0, help="the first of them (default %(default)s)")

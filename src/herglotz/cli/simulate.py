@@ -4,24 +4,45 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
 from herglotz.errors import InputError
 
-DESCRIPTION = """\
+ABOUT = """\
 Sample motions of a scene whose answer is known, from random initial positions and velocities, and write them
 as .csv or .npz for `herglotz fit`. The same seed gives the same file.
 
-Scenes: damped_oscillator, damped_pendulum, parachute.
-
+Scenes:
+{scenes}
 example:
   herglotz simulate damped_pendulum --out pendulum.csv --steps 160 --h 0.1 --noise 0.003 --param gamma=0.2
 """
 
 
+def __getattr__(name: str) -> str:
+    """`DESCRIPTION`, the text of --help, made when it is read: the list of scenes comes from their registry."""
+    if name != "DESCRIPTION":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from herglotz.systems import scene, scene_names
+
+    return ABOUT.format(scenes="".join(f"  {name:<20}{scene(name).description}\n" for name in scene_names()))
+
+
+class Help(argparse.Action):
+    """Print the help, which lists the scenes: only here is that list worth the import of PyTorch."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:  # noqa: ARG002
+        """Print and exit."""
+        parser.description = __getattr__("DESCRIPTION")
+        parser.print_help()
+        parser.exit()
+
+
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
-    parser = commands.add_parser("simulate", help="write data of a scene with a known answer", description=DESCRIPTION)
+    parser = commands.add_parser("simulate", help="write data of a scene with a known answer", add_help=False)
+    parser.add_argument("-h", "--help", action=Help, nargs=0, help="show this help message and exit")
     parser.add_argument("scene", metavar="SCENE", help="name of the scene")
     parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
     parser.add_argument(

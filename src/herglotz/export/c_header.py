@@ -13,11 +13,14 @@ import torch
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
-from herglotz.export.c_api import API
-from herglotz.export.c_model import flags_of, terms_source
+from herglotz.export.c_api import API, BATCHES
+from herglotz.export.c_arithmetic import activations, number_tests
+from herglotz.export.c_batch import BATCH
+from herglotz.export.c_model import activations_of, constants_source, flags_of, functions_source, legendre_plus_source
+from herglotz.export.c_network import PRODUCT, WIDE_PRODUCT
 from herglotz.export.c_solver import ADVANCE, ELIMINATION
-from herglotz.export.c_template import fill, finish, number, numbers, render, text_constant
-from herglotz.export.pt2 import _metadata
+from herglotz.export.c_template import fill, finish, number, numbers, render, text_constant, widen
+from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
@@ -37,9 +40,9 @@ _TOP = """\
      NAME_state x;
      int k, status;
      q1[0] = (NAME_real)0.01;  // two measured positions, h apart
-     status = NAME_init(q0, q1, 0, NAME_h, &x);
+     status = NAME_init(q0, q1, 0, NAME_h, {%if inputs}0, {%end}&x);
      for (k = 0; k < 100 && !(status & 15); k++) {
-       status = NAME_step(&x, NAME_h, &left);
+       status = NAME_step(&x, NAME_h, {%if inputs}0, {%end}&left);
        printf("%d %g %g\\n", k, (double)x.q[0], (double)left);
      }
      if (status & 15)  // the state is the last good one
@@ -56,9 +59,6 @@ _TOP = """\
 
 #include <math.h>
 
-#if defined(__FINITE_MATH_ONLY__) && __FINITE_MATH_ONLY__ > 0
-#error "compile without -ffast-math or -ffinite-math-only: they remove the checks for NaN"
-#endif
 #ifdef __cplusplus
 #define NAME_RESTRICT
 #else
@@ -66,7 +66,7 @@ _TOP = """\
 #endif
 
 typedef @REAL@ NAME_real;
-enum { NAME_N = @N@ };  /* coordinates */
+enum { NAME_N = @N@, NAME_M = @M@ };  /* coordinates, inputs */
 
 /* What a step returns. */
 enum {
@@ -75,10 +75,13 @@ enum {
   NAME_SINGULAR = 2,      /* det J = 0 or c = 0: the step is not defined there */
   NAME_DIVERGED = 3,      /* a value stopped being finite */
   NAME_BAD_INPUT = 5,     /* h <= 0, or a number that is not finite */
-  NAME_OUTSIDE_BOX = 16   /* a separate bit: a state outside the box of the fitted data; the step is done */
+  NAME_OUTSIDE_BOX = 16,  /* a separate bit: a state outside the box of the fitted data; the step is done */
+  NAME_OUTSIDE_H = 32     /* a separate bit: h outside [NAME_h_low, NAME_h_high]; the step is done */
 };
 
-/* A state. q in NAME_units; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
+/* `status & 15` is 0 where a step succeeded; the bits above are flags.
+
+   A state. q in NAME_units; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
    steps so far (start it at 1). */
 typedef struct {
   real q[NAME_N], p[NAME_N], s, sigma;
@@ -92,24 +95,12 @@ static const char NAME_versions[] = @VERSIONS@;
 static const char *const NAME_units[] = {@UNIT_LIST@};
 static const int NAME_is_angle[NAME_N] = {@ANGLES@};
 static const real NAME_h = @H@;  /* typical step: recorded, not imposed */
+static const real NAME_h_low = @H_LOW@, NAME_h_high = @H_HIGH@;  /* steps it was fitted for */
 static const real NAME_tolerance = @TOLERANCE@;  /* of Newton, relative to the size of q */
 static const real NAME_floor = @FLOOR@;  /* rounding that no iteration removes */
 static const real NAME_near = R(0.01);  /* moves below this, relative, keep the last J */
-enum { NAME_max_iterations = @MAX_ITERATIONS@ };
-@BOX@
-static inline int NAME_finite(real x) { return x - x == R(0.0); }
-
-/* The largest |x_i|; NaN where one is NaN. */
-static inline real NAME_length(const real x[NAME_N]) {
-  real size = R(0.0);
-  int i;
-  for (i = 0; i < NAME_N; i++) {
-    real a = FABS(x[i]);
-    if (a > size || a != a) size = a;
-  }
-  return size;
-}
-"""
+enum { NAME_max_iterations = @MAX_ITERATIONS@, NAME_BOXED = @BOXED@ };
+@BOX@"""
 
 
 def export_c(
@@ -121,12 +112,13 @@ def export_c(
     units: Sequence[str] = (),
     name: str = "herglotz_stepper",
     dtype: str = "float64",
+    h_range: tuple[float, float] | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
 
-    Its functions are `NAME_init` (state from two positions), `NAME_step` and `NAME_rollout`; an example stands at the
-    top of the file. Compile with `-O3 -march=native` for speed, never with `-ffast-math`.
+    Its functions are `NAME_init` (state from two positions), `NAME_step`, `NAME_rollout` and their `_batch`es; an
+    example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md` has the rest.
 
     Parameters
     ----------
@@ -144,6 +136,8 @@ def export_c(
         Prefix of every name in the file, a C identifier.
     dtype
         "float64" (C double) or "float32" (C float).
+    h_range
+        Smallest and largest step the model was fitted for: steps outside are flagged in the status. Default: any h > 0.
     metadata
         Further JSON-ready entries for the comment at the top.
 
@@ -158,16 +152,18 @@ def export_c(
         If an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
-    entries = _entries(model, h, box, units, name, dtype, metadata or {})
+    entries = _entries(model, h, box, units, name, dtype, h_range, metadata or {})
     write_atomically(path, c_source(model, entries, path.name).encode())
     return path
 
 
-def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str) -> str:
-    """The text of the header."""
+def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True) -> str:
+    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two."""
     model = copy.deepcopy(model).double().requires_grad_(False)  # rounded once, when the numbers are written
     dtype = entries["dtype"]
     flags = {**flags_of(model), "box": entries["box"] is not None}
+    flags["linear"] = flags["linear"] and explicit
+    flags["stiff"] = flags["linear"] and flags["friction"]  # the matrix of the step depends on h
     versions = f"herglotz {entries['herglotz_version']}, torch {entries['torch_version']}"
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     eps = torch.finfo(getattr(torch, dtype)).eps
@@ -175,21 +171,29 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str) ->
         "MARK": MARK,
         "REAL": "double" if dtype == "float64" else "float",
         "N": str(entries["dof"]),
+        "M": str(entries["inputs"]),
         "SHA": text_constant(entries["weights_sha256"]),
         "LEVEL": text_constant(entries["level"]),
         "DTYPE": text_constant(dtype),
         "ANGLES": ", ".join(str(int(a)) for a in entries["angles"]),
         "H": number(entries["h"], dtype),
+        "H_LOW": number((entries["h_range"] or [0.0])[0], dtype),
+        "H_HIGH": number((entries["h_range"] or [torch.finfo(getattr(torch, dtype)).max])[-1], dtype),
+        "BOXED": str(int(flags["box"])),
         "TOLERANCE": number(entries["newton_tolerance"], dtype),
         "FLOOR": number(1000 * eps, dtype),
         "MAX_ITERATIONS": str(MAX_ITERATIONS),
         "BOX": _box_constants(entries["box"], dtype),
         "VERSIONS": text_constant(versions),
     }
-    head = render(_TOP, top)
-    body = render(ELIMINATION + ADVANCE + API, None, flags)
-    tail = "\n#undef NAME_RESTRICT\n#endif\n"
-    text = finish(head + terms_source(model, dtype) + body + tail, entries["name"], dtype)
+    head = render(_TOP, top, flags)
+    functions, names = functions_source(model, dtype, flags), activations_of(model)
+    parts = [head, number_tests(dtype), constants_source(model, dtype), activations(names, dtype), PRODUCT, functions]
+    parts += [legendre_plus_source(flags), render(ELIMINATION + ADVANCE, None, flags)]
+    if flags["wide"]:
+        parts += ["\n#ifdef NAME_LANE_BYTES", WIDE_PRODUCT, widen(functions), render(BATCH, None, flags), "#endif\n"]
+    parts += [render(API + BATCHES, None, flags), "\n#undef NAME_RESTRICT\n#undef NAME_HIDDEN\n#endif\n"]
+    text = finish("".join(parts), entries["name"], dtype)
     last = {
         "NAME": entries["name"],
         "VERSION": entries["herglotz_version"],
@@ -225,18 +229,19 @@ def _entries(
     units: Sequence[str],
     name: str,
     dtype: str,
+    h_range: tuple[float, float] | None,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
         raise InputError(f"dtype must be 'float64' or 'float32', got {dtype!r}")
-    entries = _metadata(model, h, box, units, 2, extra)
+    span = None if h_range is None else [float(x) for x in h_range]
+    entries = describe(model, h, box, units, MAX_ITERATIONS, {**extra, "h_range": span})
     torch_dtype = getattr(torch, dtype)
     bad = [key for key, value in model.state_dict().items() if not bool(torch.isfinite(value.to(torch_dtype)).all())]
     if bad:
         raise InputError(f"{', '.join(bad)} hold values that are not finite in {dtype}; train the model again")
-    del entries["newton_iterations"]
     entries |= {"name": name, "dtype": dtype, "newton_tolerance": TOLERANCE * torch.finfo(torch_dtype).eps}
     return entries
 

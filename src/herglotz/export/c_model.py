@@ -2,13 +2,25 @@
 
 from __future__ import annotations
 
-import torch
+import copy
 
-from herglotz.export.c_equation import EVALUATION
-from herglotz.export.c_network import arithmetic, network
+import torch
+from torch import Tensor, nn
+
+from herglotz.export.c_action import ACTION, ACTION_LEGENDRE_PLUS
+from herglotz.export.c_equation import CONSTANT_MASS, EVALUATION, LEGENDRE_PLUS, POSITION_MASS, TYPES
+from herglotz.export.c_jet import JETS, KINETIC
+from herglotz.export.c_network import network, weights
+from herglotz.export.c_solver import LEAPFROG
 from herglotz.export.c_template import number, numbers, render
 from herglotz.models import ContactLagrangian
-from herglotz.models.terms import AffineDamping, LinearDamping
+from herglotz.models.friction import Friction
+from herglotz.models.jet import Jet
+from herglotz.models.mass import PositionKinetic
+from herglotz.models.network import Network
+from herglotz.models.terms import AffineDamping, Kinetic
+
+MAX_WIDE = 16  # beyond, a register of n x n matrices leaves the cache
 
 _POTENTIAL = """
 /* V(q) and V'(q). */
@@ -24,7 +36,7 @@ static inline void NAME_potential(const real q[NAME_N], NAME_potential_t *V) {
 {%else}
   real x[NAME_FEATURES], bend[NAME_FEATURES];
 {%end}
-  V->value = R(0.0);
+  V->value = SPREAD(0.0);
   NAME_position_features(q, x, bend);
 @BASELINE@
 {%if potential_network}
@@ -35,16 +47,21 @@ static inline void NAME_potential(const real q[NAME_N], NAME_potential_t *V) {
 {%else}
   int i;
   (void)q;
-  V->value = R(0.0);
-  for (i = 0; i < NAME_N; i++) V->slope[i] = R(0.0);
+  V->value = SPREAD(0.0);
+  for (i = 0; i < NAME_N; i++) V->slope[i] = SPREAD(0.0);
 {%end}
 }
 """
 
 _PHASE = """
-/* A function of (q0, q1): value, d/dq0, d/dq1 and, on demand, d2/dq0 dq1. */
+{%if full}
+/* A function of (q0, q1, s0): value, d/ds0, d0 = d/dq0 + p0 d/ds0, d1 = d/dq1, their sum `both` and, on demand, the
+   derivatives of d0 along q1. */
+{%else}
+/* A function of (q0, q1): value, d/dq0, d/dq1, their sum `both` and, on demand, d2/dq0 dq1. */
+{%end}
 typedef struct {
-  real value, d0[NAME_N], d1[NAME_N], d01[NAME_N][NAME_N];
+  real value, {%if full}ds, {%end}d0[NAME_N], d1[NAME_N], both[NAME_N], d01[NAME_N][NAME_N];
 } NAME_jet;
 
 /* What a network of the midpoint and the velocity reads, with its derivatives along q1. */
@@ -61,10 +78,13 @@ static inline void NAME_phase_features(const real q0[NAME_N], const real move[NA
     f->x[NAME_FEATURES + i] = move[i] / (h * NAME_speed[i]);
   }
   NAME_position_features(mean, f->x, f->bend);
+  for (j = 0; j < NAME_N; j++)  /* at either order: compilers warn of what they cannot follow */
+    for (k = 0; k < NAME_PHASE; k++) f->along[j][k] = SPREAD(0.0);
   if (order < 2) return;
   for (j = 0; j < NAME_N; j++) {
-    for (k = 0; k < NAME_FEATURES; k++) f->along[j][k] = NAME_owner[k] == j ? f->bend[k] / R(2.0) : R(0.0);
-    for (i = 0; i < NAME_N; i++) f->along[j][NAME_FEATURES + i] = i == j ? R(1.0) / (h * NAME_speed[i]) : R(0.0);
+    for (k = 0; k < NAME_FEATURES; k++)
+      if (NAME_owner[k] == j) f->along[j][k] = f->bend[k] / R(2.0);
+    f->along[j][NAME_FEATURES + j] = R(1.0) / (h * NAME_speed[j]);
   }
 }
 
@@ -72,15 +92,20 @@ static inline void NAME_phase_features(const real q0[NAME_N], const real move[NA
 static inline void NAME_chain(const NAME_phase *f, real h, int order, const real dx[NAME_PHASE],
     real ddx[NAME_N][NAME_PHASE], NAME_jet *g) {
   int i, j, k;
+{%if full}
+  g->ds = SPREAD(0.0);
+{%end}
   for (i = 0; i < NAME_N; i++) {
     real v = dx[NAME_FEATURES + i] / (h * NAME_speed[i]);
     g->d0[i] = -v;
     g->d1[i] = v;
+    g->both[i] = SPREAD(0.0);
   }
   for (k = 0; k < NAME_FEATURES; k++) {
     real m = dx[k] * f->bend[k] / R(2.0);
     g->d0[NAME_owner[k]] += m;
     g->d1[NAME_owner[k]] += m;
+    g->both[NAME_owner[k]] += R(2.0) * m;
   }
   if (order < 2) return;
   for (j = 0; j < NAME_N; j++) {
@@ -95,38 +120,75 @@ static inline void NAME_chain(const NAME_phase *f, real h, int order, const real
 
 def flags_of(model: ContactLagrangian) -> dict[str, bool]:
     """Which parts of the templates a model needs."""
-    damping = model.damping
-    affine = isinstance(damping, AffineDamping)
+    damping, friction = model.damping, model.friction
+    affine, full = isinstance(damping, AffineDamping), model.action is not None
     damping_network = isinstance(damping, AffineDamping) and damping.network is not None
     return {
-        "affine": affine,
+        "affine": affine and not full,
+        "full": full,
+        "mass": isinstance(model.kinetic, PositionKinetic),
+        "jet_N": model.correction is not None and not full,
         "damping_network": damping_network,
         "correction": model.correction is not None,
-        "phase": damping_network or model.correction is not None,
+        "phase": damping_network or model.correction is not None or full or not isinstance(model.kinetic, Kinetic),
         "baseline": model.config.baseline,
         "potential_network": model.config.baseline and model.potential.network is not None,
         "linear": model.linear_in_q1,
+        "friction": friction is not None,
+        "dry": friction is not None and friction.dry,
+        "inputs": model.config.inputs > 0,
         "scalar": model.config.dof == 1,
+        "wide": model.config.dof <= MAX_WIDE,
     }
 
 
-def terms_source(model: ContactLagrangian, dtype: str) -> str:
-    """Weights and functions of a model, as a template text for `finish`."""
-    flags, damping = flags_of(model), model.damping
-    parts = [_constants(model, dtype), arithmetic(dtype) if flags["phase"] or flags["potential_network"] else ""]
+def networks_of(model: ContactLagrangian) -> dict[str, Network]:
+    """The networks of a model by their names in the header."""
+    networks: dict[str, Network] = {}
     if model.config.baseline and model.potential.network is not None:
-        parts.append(network("potential", model.potential.network, dtype, tangents=False))
-    if isinstance(damping, AffineDamping) and damping.network is not None:
-        parts.append(network("damping", damping.network, dtype, tangents=True))
+        networks["potential"] = model.potential.network
+    if isinstance(model.damping, AffineDamping) and model.damping.network is not None:
+        networks["damping"] = model.damping.network
     if model.correction is not None:
-        parts.append(network("correction", model.correction.network, dtype, tangents=True))
+        networks["correction"] = model.correction.network
+    if isinstance(model.kinetic, PositionKinetic):
+        networks["mass"] = _of_phase(model.kinetic.network, model.dof)
+    return networks
+
+
+def activations_of(model: ContactLagrangian) -> set[str]:
+    """Which activation functions the networks use."""
+    return {net.activation for net in networks_of(model).values()}
+
+
+def constants_source(model: ContactLagrangian, dtype: str) -> str:
+    """Parameters and weights, as a template text."""
+    parts = [weights(name, net, dtype) for name, net in networks_of(model).items()]
+    return _constants(model, dtype) + "".join(parts)
+
+
+def functions_source(model: ContactLagrangian, dtype: str, flags: dict[str, bool]) -> str:
+    """The terms and the step equation, as a template text that `widen` can turn into one for several samples."""
+    parts = [
+        network(name, net, net.activation, tangents=name != "potential", several=name == "mass")
+        for name, net in networks_of(model).items()
+    ]
+    jets = flags["full"] or flags["mass"]
     parts += [
         _position_features(model, dtype),
         render(_POTENTIAL, {"BASELINE": _baseline(model, dtype)}, flags),
-        _PHASE if flags["phase"] else "",
-        render(EVALUATION, None, flags),
+        render(_PHASE, None, flags) if flags["phase"] else "",
+        render(JETS + KINETIC, None, flags) if jets else "",
+        render(TYPES, None, flags),
+        render(ACTION if flags["full"] else EVALUATION, _names_of_K(flags), flags),
+        render(LEAPFROG, None, flags),
     ]
     return "".join(parts)
+
+
+def legendre_plus_source(flags: dict[str, bool]) -> str:
+    """FL⁺ of a solved step, for one sample."""
+    return render(ACTION_LEGENDRE_PLUS if flags["full"] else LEGENDRE_PLUS, _names_of_K(flags), flags)
 
 
 def _constants(model: ContactLagrangian, dtype: str) -> str:
@@ -134,7 +196,9 @@ def _constants(model: ContactLagrangian, dtype: str) -> str:
     config, damping = model.config, model.damping
     owner = [i for i, angle in enumerate(config.angles) for _ in range(2 if angle else 1)]
     angle = [float(config.angles[i]) for i in owner]
-    mass = model.kinetic.mass().detach().cpu().double()
+    kinetic = model.kinetic if isinstance(model.kinetic, Kinetic) else model.kinetic.constant
+    mass = kinetic.mass().detach().cpu().double()
+    rate = 0.0 if damping is None else float(damping.rate)
     lines = [
         "",
         "/* Features of the position: sin q, cos q of an angle, q / scale of another coordinate. */",
@@ -143,15 +207,54 @@ def _constants(model: ContactLagrangian, dtype: str) -> str:
         f"static const real NAME_angle[NAME_FEATURES] = {{{numbers(angle, dtype)}}};",
         f"static const real NAME_speed[NAME_N] = {{{numbers(config.speed, dtype)}}};",
         f"static const real NAME_energy = {number(sum(v * v for v in config.speed), dtype)};",
-        f"static const real NAME_rate = {number(float(damping.rate), dtype)};",
-        "/* The mass matrix and its inverse, row by row. */",
+        f"static const real NAME_rate = {number(rate, dtype)};",
+        "/* The mass matrix (at q = 0) and its inverse, row by row. */",
         f"static const real NAME_mass[NAME_N * NAME_N] = {{{numbers(mass.reshape(-1).tolist(), dtype)}}};",
         "static const real NAME_inverse_mass[NAME_N * NAME_N] = "
         f"{{{numbers(torch.linalg.inv(mass).reshape(-1).tolist(), dtype)}}};",
     ]
-    if not isinstance(damping, LinearDamping):
-        lines.append(f"static const real NAME_drag[NAME_N] = {{{numbers(damping.drag.tolist(), dtype)}}};")
+    vectors = {"drag": damping.drag} if isinstance(damping, AffineDamping) else {}
+    if model.friction is not None:
+        vectors |= _friction_constants(model.friction)
+    if isinstance(model.kinetic, PositionKinetic):
+        vectors |= _mass_constants(model.kinetic)
+    if model.action is not None:
+        lines.append(f"enum {{ NAME_UNITS = {len(model.action.rate)} }};  /* of the flow of s */")
+        slope = model.action.log_slope.exp() / model.action.size
+        vectors |= {"action_rate": model.action.rate, "action_slope": slope}
+        vectors |= {"action_weight": model.action.weight, "action_bias": model.action.bias}
+    for name, values in vectors.items():
+        words = numbers(values.reshape(-1).tolist(), dtype)
+        lines.append(f"static const real NAME_{name}[{values.numel()}] = {{{words}}};")
     return "\n".join(lines) + "\n"
+
+
+def _names_of_K(flags: dict[str, bool]) -> dict[str, str]:
+    return POSITION_MASS if flags["mass"] else CONSTANT_MASS
+
+
+def _of_phase(net: Network, dof: int) -> Network:
+    """A network of the position as one of position and velocity, which it does not look at."""
+    net = copy.deepcopy(net)
+    first = net.weights[0].detach()
+    net.weights[0] = nn.Parameter(torch.cat([first, first.new_zeros(len(first), dof)], 1))
+    return net
+
+
+def _mass_constants(kinetic: PositionKinetic) -> dict[str, Tensor]:
+    """The factor C̄ of the mass at q = 0, and what the network gives there."""
+    return {
+        "mass_factor": kinetic.constant.factor(),
+        "mass_origin": kinetic.network(Jet(kinetic.origin[None], 0, 1)).value,
+    }
+
+
+def _friction_constants(friction: Friction) -> dict[str, Tensor]:
+    vectors: dict[str, Tensor] = {"viscous": friction.viscous}
+    if friction.dry:
+        vectors |= {"coulomb": friction.coulomb, "breakaway": friction.breakaway}
+        vectors |= {"per_smooth": (-friction.log_smooth).exp(), "per_stribeck": (-friction.log_stribeck).exp()}
+    return {**vectors, "input_map": friction.input_map} if friction.inputs else vectors
 
 
 def _position_features(model: ContactLagrangian, dtype: str) -> str:
@@ -164,7 +267,7 @@ def _position_features(model: ContactLagrangian, dtype: str) -> str:
             f += 2
         else:
             scale = number(model.config.scale[i], dtype)
-            lines += [f"x[{f}] = q[{i}] / {scale};", f"bend[{f}] = R(1.0) / {scale};"]
+            lines += [f"x[{f}] = q[{i}] / {scale};", f"bend[{f}] = R(1.0) / {scale} + SPREAD(0.0);"]
             f += 1
     head = "static inline void NAME_position_features(const real q[NAME_N], real *x, real bend[NAME_FEATURES]) {\n"
     return "\n/* The features x of a position and their derivatives. */\n" + head + _indented(lines) + "}\n"

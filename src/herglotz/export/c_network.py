@@ -1,143 +1,182 @@
-"""The networks of a model as C: vectorisable tanh, weights, value, gradient and its tangents."""
+"""The networks of a model as C: weights, value, gradient and its tangents."""
 
 from __future__ import annotations
 
 from itertools import pairwise
-from math import factorial
 
 from torch import Tensor
 
 from herglotz.export.c_template import numbers, render
 from herglotz.models.network import Network
 
-# (largest |2x|, ln 2 in two parts, exponent bias, mantissa bits, terms of the series) of each type
-_TANH = {
-    "float64": ("40.0", "6.93147180369123816490e-01", "1.90821492927058770002e-10", 1023, 52, 13),
-    "float32": ("20.0", "6.93359375e-01", "-2.12194440e-04", 127, 23, 7),
-}
-
-_ARITHMETIC = """
-/* tanh x = e / (e + 2) with e = exp(2x) - 1 = 2^k (exp(r) - 1) + 2^k - 1 and |r| <= ln(2)/2: a few units in the last
-   place, and without branches or calls, so that compilers vectorise loops of it. Needs IEEE 754 numbers. NaN stays. */
-static inline real NAME_tanh(real x) {
-  union { real f; @BITS@ i; } two;
-  real y = R(2.0) * x, r, e;
-  int k;
-  y = y > R(@LIMIT@) ? R(@LIMIT@) : y;
-  y = y < R(-@LIMIT@) ? R(-@LIMIT@) : y;
-  r = y == y ? y * R(1.44269504088896340736) : R(0.0);
-  k = (int)(r + (r < R(0.0) ? R(-0.5) : R(0.5)));
-  r = (y - (real)k * R(@HIGH@)) - (real)k * R(@LOW@);
-  e = R(@LAST@);
-@SERIES@
-  e = r + r * r * e;
-  two.i = (@BITS@)(k + @BIAS@) << @MANTISSA@;
-  e = two.f * e + (two.f - R(1.0));
-  return e / (e + R(2.0));
-}
-
-/* y_k += sum_j w_jk x_j where k runs fastest: nothing is summed across lanes. With GCC's and clang's vector
-   types sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
-static inline void NAME_product(int inputs, int outputs, const real *w, const real *x, real *NAME_RESTRICT y) {
+PRODUCT = """
+/* y_k += sum_j w_jk x_j, where w is (inputs, outputs) and t its transpose. Long rows of outputs are summed side by
+   side, without sums across lanes; a few outputs of many inputs are dot products. With GCC's and clang's vector types
+   sums stay in registers: left alone, some compilers vectorise the wrong loop and lose a factor of ten. */
+static inline void NAME_product(int inputs, int outputs, const real *w, const real *t, const real *x,
+    real *NAME_RESTRICT y) {
   int j, k = 0;
 #ifdef __GNUC__
-  typedef real lanes __attribute__((vector_size(32), aligned(sizeof(real)), may_alias));
-  enum { L = (int)(32 / sizeof(real)) };
+  enum { L = NAME_LANES };
   for (; k + 4 * L <= outputs; k += 4 * L) {
-    lanes *to = (lanes *)(y + k), a = to[0], b = to[1], c = to[2], d = to[3];
-    for (j = 0; j < inputs; j++) {
-      const lanes *from = (const lanes *)(w + j * outputs + k);
+    NAME_part *to = (NAME_part *)(y + k);
+    NAME_lanes a = to[0], b = to[1], c = to[2], d = to[3];
+    NAME_lanes e = NAME_spread(R(0.0)), f = e, g = e, o = e;
+    for (j = 0; j + 2 <= inputs; j += 2) {
+      const NAME_part *from = (const NAME_part *)(w + j * outputs + k);
+      const NAME_part *next = (const NAME_part *)(w + (j + 1) * outputs + k);
+      a += from[0] * x[j];
+      b += from[1] * x[j];
+      c += from[2] * x[j];
+      d += from[3] * x[j];
+      e += next[0] * x[j + 1];
+      f += next[1] * x[j + 1];
+      g += next[2] * x[j + 1];
+      o += next[3] * x[j + 1];
+    }
+    if (j < inputs) {
+      const NAME_part *from = (const NAME_part *)(w + j * outputs + k);
       a += from[0] * x[j];
       b += from[1] * x[j];
       c += from[2] * x[j];
       d += from[3] * x[j];
     }
-    to[0] = a;
-    to[1] = b;
-    to[2] = c;
-    to[3] = d;
+    to[0] = a + e;
+    to[1] = b + f;
+    to[2] = c + g;
+    to[3] = d + o;
   }
   for (; k + L <= outputs; k += L) {
-    lanes *to = (lanes *)(y + k), a = to[0];
-    for (j = 0; j < inputs; j++) a += *(const lanes *)(w + j * outputs + k) * x[j];
-    to[0] = a;
+    NAME_part *to = (NAME_part *)(y + k);
+    NAME_lanes a = to[0], b = NAME_spread(R(0.0)), c = b, d = b;
+    const real *from = w + k;
+    for (j = 0; j + 4 <= inputs; j += 4, from += 4 * outputs) {
+      a += *(const NAME_part *)from * x[j];
+      b += *(const NAME_part *)(from + outputs) * x[j + 1];
+      c += *(const NAME_part *)(from + 2 * outputs) * x[j + 2];
+      d += *(const NAME_part *)(from + 3 * outputs) * x[j + 3];
+    }
+    for (; j < inputs; j++, from += outputs) a += *(const NAME_part *)from * x[j];
+    to[0] = (a + b) + (c + d);
+  }
+  if (inputs >= L) {
+    const real *row = t + k * inputs;
+    for (; k < outputs; k++, row += inputs) {
+      NAME_lanes sum = NAME_spread(R(0.0));
+      int half, i;
+      for (j = 0; j + L <= inputs; j += L) sum += *(const NAME_part *)(row + j) * *(const NAME_part *)(x + j);
+      for (half = L / 2; half > 0; half /= 2)
+        for (i = 0; i < half; i++) sum[i] += sum[i + half];
+      for (; j < inputs; j++) sum[0] += row[j] * x[j];
+      y[k] += sum[0];
+    }
   }
 #endif
-  for (; k < outputs; k++)
-    for (j = 0; j < inputs; j++) y[k] += w[j * outputs + k] * x[j];
+  (void)t;
+  for (; k < outputs; k++) {
+    real sum = y[k];
+    for (j = 0; j < inputs; j++) sum += w[j * outputs + k] * x[j];
+    y[k] = sum;
+  }
+}
+"""
+
+WIDE_PRODUCT = """
+/* The same for a register of samples: eight sums at a time stay in registers. */
+static inline void NAME_wide_product(int inputs, int outputs, const real *w, const real *t, const NAME_lanes *x,
+    NAME_lanes *NAME_RESTRICT y) {
+  int j, k = 0;
+  (void)t;
+  for (; k + 8 <= outputs; k += 8) {
+    NAME_lanes a = y[k], b = y[k + 1], c = y[k + 2], d = y[k + 3];
+    NAME_lanes e = y[k + 4], f = y[k + 5], g = y[k + 6], o = y[k + 7];
+    for (j = 0; j < inputs; j++) {
+      const real *from = w + j * outputs + k;
+      const NAME_lanes v = x[j];
+      a += from[0] * v;
+      b += from[1] * v;
+      c += from[2] * v;
+      d += from[3] * v;
+      e += from[4] * v;
+      f += from[5] * v;
+      g += from[6] * v;
+      o += from[7] * v;
+    }
+    y[k] = a;
+    y[k + 1] = b;
+    y[k + 2] = c;
+    y[k + 3] = d;
+    y[k + 4] = e;
+    y[k + 5] = f;
+    y[k + 6] = g;
+    y[k + 7] = o;
+  }
+  for (; k < outputs; k++) {
+    NAME_lanes sum = y[k];
+    for (j = 0; j < inputs; j++) sum += w[j * outputs + k] * x[j];
+    y[k] = sum;
+  }
 }
 """
 
 _HEAD = """
 /* The @WHICH@ network of @M@ features x: value, gradient dx{%if tangents}, and the derivatives ddx of that gradient
    along `count` directions tx{%end}: forward, then backward through the layers. */
-static inline void NAME_@WHICH@_network(const real x[@M@], real *value, real dx[@M@]{%if tangents},
+static inline void NAME_@WHICH@_network({%if several}int out, {%end}const real x[@M@],
+    real *value, real dx[@M@]{%if tangents},
     int count, real tx[NAME_N][@M@], real ddx[NAME_N][@M@]{%end}) {
 """
 
 
-def arithmetic(dtype: str) -> str:
-    """`tanh` and the parts of a matrix product in C for one number type."""
-    limit, high, low, bias, mantissa, terms = _TANH[dtype]
-    series = "\n".join(f"  e = e * r + R({1 / factorial(k)!r});" for k in range(terms - 1, 1, -1))
-    values = {
-        "BITS": "unsigned long long" if dtype == "float64" else "unsigned int",
-        "LIMIT": limit,
-        "HIGH": high,
-        "LOW": low,
-        "LAST": repr(1 / factorial(terms)),
-        "SERIES": series,
-        "BIAS": str(bias),
-        "MANTISSA": str(mantissa),
-    }
-    return render(_ARITHMETIC, values)
-
-
-def network(which: str, net: Network, dtype: str, *, tangents: bool) -> str:
-    """Weights (in both layouts) and the function NAME_`which`_network."""
-    weights = [w.detach().cpu().double() for w in net.weights]
-    biases = [b.detach().cpu().double() for b in net.biases]
-    depth, m = len(biases), weights[0].shape[1]
+def weights(which: str, net: Network, dtype: str) -> str:
+    """The weights of a network in both layouts, as C constants."""
+    matrices = [w.detach().cpu().double() for w in net.weights]
     parts = [f"\n/* Weights of the {which} network: w is (outputs, inputs), t its transpose. */\n"]
-    for layer in range(depth):
+    for layer, bias in enumerate(net.biases):
         parts += [
-            _array(f"NAME_{which}_w{layer}", weights[layer], dtype),
-            _array(f"NAME_{which}_t{layer}", weights[layer].T, dtype),
-            _array(f"NAME_{which}_b{layer}", biases[layer], dtype),
+            _array(f"NAME_{which}_w{layer}", matrices[layer], dtype),
+            _array(f"NAME_{which}_t{layer}", matrices[layer].T, dtype),
+            _array(f"NAME_{which}_b{layer}", bias.detach().cpu().double(), dtype),
         ]
-    parts.append(_array(f"NAME_{which}_last", weights[depth], dtype))
-    parts.append(render(_HEAD, {"WHICH": which, "M": str(m)}, {"tangents": tangents}))
-    parts.append(_body(which, [m] + [len(b) for b in biases], tangents))
+    parts.append(_array(f"NAME_{which}_last", matrices[-1], dtype))
     return "".join(parts)
 
 
-def _body(which: str, sizes: list[int], tangents: bool) -> str:
+def network(which: str, net: Network, activation: str, *, tangents: bool, several: bool = False) -> str:
+    """The function NAME_`which`_network, as a template; with `several` outputs it gives the one of number `out`."""
+    m = net.weights[0].shape[1]
+    head = render(_HEAD, {"WHICH": which, "M": str(m)}, {"tangents": tangents, "several": several})
+    return head + _body(which, [m] + [len(b) for b in net.biases], activation, tangents, several)
+
+
+def _body(which: str, sizes: list[int], activation: str, tangents: bool, several: bool) -> str:
     """Forward and backward through the layers, written out; sizes = (features, width, ..., width)."""
     depth = len(sizes) - 1
-    depth = len(sizes) - 1
     top, last = depth - 1, sizes[-1]
+    weight = f"NAME_{which}_last[out * {last} + k]" if several else f"NAME_{which}_last[k]"
     C: list[str] = []
     for k, size in enumerate(sizes[1:]):
-        C.append(f"real a{k}[{size}], u{k}[{size}], g{k}[{size}];  /* activation, its adjoint, its argument's */")
+        C.append(f"real a{k}[{size}], f{k}[{size}], u{k}[{size}], g{k}[{size}];  /* value, slope, adjoints of both */")
         if tangents:
-            below_top = "" if k == top else f" tu{k}[{size}],"
-            C.append(f"real ta{k}[{size}],{below_top} tg{k}[{size}];  /* their derivatives */")
-    C += ["int k;", "real sum = R(0.0);"]
+            inner = "" if k == top else f", ta{k}[{size}], tu{k}[{size}]"
+            C.append(f"real e{k}[{size}], tz{k}[{size}], tg{k}[{size}]{inner};")
+    C += ["int k;", "real sum = SPREAD(0.0);"]
     if tangents:
         C.append("int j;")
     for layer, (a, b) in enumerate(pairwise(sizes)):
         below = "x" if layer == 0 else f"a{layer - 1}"
-        C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_{which}_b{layer}[k];")
+        C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_{which}_b{layer}[k] + SPREAD(0.0);")
         C.append(_product(a, b, f"NAME_{which}_t{layer}", below, f"a{layer}"))
-        C.append(f"for (k = 0; k < {b}; k++) a{layer}[k] = NAME_tanh(a{layer}[k]);")
-    C.append(f"for (k = 0; k < {last}; k++) sum += NAME_{which}_last[k] * a{top}[k];")
+        bend = f"count > 0 ? e{layer} : 0" if tangents else "0"
+        C.append(f"NAME_activate_{activation}({b}, a{layer}, f{layer}, {bend});")
+    C.append(f"for (k = 0; k < {last}; k++) sum += {weight} * a{top}[k];")
     C.append("*value = sum;")
-    C.append(f"for (k = 0; k < {last}; k++) u{top}[k] = NAME_{which}_last[k];")
+    C.append(f"for (k = 0; k < {last}; k++) u{top}[k] = {weight} + SPREAD(0.0);")
     for layer in reversed(range(depth)):
         a, b = sizes[layer], sizes[layer + 1]
         below = "dx" if layer == 0 else f"u{layer - 1}"
-        C.append(f"for (k = 0; k < {b}; k++) g{layer}[k] = u{layer}[k] * (R(1.0) - a{layer}[k] * a{layer}[k]);")
-        C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
+        C.append(f"for (k = 0; k < {b}; k++) g{layer}[k] = u{layer}[k] * f{layer}[k];")
+        C.append(f"for (k = 0; k < {a}; k++) {below}[k] = SPREAD(0.0);")
         C.append(_product(b, a, f"NAME_{which}_w{layer}", f"g{layer}", below))
     if tangents:
         C.append("for (j = 0; j < count; j++) {")
@@ -147,28 +186,29 @@ def _body(which: str, sizes: list[int], tangents: bool) -> str:
 
 
 def _tangents(which: str, sizes: list[int]) -> list[str]:
-    """Along direction j: a′ = (1 − a²) (W a′ of the layer below), then g = u (1 − a²) gives u′ (1 − a²) − 2 a a′ u."""
+    """Along direction j: z′ = W a′ of the layer below, a′ = f z′; then g = u f gives g′ = u′ f + u e z′."""
     C: list[str] = []
     top = len(sizes) - 2
     for layer, (a, b) in enumerate(pairwise(sizes)):
         below = "tx[j]" if layer == 0 else f"ta{layer - 1}"
-        C.append(f"for (k = 0; k < {b}; k++) ta{layer}[k] = R(0.0);")
-        C.append(_product(a, b, f"NAME_{which}_t{layer}", below, f"ta{layer}"))
-        C.append(f"for (k = 0; k < {b}; k++) ta{layer}[k] *= R(1.0) - a{layer}[k] * a{layer}[k];")
+        C.append(f"for (k = 0; k < {b}; k++) tz{layer}[k] = SPREAD(0.0);")
+        C.append(_product(a, b, f"NAME_{which}_t{layer}", below, f"tz{layer}"))
+        if layer < top:
+            C.append(f"for (k = 0; k < {b}; k++) ta{layer}[k] = tz{layer}[k] * f{layer}[k];")
     for layer in reversed(range(top + 1)):
         a, b = sizes[layer], sizes[layer + 1]
         below = "ddx[j]" if layer == 0 else f"tu{layer - 1}"
-        first = "" if layer == top else f"tu{layer}[k] * (R(1.0) - a{layer}[k] * a{layer}[k]) "
-        C.append(f"for (k = 0; k < {b}; k++)")
-        C.append(f"  tg{layer}[k] = {first}- R(2.0) * a{layer}[k] * ta{layer}[k] * u{layer}[k];")
-        C.append(f"for (k = 0; k < {a}; k++) {below}[k] = R(0.0);")
+        first = "" if layer == top else f"tu{layer}[k] * f{layer}[k] + "
+        C.append(f"for (k = 0; k < {b}; k++) tg{layer}[k] = {first}u{layer}[k] * e{layer}[k] * tz{layer}[k];")
+        C.append(f"for (k = 0; k < {a}; k++) {below}[k] = SPREAD(0.0);")
         C.append(_product(b, a, f"NAME_{which}_w{layer}", f"tg{layer}", below))
     return C
 
 
 def _product(inputs: int, outputs: int, w: str, x: str, y: str) -> str:
-    """Y += x w for a matrix w of (inputs, outputs)."""
-    return f"NAME_product({inputs}, {outputs}, {w}, {x}, {y});"
+    """Y += x w for a matrix w of (inputs, outputs); the other layout goes with it (less than ten layers)."""
+    t = w[:-2] + {"t": "w", "w": "t"}[w[-2]] + w[-1]
+    return f"NAME_product({inputs}, {outputs}, {w}, {t}, {x}, {y});"
 
 
 def _array(name: str, values: Tensor, dtype: str) -> str:

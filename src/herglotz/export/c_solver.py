@@ -67,9 +67,10 @@ static inline int NAME_solve(const NAME_problem *P, NAME_terms *t, real *residua
   real delta[NAME_N], next[NAME_N], q1[NAME_N], scale, merit, length = R(1.0), size;
   int i, iteration, exact = 1;
   *residual = R(0.0);
+  for (i = 0; i < NAME_N; i++) t->rest[i] = trial.rest[i] = R(0.0);
   NAME_evaluate(P, 2, t);
   merit = NAME_length(t->F);
-  if (!NAME_finite(merit)) return NAME_DIVERGED;
+  if (!NAME_all_finite(t->F)) return NAME_DIVERGED;
   if (NAME_factorise(t->J, &A)) return NAME_SINGULAR;
   NAME_direction(&A, t->F, delta);
   for (i = 0; i < NAME_N; i++) q1[i] = P->q0[i] + t->move[i];
@@ -82,13 +83,16 @@ static inline int NAME_solve(const NAME_problem *P, NAME_terms *t, real *residua
     real trial_merit, trial_size;
     int order;
     *residual = size = NAME_length(delta);
-    if (!NAME_finite(size)) return NAME_SINGULAR;
-    if (size <= NAME_tolerance * scale) return NAME_CONVERGED;
+    if (!NAME_all_finite(delta)) return NAME_SINGULAR;
+    if (size <= NAME_tolerance * scale) {
+      for (i = 0; i < NAME_N; i++) t->rest[i] = delta[i];
+      return NAME_CONVERGED;
+    }
     order = length == R(1.0) && size <= NAME_near * scale ? 1 : 2;
     for (i = 0; i < NAME_N; i++) trial.move[i] = t->move[i] + length * delta[i];
     NAME_evaluate(P, order, &trial);
     trial_merit = NAME_length(trial.F);
-    if (trial_merit <= (R(1.0) - R(1e-4) * length) * merit) {
+    if (NAME_all_finite(trial.F) && trial_merit <= (R(1.0) - R(1e-4) * length) * merit) {
       int kept = order == 1;
       if (kept) {
         NAME_direction(&A, trial.F, next);
@@ -124,13 +128,28 @@ static inline int NAME_solve(const NAME_problem *P, NAME_terms *t, real *residua
 {%end}
 """
 
-ADVANCE = """
+LEAPFROG = """
+{%if stiff}
+/* q1 - q0 of a model whose step equation is linear in it: c (p0 - h/2 (V0' - G u)) = sqrt(c) (m + sqrt(c) h/2 b)
+   (q1 - q0) / h, with the inverse of the last matrix. */
+static inline void NAME_leapfrog(const NAME_problem *P, real root, const real inverse[NAME_N * NAME_N],
+    real move[NAME_N]) {
+  int i, j;
+  for (i = 0; i < NAME_N; i++) {
+    move[i] = SPREAD(0.0);
+    for (j = 0; j < NAME_N; j++)
+      move[i] += inverse[i * NAME_N + j] *
+          (P->p0[j] - P->h / R(2.0) * (P->V0.slope[j]{%if inputs} - P->push[j]{%end}));
+    move[i] *= P->h * root;
+  }
+}
+{%else}
 /* q1 - q0 of the model without networks in q1: c p0 - (h/2) c V0' = sqrt(c) m (q1 - q0) / h. */
 {%if baseline}
 static inline void NAME_leapfrog(const NAME_problem *P, real root, real move[NAME_N]) {
   int i, j;
   for (i = 0; i < NAME_N; i++) {
-    move[i] = R(0.0);
+    move[i] = SPREAD(0.0);
     for (j = 0; j < NAME_N; j++)
       move[i] += NAME_inverse_mass[i * NAME_N + j] * (P->p0[j] - P->h / R(2.0) * P->V0.slope[j]);
     move[i] *= P->h * root;
@@ -141,32 +160,100 @@ static inline void NAME_leapfrog(const NAME_problem *P, real root, real move[NAM
   int i;
   (void)P;
   (void)root;
-  for (i = 0; i < NAME_N; i++) move[i] = R(0.0);
+  for (i = 0; i < NAME_N; i++) move[i] = SPREAD(0.0);
 }
 {%end}
+{%end}
+"""
 
-/* What a run of steps carries along: V(q) and, for the guess, the last moves. */
+ADVANCE = """
+{%if stiff}
+/* (m + sqrt(c) h/2 b)^-1, by elimination with exchanged rows; not finite where there is none. */
+static inline void NAME_invert(real h, real root, real inverse[NAME_N * NAME_N]) {
+  real A[NAME_N][2 * NAME_N], pivot;
+  int i, j, k, best;
+  for (i = 0; i < NAME_N; i++)
+    for (j = 0; j < NAME_N; j++) {
+      A[i][j] = NAME_mass[i * NAME_N + j] + (i == j ? root * h / R(2.0) * NAME_viscous[i] : R(0.0));
+      A[i][NAME_N + j] = i == j ? R(1.0) : R(0.0);
+    }
+  for (k = 0; k < NAME_N; k++) {
+    for (best = k, i = k + 1; i < NAME_N; i++)
+      if (FABS(A[i][k]) > FABS(A[best][k])) best = i;
+    pivot = A[best][k];
+    for (j = 0; j < 2 * NAME_N; j++) {
+      const real other = A[best][j] / pivot;
+      A[best][j] = A[k][j];
+      A[k][j] = other;
+    }
+    for (i = 0; i < NAME_N; i++) {
+      const real factor = A[i][k];
+      if (i != k)
+        for (j = 0; j < 2 * NAME_N; j++) A[i][j] -= factor * A[k][j];
+    }
+  }
+  for (i = 0; i < NAME_N; i++)
+    for (j = 0; j < NAME_N; j++) inverse[i * NAME_N + j] = A[i][NAME_N + j];
+}
+
+{%end}
+/* What a run of steps carries along: V(q), what rounding took from q, p, s and sigma in the additions so far, and, for
+   the guess, the last moves. */
 typedef struct {
   NAME_potential_t V;
-  real move[3][NAME_N], h, root, miss[2];
+  real low_q[NAME_N], low_p[NAME_N], low_s, low_sigma, h, root;
+{%if linear}
+  real E;
+{%if stiff}
+  real inverse[NAME_N * NAME_N];
+{%end}
+{%else}
+  real move[3][NAME_N], miss[2];
   int known;
+{%end}
 } NAME_track;
 
 static inline void NAME_track_start(const NAME_state *state, NAME_track *track) {
   int i;
-  for (i = 0; i < NAME_N; i++) track->move[0][i] = track->move[1][i] = track->move[2][i] = R(0.0);
   NAME_potential(state->q, &track->V);
-  track->h = R(0.0);
+  for (i = 0; i < NAME_N; i++) track->low_q[i] = track->low_p[i] = R(0.0);
+  track->low_s = track->low_sigma = track->h = track->root = R(0.0);
+{%if linear}
+  track->E = R(0.0);
+{%if stiff}
+  for (i = 0; i < NAME_N * NAME_N; i++) track->inverse[i] = R(0.0);
+{%end}
+{%else}
+  for (i = 0; i < NAME_N; i++) track->move[0][i] = track->move[1][i] = track->move[2][i] = R(0.0);
   track->known = 0;
   track->miss[0] = track->miss[1] = R(0.0);
+{%end}
+}
+
+{%if inputs}
+/* G u; no inputs where u is null. */
+static inline void NAME_push(const real *u, real push[NAME_N]) {
+  int i, j;
+  for (i = 0; i < NAME_N; i++)
+    for (push[i] = R(0.0), j = 0; u && j < NAME_M; j++) push[i] += NAME_input_map[i * NAME_M + j] * u[j];
+}
+{%end}
+
+/* x + change, with what its rounding loses kept in `low` for the next time. */
+static inline real NAME_add(real x, real change, real *low) {
+  const real add = change + *low, sum = x + add, back = sum - x;
+  *low = (x - (sum - back)) + (add - back);
+  return NAME_flush(sum);
 }
 
 /* One step of a run: NAME_step without its checks of the input, faster by what `track` carries. Start the track again
    whenever anything but this function has changed the state. */
-static inline int NAME_advance(NAME_state *state, NAME_track *track, real h, real *residual) {
+static inline int NAME_advance(NAME_state *state, NAME_track *track, real h,
+    {%if inputs}const real *u, {%end}real *residual) {
   NAME_problem P;
   NAME_terms t;
-  NAME_state next;
+  NAME_potential_t V1;
+  real q1[NAME_N], low[NAME_N], dp[NAME_N], ds, sum = R(0.0);
   int i, status = NAME_CONVERGED;
   for (i = 0; i < NAME_N; i++) {
     P.q0[i] = state->q[i];
@@ -175,26 +262,45 @@ static inline int NAME_advance(NAME_state *state, NAME_track *track, real h, rea
   P.s0 = state->s;
   P.h = h;
   P.V0 = track->V;
+{%if inputs}
+  NAME_push(u, P.push);
+{%end}
+  *residual = R(0.0);
+{%if linear}
   if (h != track->h) {
     track->h = h;
     track->root = EXP(R(-0.5) * NAME_rate * h);
-    track->known = 0;
+    track->E = EXPM1(-NAME_rate * h);
+{%if stiff}
+    NAME_invert(h, track->root, track->inverse);
+{%end}
   }
-{%if linear}
+  t.E = track->E;
   t.root = track->root;
-  t.c = t.root * t.root;
-  NAME_leapfrog(&P, t.root, t.move);
-  *residual = R(0.0);
+  t.c = R(1.0) + t.E;
   t.K = R(0.0);
-  for (i = 0; i < NAME_N; i++) {  /* m (q1 - q0) / h, from the equation instead of the rounded move */
-    t.momentum[i] = t.root * (P.p0[i] - h / R(2.0) * P.V0.slope[i]);
-    t.K += t.momentum[i] * t.move[i] / R(2.0);
-    next.q[i] = state->q[i] + t.move[i];
+{%if stiff}
+  NAME_leapfrog(&P, t.root, track->inverse, t.move);
+  NAME_friction(&P, &t);
+  for (i = 0; i < NAME_N * NAME_N; i++)
+    t.K += NAME_mass[i] * t.move[i / NAME_N] * t.move[i % NAME_N] / (R(2.0) * h);
+{%else}
+  NAME_leapfrog(&P, t.root, t.move);
+  for (i = 0; i < NAME_N; i++) t.K += t.root * (P.p0[i] - h / R(2.0) * P.V0.slope[i]) * t.move[i] / R(2.0);
+{%end}
+  for (i = 0; i < NAME_N; i++) {
+    low[i] = track->low_q[i];
+    q1[i] = NAME_add(P.q0[i], t.move[i], &low[i]);
   }
 {%else}
   {
     real guess[2][NAME_N], miss;
     int j, better;
+    if (h != track->h) {
+      track->h = h;
+      track->root = EXP(R(-0.5) * NAME_rate * h);
+      track->known = 0;
+    }
     NAME_leapfrog(&P, track->root, guess[0]);
     for (i = 0; i < NAME_N; i++)  /* the cubic through the last four positions */
       guess[1][i] = R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
@@ -211,18 +317,26 @@ static inline int NAME_advance(NAME_state *state, NAME_track *track, real h, rea
     for (i = 0; i < NAME_N; i++) {
       track->move[2][i] = track->move[1][i];
       track->move[1][i] = track->move[0][i];
-      track->move[0][i] = t.move[i];
-      next.q[i] = state->q[i] + t.move[i];
+      track->move[0][i] = t.move[i] + t.rest[i];
+      low[i] = track->low_q[i];
+      q1[i] = NAME_add(P.q0[i], track->move[0][i], &low[i]);
     }
     if (track->known < 3) track->known++;
   }
 {%end}
-  NAME_potential(next.q, &track->V);
-  NAME_legendre_plus(&P, &t, &track->V, next.p, &next.s);
-  next.sigma = state->sigma * t.c;
-  if (!NAME_finite(NAME_length(next.q) + NAME_length(next.p) + next.s)) return NAME_DIVERGED;
+  NAME_potential(q1, &V1);
+  NAME_increments(&P, &t, &V1, dp, &ds);
+  for (i = 0; i < NAME_N; i++) sum += FABS(t.move[i]) + FABS(dp[i]) + FABS(q1[i]);
+  if (!NAME_finite(sum + FABS(ds))) return NAME_DIVERGED;
   if (!(t.c > R(0.0))) return NAME_SINGULAR;
-  *state = next;
+  for (i = 0; i < NAME_N; i++) {
+    state->q[i] = q1[i];
+    track->low_q[i] = low[i];
+    state->p[i] = NAME_add(P.p0[i], dp[i], &track->low_p[i]);
+  }
+  state->s = NAME_add(P.s0, ds, &track->low_s);
+  state->sigma = NAME_add(state->sigma, t.E * state->sigma, &track->low_sigma);
+  track->V = V1;
   return status;
 }
 """

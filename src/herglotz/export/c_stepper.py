@@ -6,6 +6,7 @@ import ctypes
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,7 +15,7 @@ from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
 from herglotz.export.c_wrapper import build
-from herglotz.export.inputs import check_state, checked_h
+from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Rollout, State, Status, Step, step_sizes
 
@@ -43,23 +44,31 @@ class CompiledStepper:
         self.dof: int = self.metadata["dof"]
         self.dtype: torch.dtype = getattr(torch, self.metadata["dtype"])
         self.h: float = self.metadata["h"]
-        self._library = build(header, self.metadata["name"], self.metadata["dtype"])
+        self.inputs: int = self.metadata["inputs"]
+        name, dtype = self.metadata["name"], self.metadata["dtype"]
+        self._library = build(header, name, dtype, inputs=self.inputs > 0)
 
-    def init(self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0) -> State:
+    def init(
+        self,
+        q0: Tensor,
+        q1: Tensor,
+        s0: Tensor | None = None,
+        h: Tensor | float = 1.0,
+        u: Tensor | None = None,
+    ) -> State:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. NaN where it is not finite."""
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0)
-        h = checked_h(h, self.dtype).expand(s0.shape).contiguous()
-        p, s = (
-            torch.full_like(q0, torch.nan, memory_format=torch.contiguous_format),
-            torch.full(s0.shape, torch.nan, dtype=self.dtype),
-        )
+        h = spread_h(self._checked_h(h), s0).contiguous()
+        u = self._inputs(u, s0.shape)
+        p = torch.full(q0.shape, torch.nan, dtype=self.dtype)
+        s = torch.full(s0.shape, torch.nan, dtype=self.dtype)
         status = torch.zeros(s0.shape, dtype=torch.uint8)
-        inputs = [x.contiguous() for x in (q0, q1, s0)]
-        self._call("herglotz_inits", s0.numel(), *inputs, h, 1, p, s, status)
+        starts = [x.contiguous() for x in (q0, q1, s0)]
+        self._call("herglotz_inits", s0.numel(), *starts, h, 1, u, self.inputs, p, s, status)
         return State(q1, p, s)
 
-    def step(self, state: State, h: Tensor | float) -> Step:
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step.
 
         Parameters
@@ -68,6 +77,10 @@ class CompiledStepper:
             (q, p, s) with shapes (..., n), (..., n), (...), in the dtype of the header.
         h
             Time step > 0, scalar or (...).
+        guess
+            Taken for the sake of `Stepper`'s signature; the header has its own guess.
+        u
+            (m,) or (..., m) input of this step, for a model with inputs; None: no input acts.
 
         Returns
         -------
@@ -79,14 +92,27 @@ class CompiledStepper:
         InputError
             If a shape, the dtype or a value is not what the header takes.
         """
+        del guess
         q, p, s = state
         self._check(q, p, s)
-        h = checked_h(h, self.dtype)
-        out = self._rollout(q, p, s, _expand(h, s)[..., None])
+        h = spread_h(self._checked_h(h), s)[..., None]
+        out = self._rollout(q, p, s, h, None if u is None else u.expand(*s.shape, u.shape[-1])[..., None, :])
         return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS)
 
     def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        inputs: Tensor | None = None,
+        every: int = 1,
+        events: Sequence[Any] = (),
+        checkpoint: int | None = None,
+        chunk: int = 1024,
+        u: Tensor | None = None,
     ) -> Rollout:
         """Step K times from (q, p, s); everything after a failed step is NaN.
 
@@ -97,17 +123,35 @@ class CompiledStepper:
         h
             A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
         steps
-            K; needed for a scalar h only.
+            K; needed for a scalar h without inputs only.
+        inputs
+            (K, m) or (..., K, m): u_k of each step, for a model with inputs. `u` is the same by the name that the other
+            exported steppers have for it.
+        every
+            Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
+        events
+            Refused: they need `Stepper`.
+        checkpoint, chunk
+            Taken for the sake of `Stepper`'s signature; nothing is differentiated or gathered here.
 
         Raises
         ------
         InputError
-            As `step`, and if the length of h and `steps` disagree.
+            As `step`, and if lengths disagree.
         """
+        del checkpoint, chunk
+        inputs = u if inputs is None else inputs
+        if events:
+            raise InputError("a compiled stepper has no events; use herglotz.Stepper")
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, p, s)
-        h = step_sizes(checked_h(h, self.dtype), steps)
-        return self._rollout(q, p, s, h)
+        if inputs is not None and inputs.ndim > 1 and steps is None and torch.as_tensor(h).ndim == 0:
+            steps = inputs.shape[-2]
+        h = step_sizes(self._checked_h(h), steps)
+        if every < 1 or h.shape[-1] % every:
+            raise InputError(f"every must divide the number of steps, got {every} and {h.shape[-1]}")
+        out = self._rollout(q, p, s, h, inputs)
+        return out if every == 1 else _decimated(out, every)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
@@ -123,22 +167,40 @@ class CompiledStepper:
         self._call("herglotz_outside_box", state.s.numel(), *(x.contiguous() for x in state), out)
         return out.bool()
 
-    def _rollout(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> Rollout:
-        """Steps of h (K,) or (..., K)."""
+    def _rollout(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None) -> Rollout:
+        """Steps of h (K,) or (..., K), with inputs (K, m) or (..., K, m)."""
         batch, steps = s.shape, h.shape[-1]
         shared = h.ndim == 1
-        h = h.contiguous() if shared else _expand(h, s[..., None]).contiguous()
+        h = h.contiguous() if shared else spread_h(h, s[..., None].expand(*batch, steps)).contiguous()
+        common = u is not None and u.ndim == 2
+        u = self._inputs(u, (steps,) if common else (*batch, steps))
         q_out, p_out = (torch.full((*batch, steps + 1, self.dof), torch.nan, dtype=self.dtype) for _ in "qp")
         s_out, sigma = (torch.full((*batch, steps + 1), torch.nan, dtype=self.dtype) for _ in range(2))
         residual = torch.full((*batch, steps), torch.nan, dtype=self.dtype)
         status = torch.full((*batch, steps), int(Status.DIVERGED), dtype=torch.uint8)
-        inputs = [x.contiguous() for x in (q, p, s)]
+        starts = [x.contiguous() for x in (q, p, s)]
+        h_stride, u_stride = 0 if shared else steps, 0 if common else steps * self.inputs
         outputs = (q_out, p_out, s_out, sigma, status, residual)
-        self._call("herglotz_rollouts", s.numel(), steps, *inputs, h, 0 if shared else steps, 1, *outputs)
+        self._call("herglotz_rollouts", s.numel(), steps, *starts, h, h_stride, 1, u, u_stride, *outputs)
         return Rollout(q_out, p_out, s_out, sigma, status, residual)
 
-    def _call(self, function: str, *arguments: Tensor | int) -> None:
-        converted = (ctypes.c_void_p(x.data_ptr()) if isinstance(x, Tensor) else ctypes.c_long(x) for x in arguments)
+    def _inputs(self, u: Tensor | None, shape: tuple[int, ...]) -> Tensor | None:
+        """Inputs (*shape, m), checked; None where there are none."""
+        if u is None:
+            return None
+        check_inputs(u, self.inputs, shape, self.dtype)
+        return u.contiguous()
+
+    def _checked_h(self, h: Tensor | float) -> Tensor:
+        h = checked_h(h, self.dtype)
+        check_range(h, self.metadata["h_range"])
+        return h
+
+    def _call(self, function: str, *arguments: Tensor | int | None) -> None:
+        converted = (
+            ctypes.c_long(x) if isinstance(x, int) else ctypes.c_void_p(None if x is None else x.data_ptr())
+            for x in arguments
+        )
         getattr(self._library, function)(*converted)
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor) -> None:
@@ -150,13 +212,38 @@ class CompiledStepper:
                 )
 
 
-def _expand(h: Tensor, like: Tensor) -> Tensor:
-    """H for every sample."""
-    shape = (*like.shape[:-1], h.shape[-1]) if like.ndim and like.shape[-1] == 1 and h.ndim == like.ndim else like.shape
-    try:
-        return h.expand(shape)
-    except RuntimeError:
-        raise InputError(f"h must be a scalar or match the batch {tuple(shape)}, got shape {tuple(h.shape)}") from None
+def _decimated(rollout: Rollout, every: int) -> Rollout:
+    """Each m-th state, with the worst status and residual of the steps before it."""
+    groups = (-1, every)
+    return Rollout(
+        q=rollout.q[..., ::every, :],
+        p=rollout.p[..., ::every, :],
+        s=rollout.s[..., ::every],
+        sigma=rollout.sigma[..., ::every],
+        status=rollout.status.unflatten(-1, groups).amax(-1),
+        residual=rollout.residual.unflatten(-1, groups).amax(-1),
+    )
+
+
+def load_c(path: PathLike) -> CompiledStepper:
+    """Compile a header that `export_c` wrote, and load it.
+
+    Parameters
+    ----------
+    path
+        The header.
+
+    Returns
+    -------
+    CompiledStepper
+        With the header's own dtype and its `metadata`.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read or is no such header, or there is no compiler.
+    """
+    return CompiledStepper(read_bytes(path).decode("utf-8", "replace"), path)
 
 
 def compile_c(
@@ -187,10 +274,10 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, or the source is not usable.
+        If there is no compiler, the source is not usable, or a term of the model has no C yet.
     """
     if not isinstance(source, ContactLagrangian):
-        return CompiledStepper(read_bytes(source).decode("utf-8", "replace"), source)
+        return load_c(source)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
     with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
         path = export_c(source, Path(folder, "stepper.h"), h=h, box=box, units=units, dtype=dtype)

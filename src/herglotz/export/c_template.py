@@ -1,7 +1,8 @@
 """From a C template to C text: conditions, names and number types.
 
-Templates write `NAME_` for the prefix, `real` for the number type, `R(0.5)` for a constant, `SIN(` for a function of
-<math.h>, `@KEY@` for a value and `{%if flag} … {%else} … {%end}` for parts that only some models need.
+Templates write `NAME_` for the prefix, `real` for the number type, `R(0.5)` for a constant, `SPREAD(0.0)` for one that
+a variable is set to, `SIN(` for a function of <math.h>, `@KEY@` for a value and `{%if flag} … {%else} … {%end}` for
+parts that only some models need. `widen` turns a template for one sample into the same code for a register of samples.
 """
 
 from __future__ import annotations
@@ -11,7 +12,12 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 
-FUNCTIONS = ("SIN", "COS", "EXPM1", "EXP", "SQRT", "FABS", "FLOOR")
+FUNCTIONS = ("SIN", "COS", "TANH", "ATANH", "EXPM1", "EXP", "SQRT", "FABS", "FLOOR")
+WIDE = (
+    "problem|terms|potential|potential_t|jet|phase|phase_features|position_features|chain|evaluate|legendre_plus|"
+    "kinetic|jet_\\w+|action_unit|leapfrog|friction|increments|product|activate_\\w+|unit_\\w+|tanh|growth|log1p|"
+    "\\w+_network"
+)
 _TOKEN = re.compile(r"\{%(if \w+|if !\w+|else|end)\}\n?")
 
 
@@ -42,9 +48,23 @@ def fill(text: str, values: Mapping[str, str]) -> str:
     return re.sub(r"@(\w+)@", lambda m: values.get(m[1], m[0]), text)
 
 
+def widen(text: str) -> str:
+    """The same functions for a register of samples: types and functions get the prefix `wide_`, numbers are lanes.
+
+    Constants (`static const real`) stay numbers: compilers spread them when they meet lanes.
+    """
+    text = re.sub(r"\bNAME_(" + WIDE + r")\b", r"NAME_wide_\1", text)
+    text = re.sub(r"(?<!static const )\breal\b", "NAME_lanes", text)
+    text = re.sub(r"\bSPREAD\(", "NAME_spread(", text)
+    for function in FUNCTIONS:
+        text = re.sub(rf"\b{function}\(", f"NAME_wide_{function.lower()}(", text)
+    return text
+
+
 def finish(text: str, name: str, dtype: str) -> str:
     """Put in the prefix, the number type, its constants and its functions."""
     suffix = "" if dtype == "float64" else "f"
+    text = re.sub(r"\bSPREAD\(([^()]*)\)", r"R(\1)", text)
     text = re.sub(r"\bR\(([^()]*)\)", lambda m: _constant(m[1], suffix), text)
     for function in FUNCTIONS:
         text = re.sub(rf"\b{function}\(", f"{function.lower()}{suffix}(", text)

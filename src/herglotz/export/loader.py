@@ -1,11 +1,11 @@
-"""An exported `.pt2` file as a stepper with the interface of `herglotz.stepping.Stepper`."""
+"""Exported files as steppers with the interface of `herglotz.stepping.Stepper`, whatever their format."""
 
 from __future__ import annotations
 
 import io
-import json
-import logging
-import math
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -13,35 +13,69 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
-from herglotz.export.inputs import check_state, checked_h
-from herglotz.export.pt2 import FORMAT, METADATA
+from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
+from herglotz.export.metadata import METADATA, from_json
+from herglotz.export.module import Box
+from herglotz.export.pt2 import quiet
 from herglotz.stepping import Rollout, State, Step, step_sizes
 
-REQUIRED = ("format", "dof", "dtype", "h", "box", "newton_iterations", "newton_tolerance")
+Program = Callable[..., tuple[Tensor, ...]]
 
 
 class ExportedStepper:
-    """The flow Φ̃ of an exported model; results are those of `Stepper`, differentiable in the state.
+    """The flow Φ̃ of an exported model; results are those of `Stepper`.
 
     Parameters
     ----------
-    module
-        What `torch.export.load(path).module()` gives.
+    programs
+        What the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) → K steps, and
+        where the format has them `model`, one differentiable step, and `init`.
     metadata
         The file's own description: model, dof, dtype, h, units, angles, box, versions, weights_sha256.
     path
         Where it came from, for messages.
+    kind
+        "pt2", "aoti" or "onnx".
     """
 
-    def __init__(self, module: torch.nn.Module, metadata: dict[str, Any], path: str = "exported model"):
-        self.module = module
+    def __init__(
+        self, programs: Mapping[str, Program], metadata: dict[str, Any], path: str = "exported model", kind: str = "pt2"
+    ):
+        self.programs = dict(programs)
         self.metadata = metadata
         self.path = path
+        self.kind = kind
         self.dof: int = metadata["dof"]
+        self.inputs: int = metadata.get("inputs", 0)
         self.dtype: torch.dtype = getattr(torch, metadata["dtype"])
         self.h: float = metadata["h"]
+        box = metadata["box"]
+        self._box = None if box is None else Box(box, metadata.get("angles", [False] * self.dof), self.dtype)
 
-    def step(self, state: State, h: Tensor | float) -> Step:
+    @property
+    def differentiable(self) -> bool:
+        """Whether autograd goes through `step`."""
+        return "model" in self.programs
+
+    def init(
+        self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
+    ) -> State:
+        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions h apart; s0 defaults to 0.
+
+        Raises
+        ------
+        InputError
+            As `step`, and where the format holds no such program.
+        """
+        if "init" not in self.programs:
+            raise InputError(f"{self.path}: an {self.kind} file starts from (q, p, s) only; use a .pt2 file for init")
+        s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
+        self._check(q0, q1, s0, ("q0", "q1", "s0"))
+        h = self._checked_h(h)
+        p, s = self.programs["init"](*self._flat(State(q0, q1, s0), spread_h(h, s0), u))
+        return State(q1, p.reshape(q1.shape), s.reshape(s0.shape))
+
+    def step(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Step:
         """One step.
 
         Parameters
@@ -50,11 +84,13 @@ class ExportedStepper:
             (q, p, s) with shapes (..., n), (..., n), (...), in the dtype of the file.
         h
             Time step > 0, scalar or (...).
+        u
+            (..., m) inputs, for a model that takes some.
 
         Returns
         -------
         Step
-            NaN in the samples whose status is not `Status.CONVERGED`.
+            NaN in the samples whose status is not `Status.CONVERGED`. `iterations` is the bound, not a count.
 
         Raises
         ------
@@ -62,13 +98,29 @@ class ExportedStepper:
             If a shape, the dtype or a value is not what the file takes.
         """
         q, p, s = state
-        check_state(q, p, s, self.dof, self.dtype)
-        return self._step(state, checked_h(h, self.dtype))
+        self._check(q, p, s)
+        h = spread_h(self._checked_h(h), s)
+        flat = self._flat(state, h, u)
+        if "model" in self.programs:
+            out = self.programs["model"](*flat)
+        else:
+            out = tuple(x[0] for x in self.programs["rollout"](*flat[:3], *(x[None] for x in flat[3:])))
+        q1, p1, s1, c, residual, status = out[:6]
+        new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
+        c, residual, status = (x.reshape(s.shape) for x in (c, residual, status))
+        return Step(new, c, status, residual, self.metadata["newton_iterations"])
 
     def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        u: Tensor | None = None,
     ) -> Rollout:
-        """Step K times from (q, p, s); everything after a failed step is NaN.
+        """Step K times from (q, p, s), inside the file; everything after a failed step is NaN. No derivatives.
 
         Parameters
         ----------
@@ -78,6 +130,8 @@ class ExportedStepper:
             A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
         steps
             K; needed for a scalar h only.
+        u
+            (..., K, m) inputs, for a model that takes some.
 
         Raises
         ------
@@ -85,13 +139,21 @@ class ExportedStepper:
             As `step`, and if the length of h and `steps` disagree.
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
-        check_state(q, p, s, self.dof, self.dtype)
-        h_all = step_sizes(checked_h(h, self.dtype), steps)
-        states, results = [State(q, p, s)], []
-        for k in range(h_all.shape[-1]):
-            results.append(self._step(states[-1], h_all[..., k]))
-            states.append(results[-1].state)
-        return Rollout.of(states, results)
+        self._check(q, p, s)
+        h_all = step_sizes(self._checked_h(h), steps)
+        steps, size = h_all.shape[-1], s.numel()
+        rows = [spread_h(h_all[..., k], s).reshape(-1) for k in range(steps)] if h_all.ndim > 1 else []
+        h_rows = torch.stack(rows) if rows else h_all.reshape(-1, 1).expand(steps, size)
+        u_rows = None if u is None else u.expand(*s.shape, steps, u.shape[-1]).reshape(size, steps, -1).transpose(0, 1)
+        check_inputs(u_rows, self.inputs, (steps, size), self.dtype)
+        more = () if u_rows is None else (u_rows,)
+        start = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1))
+        with torch.no_grad():
+            out = self.programs["rollout"](*(_plain(x) for x in (*start, h_rows, *more)))
+        q_all, p_all, s_all, c, residual, status = (x.movedim(0, 1).reshape(*s.shape, *_tail(x)) for x in out[:6])
+        sigma = torch.cat([torch.ones_like(s)[..., None], c], -1).cumprod(-1)
+        q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in ((q, q_all), (p, p_all), (s, s_all)))
+        return Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
@@ -101,34 +163,34 @@ class ExportedStepper:
         InputError
             If the file records no box.
         """
-        box = self.metadata["box"]
-        if box is None:
+        if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
-        bounds = {key: torch.tensor(values, dtype=self.dtype, device=state.q.device) for key, values in box.items()}
-        middle = (bounds["q_low"] + bounds["q_high"]) / 2
-        turns = torch.round((state.q - middle) / (2 * math.pi))
-        angles = torch.tensor(self.metadata.get("angles", [False] * self.dof), device=state.q.device)
-        q = torch.where(angles, state.q - 2 * math.pi * turns, state.q)
-        outside = torch.zeros_like(state.s, dtype=torch.bool)
-        for name, x in (("q", q), ("p", state.p), ("s", state.s[..., None])):
-            inside = (x >= bounds[f"{name}_low"]) & (x <= bounds[f"{name}_high"])
-            outside = outside | ~inside.all(-1)
-        return outside
+        return self._box(*state)
 
-    def _step(self, state: State, h: Tensor) -> Step:
+    def _check(self, q: Tensor, p: Tensor, s: Tensor, names: tuple[str, str, str] = ("q", "p", "s")) -> None:
+        check_state(q, p, s, self.dof, self.dtype, names)
+        for name, x in zip(names, (q, p, s), strict=True):
+            if x.device.type != "cpu":
+                raise InputError(f"{name} must be on the CPU, got {x.device}; use {name}.cpu()")
+            if x.requires_grad and not self.differentiable and torch.is_grad_enabled():
+                raise InputError(f"an {self.kind} file has no derivatives; use a .pt2 file, or {name}.detach()")
+
+    def _checked_h(self, h: Tensor | float) -> Tensor:
+        h = checked_h(h, self.dtype)
+        check_range(h, self.metadata.get("h_range"))
+        return h
+
+    def _flat(self, state: State, h: Tensor, u: Tensor | None) -> tuple[Tensor, ...]:
+        """(B, n), (B, n), (B,), (B,)[, (B, m)], each with its own storage in standard layout."""
         q, p, s = state
-        fits = h.ndim <= s.ndim and all(a in (1, b) for a, b in zip(h.shape[::-1], s.shape[::-1], strict=False))
-        if not fits:
-            raise InputError(f"h must be a scalar or match the batch {tuple(s.shape)}, got shape {tuple(h.shape)}")
-        flat = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.expand(s.shape).reshape(-1))
-        q1, p1, s1, c, residual, status = self.module(*(x.contiguous() for x in flat))
-        new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
-        c, residual, status = (x.reshape(s.shape) for x in (c, residual, status))
-        return Step(new, c, status, residual, self.metadata["newton_iterations"])
+        flat = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1))
+        u = None if u is None else u.expand(*s.shape, u.shape[-1]).reshape(len(flat[2]), -1)
+        check_inputs(u, self.inputs, (len(flat[2]),), self.dtype)
+        return tuple(_plain(x) for x in (*flat, *(() if u is None else (u,))))
 
 
 def load_pt2(path: PathLike) -> ExportedStepper:
-    """Read a file that `export_pt2` wrote.
+    """Read a file that `export_pt2` or `export_aoti` wrote.
 
     Raises
     ------
@@ -136,31 +198,71 @@ def load_pt2(path: PathLike) -> ExportedStepper:
         If the file is missing, damaged, not one of ours, or of another format version.
     """
     content = read_bytes(path)
-    extra = {METADATA: ""}
-    log = logging.getLogger("torch.export")
-    level = log.level
-    log.setLevel(logging.CRITICAL)  # torch logs a traceback of its own for a damaged file; one line is enough
     try:
-        module = torch.export.load(io.BytesIO(content), extra_files=extra).module()
+        with quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
+            if _is_compiled(content):
+                return _load_aoti(path)
+            from torch.export.pt2_archive._package import load_pt2 as unpack
+
+            found = unpack(io.BytesIO(content))
+            text = found.extra_files.get(METADATA)
+            metadata = from_json(text.decode() if isinstance(text, bytes) else text, path)
+            modules = {name: program.module(check_guards=False) for name, program in found.exported_programs.items()}
+    except InputError:
+        raise
     except Exception as error:  # torch raises whatever its zip, JSON and graph readers raise
         line = str(error).strip().splitlines() or [""]
         raise InputError(
             f"{path}: is not a readable .pt2 file ({type(error).__name__}: {line[0][:120]}); export the model again"
         ) from error
-    finally:
-        log.setLevel(level)
-    return ExportedStepper(module, _read_metadata(extra[METADATA], path), str(path))
+    return ExportedStepper(modules, metadata, str(path), "pt2")
 
 
-def _read_metadata(text: str, path: PathLike) -> dict[str, Any]:
-    try:
-        metadata = json.loads(text)
-    except json.JSONDecodeError:
-        metadata = None
-    if not isinstance(metadata, dict) or any(key not in metadata for key in REQUIRED):
-        raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export.export_pt2")
-    if metadata["format"] != FORMAT:
-        raise InputError(
-            f"{path}: is of format {metadata['format']}, this herglotz reads {FORMAT}; export the model again"
-        )
-    return metadata
+def load_exported(path: PathLike) -> Any:
+    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
+
+    Returns
+    -------
+    ExportedStepper or CompiledStepper
+        Both have `step`, `rollout`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
+
+    Raises
+    ------
+    InputError
+        As the reader of that format.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".onnx":
+        from herglotz.export.onnx_file import load_onnx
+
+        return load_onnx(path)
+    if suffix == ".h":
+        from herglotz.export.c_stepper import load_c
+
+        return load_c(path)
+    return load_pt2(path)
+
+
+def _is_compiled(content: bytes) -> bool:
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return any("/data/aotinductor/" in f"/{name}" for name in archive.namelist())
+
+
+def _load_aoti(path: PathLike) -> ExportedStepper:
+    import torch._inductor
+
+    from herglotz.export.aoti import KEY
+
+    package = torch._inductor.aoti_load_package(str(path))
+    metadata = from_json(package.loader.get_metadata().get(KEY), path)  # pyright: ignore[reportAttributeAccessIssue]
+    return ExportedStepper({"rollout": package}, metadata, str(path), "aoti")
+
+
+def _plain(x: Tensor) -> Tensor:
+    """Standard layout; compiled code reads memory in that order whatever the strides say."""
+    return x.contiguous() if x.requires_grad else x.clone(memory_format=torch.contiguous_format)
+
+
+def _tail(x: Tensor) -> tuple[int, ...]:
+    """The shape of (K, B, ...) without B."""
+    return (x.shape[0], *x.shape[2:])

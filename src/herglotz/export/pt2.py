@@ -2,28 +2,29 @@
 
 from __future__ import annotations
 
-import copy
-import hashlib
 import io
-import json
-from collections.abc import Mapping, Sequence
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
-import herglotz
 from herglotz.data.files import PathLike, write_atomically
-from herglotz.errors import InputError
-from herglotz.export.module import TOLERANCE, StepModule
+from herglotz.export.equation import Equations, batched, example
+from herglotz.export.inline import inlined, opaque
+from herglotz.export.metadata import FORMAT, METADATA, describe, to_json, weights_digest
+from herglotz.export.metadata import describe as _metadata
+from herglotz.export.module import ITERATIONS, InitModule, RolloutModule, StepModule
 from herglotz.models import ContactLagrangian
 
-FORMAT = 1
-METADATA = "metadata.json"
-BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
-EXAMPLE_BATCH = 7  # equal to no other size in the graph, or torch.export takes the two for one
+__all__ = ["FORMAT", "METADATA", "_metadata", "export_pt2", "rollout_program", "weights_digest"]
+
+EXAMPLE_STEPS = 13
 
 
 def export_pt2(
@@ -34,12 +35,15 @@ def export_pt2(
     box: Mapping[str, Sequence[float]] | None = None,
     units: Sequence[str] = (),
     metadata: Mapping[str, Any] | None = None,
-    newton_iterations: int = 8,
+    newton_iterations: int = ITERATIONS,
 ) -> Path:
-    """Write one step (q, p, s, h) → (q1, p1, s1, c, residual, status) of the model's flow as a `.pt2` file.
+    """Write the model's flow as a `.pt2` file: graphs of tensor operations that any PyTorch of this version runs.
 
-    The batch size is free, every step h > 0 is accepted, and the file holds weights, graph and metadata. It loads with
-    `torch.export.load(path).module()` on a machine without herglotz, or with `load_pt2` here.
+    It holds three programs. `model`, the one that `torch.export.load(path).module()` gives on a machine without
+    herglotz, is one step (q, p, s, h) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state;
+    `rollout` is K steps with both loops inside; `init` makes (p1, s1) from (q0, q1, s0, h). The batch size is free and
+    every step h > 0 is accepted. A model with inputs takes u after h. With a box, outside is 1 where a step starts or
+    ends beyond it.
 
     Parameters
     ----------
@@ -54,9 +58,10 @@ def export_pt2(
     units
         Unit of each coordinate.
     metadata
-        Further JSON-ready entries; they may not replace those written here.
+        Further JSON-ready entries; they may not replace those written here. `h_range` = (low, high) makes the loaders
+        refuse other steps.
     newton_iterations
-        Unrolled iterations; ignored (2) for a model whose step equation is linear in q1.
+        Bound on the Newton iterations of a step, at least 2.
 
     Returns
     -------
@@ -68,35 +73,57 @@ def export_pt2(
     InputError
         If h, box, units or metadata are not usable, or the file cannot be written.
     """
-    entries = _metadata(model, h, box, units, newton_iterations, metadata or {})
-    text = _json(entries)
-    module = StepModule(copy.deepcopy(model).eval().requires_grad_(False), entries["newton_iterations"])
-    program = _slim(_export(module, entries["dof"], h))
-    buffer = io.BytesIO()
-    torch.export.save(program, buffer, extra_files={METADATA: text})
+    entries = describe(model, h, box, units, newton_iterations, metadata or {})
+    text = to_json(entries)
+    with quiet():
+        equations, arguments = Equations.of(model), example(model, h)
+        programs = {
+            "model": _program(StepModule(equations, newton_iterations, entries["box"]), arguments),
+            "rollout": rollout_program(equations, entries),
+            "init": _program(InitModule(equations), arguments),
+        }
+        from torch.export.pt2_archive._package import package_pt2  # what torch.export.save calls for a single program
+
+        buffer = io.BytesIO()
+        package_pt2(buffer, exported_programs=programs, extra_files={METADATA: text})
     write_atomically(path, buffer.getvalue())
     return Path(path)
 
 
-def weights_digest(model: torch.nn.Module) -> str:
-    """The sha256 (hex) of names, dtypes, shapes and values of a module's state."""
-    sha = hashlib.sha256()
-    for name, value in sorted(model.state_dict().items()):
-        sha.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
-        sha.update(value.detach().cpu().contiguous().numpy().tobytes())
-    return sha.hexdigest()
+def rollout_program(model: ContactLagrangian | Equations, entries: Mapping[str, Any]) -> ExportedProgram:
+    """`RolloutModule` as an exported program; `entries` is the file's metadata."""
+    equations = Equations.of(model)
+    arguments = example(equations.model, entries["h"])
+    stacked = (x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in arguments[3:])
+    module = RolloutModule(equations, entries["newton_iterations"], entries["box"])
+    return _program(module, (*arguments[:3], *stacked), stacked=3)
 
 
-def _export(module: StepModule, dof: int, h: float) -> ExportedProgram:
-    parameter = next(module.parameters())
-    make = torch.Generator().manual_seed(0)
-    options: dict[str, Any] = {"dtype": parameter.dtype, "device": parameter.device}
-    q, p = (0.1 * torch.randn(EXAMPLE_BATCH, dof, generator=make).to(**options) for _ in range(2))
-    arguments = (q, p, torch.zeros(EXAMPLE_BATCH, **options), torch.full((EXAMPLE_BATCH,), float(h), **options))
-    with torch.no_grad():
-        module(*arguments)  # fills the index caches of the jets with real tensors, before tracing makes fake ones
-    shapes = tuple({0: Dim.AUTO} for _ in arguments)
-    return torch.export.export(module, arguments, dynamic_shapes=shapes)
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the remarks that torch's exporters make on their own code."""
+    logs = [logging.getLogger(name) for name in ("torch.export", "torch.onnx", "torch._inductor", "onnxscript")]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)
+
+
+def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: int | None = None) -> ExportedProgram:
+    """Export for any batch size; arguments from `stacked` on have a leading axis of steps, free as well."""
+    one = {0: Dim.DYNAMIC}
+    count = len(arguments)
+    split = count if stacked is None else stacked
+    shapes = tuple(one if i < split else {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} for i in range(count))
+    with torch.no_grad(), opaque(module):
+        program = torch.export.export(module, arguments, dynamic_shapes=batched(module, shapes))
+    return _slim(inlined(program))
 
 
 def _slim(program: ExportedProgram) -> ExportedProgram:
@@ -104,70 +131,11 @@ def _slim(program: ExportedProgram) -> ExportedProgram:
 
     Index tensors are views of one storage; torch saves such a group in one piece, and warns that it may be wrong.
     """
-    for node in program.graph.nodes:
-        for key in ("stack_trace", "nn_module_stack", "source_fn_stack"):
-            node.meta.pop(key, None)
+    for module in program.graph_module.modules():
+        for node in getattr(module, "graph", program.graph).nodes:
+            for key in ("stack_trace", "nn_module_stack", "source_fn_stack"):
+                node.meta.pop(key, None)
     for name, value in list(program.constants.items()):
         if isinstance(value, Tensor):
             program.constants[name] = value.clone()
     return program
-
-
-def _metadata(
-    model: ContactLagrangian,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None,
-    units: Sequence[str],
-    newton_iterations: int,
-    extra: Mapping[str, Any],
-) -> dict[str, Any]:
-    dtype = next(model.parameters()).dtype
-    if dtype not in (torch.float32, torch.float64):
-        raise InputError(f"export needs a float32 or float64 model, got {dtype}; convert it with .double()")
-    if not (float(h) > 0 and float(h) < float("inf")):
-        raise InputError(f"h must be a finite number > 0, got {h}")
-    if units and len(units) != model.config.dof:
-        raise InputError(f"units needs one entry a coordinate ({model.config.dof}), got {list(units)}")
-    entries: dict[str, Any] = {
-        "format": FORMAT,
-        "herglotz_version": herglotz.__version__,
-        "torch_version": str(torch.__version__),
-        "model": model.config.to_dict(),
-        "weights_sha256": weights_digest(model),
-        "level": model.config.level,
-        "dof": model.config.dof,
-        "dtype": str(dtype).removeprefix("torch."),
-        "h": float(h),
-        "units": list(units),
-        "angles": list(model.config.angles),
-        "box": None if box is None else _box(box, model.config.dof),
-        "newton_iterations": 2 if model.linear_in_q1 else newton_iterations,
-        "newton_tolerance": TOLERANCE * torch.finfo(dtype).eps,
-    }
-    taken = sorted(set(extra) & set(entries))
-    if taken:
-        raise InputError(f"metadata may not replace {', '.join(taken)}; use another name")
-    return {**entries, **extra}
-
-
-def _box(box: Mapping[str, Sequence[float]], dof: int) -> dict[str, list[float]]:
-    """The box with plain numbers, checked: q and p have n entries, s has one, low ≤ high."""
-    if set(box) != set(BOX_KEYS):
-        raise InputError(f"box needs exactly the keys {', '.join(BOX_KEYS)}; got {', '.join(sorted(box)) or 'none'}")
-    plain = {key: [float(x) for x in torch.as_tensor(box[key], dtype=torch.float64).reshape(-1)] for key in BOX_KEYS}
-    for key, values in plain.items():
-        size = 1 if key.startswith("s") else dof
-        if len(values) != size:
-            raise InputError(f"box {key} needs {size} numbers, got {values}")
-    for name in "qps":
-        low, high = plain[f"{name}_low"], plain[f"{name}_high"]
-        if not all(a <= b for a, b in zip(low, high, strict=True)):
-            raise InputError(f"box {name}_low must not exceed {name}_high, got {low} and {high}")
-    return plain
-
-
-def _json(entries: dict[str, Any]) -> str:
-    try:
-        return json.dumps(entries, indent=1, allow_nan=False)
-    except (TypeError, ValueError) as error:
-        raise InputError(f"metadata cannot be written as JSON ({error}); use plain finite numbers and text") from None

@@ -1,4 +1,7 @@
-"""The continuous counterpart: contact Hamiltonian H(q, p, s) and its vector field."""
+"""The continuous counterpart: a contact Hamiltonian H(q, p, s) or Lagrangian L(q, v, s) and the motion it gives.
+
+Everything here is batched over leading dimensions and differentiable again where an argument wants a gradient.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,69 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-Hamiltonian = Callable[[Tensor, Tensor, Tensor], Tensor]
+from herglotz.errors import InputError
+from herglotz.mechanics.partials import Partials, autograd_partials
+
+ScalarField = Callable[[Tensor, Tensor, Tensor], Tensor]
+Hamiltonian = ScalarField
+Lagrangian = ScalarField
+
+
+def derivatives(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    x: Tensor,  # (..., n) p or v
+    s: Tensor,  # (...)
+    order: int = 1,
+) -> Partials:
+    """f(q, x, s) and its derivatives, through the door: D1 = f_q, D2 = f_x, D3 = f_s, D12 = f_qx and so on."""
+    return autograd_partials(lambda q, x, s, h: f(q, x, s), q, x, s, 0.0, order)  # noqa: ARG005
+
+
+def gradient(
+    F: Callable[[Tensor], Tensor],  # (..., m) → (...)
+    x: Tensor,  # (..., m)
+    order: int = 1,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """F, F_x and (order 2) F_xx with shapes (...), (..., m), (..., m, m)."""
+    P = autograd_partials(lambda x, _, s, h: F(x), x, x, x[..., 0], 0.0, order)  # noqa: ARG005
+    return P.L, P.D1, P.D11
+
+
+def jacobian(
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart
+    x: Tensor,  # (..., m)
+) -> tuple[Tensor, Tensor]:
+    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph where x or something inside f wants a gradient."""
+    keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
+    with torch.enable_grad():
+        x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
+        y = f(x)
+        if not y.requires_grad:  # a constant map
+            return y, y.new_zeros(*y.shape, x.shape[-1])
+        rows = [
+            torch.autograd.grad(
+                y[..., i].sum(),
+                x,
+                retain_graph=True,
+                create_graph=keep_graph,
+                materialize_grads=True,
+                allow_unused=True,
+            )[0]
+            for i in range(y.shape[-1])
+        ]
+    J = torch.stack(rows, -2)
+    return (y, J) if keep_graph else (y.detach(), J)
+
+
+def square_jacobian(
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., m), samples apart; takes one more leading dimension
+    x: Tensor,  # (..., m)
+) -> tuple[Tensor, Tensor]:
+    """The same as `jacobian` by one backward pass instead of m: on m copies of x, of which copy i gives row i."""
+    copies = x.expand(x.shape[-1], *x.shape)
+    y, rows, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
+    return y.movedim(0, -1), rows.movedim(0, -2)
 
 
 def contact_vector_field(
@@ -25,8 +90,60 @@ def contact_vector_field(
 
     Source: contact Hamilton equations of the paper.
     """
-    with torch.enable_grad():
-        q, p, s = (x.detach().requires_grad_() for x in (q, p, s))
-        value = H(q, p, s)
-        H_q, H_p, H_s = torch.autograd.grad(value.sum(), (q, p, s), materialize_grads=True, allow_unused=True)
-    return H_p, -(H_q + p.detach() * H_s[..., None]), (p.detach() * H_p).sum(-1) - value.detach()
+    q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
+    return q_dot, p_dot, heat - H_value
+
+
+def evolution_vector_field(
+    H: Hamiltonian,
+    q: Tensor,  # (..., n)
+    p: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+) -> tuple[Tensor, Tensor, Tensor]:
+    """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along it and η(E_H) = 0.
+
+    Returns
+    -------
+    tuple of Tensor
+        (q̇, ṗ, ṡ) with shapes (..., n), (..., n), (...).
+
+    Source: erratum E2; it is the field for which Theorem 1 of the paper holds as printed.
+    """
+    return _evolution(H, q, p, s)[:3]
+
+
+def herglotz_acceleration(
+    L: Lagrangian,
+    q: Tensor,  # (..., n)
+    v: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+) -> Tensor:
+    """The acceleration a of Herglotz's equations, L_vv a = L_q + L_s L_v − L_vq v − L_vs L; with q̇ = v and ṡ = L.
+
+    Returns
+    -------
+    Tensor
+        Shape (..., n).
+
+    Raises
+    ------
+    InputError
+        If L_vv is singular at a sample.
+
+    Source: d/dt L_v − L_q = L_s L_v, with d/dt expanded along ṡ = L.
+    """
+    P = derivatives(L, q, v, s, order=2)
+    L_vq_v = (P.D12.mT @ v[..., None])[..., 0]
+    force = P.D1 + P.D3[..., None] * P.D2 - L_vq_v - P.L[..., None] * P.D23
+    a, info = torch.linalg.solve_ex(P.D22, force[..., None])
+    if bool((info != 0).any()):
+        sample = tuple(int(i) for i in (info != 0).nonzero()[0])
+        raise InputError(f"L_vv is singular at sample {sample}: L gives no acceleration there; check its kinetic term")
+    return a[..., 0]
+
+
+def _evolution(H: Hamiltonian, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The three components of E_H, and H."""
+    P = derivatives(H, q, p, s)
+    H_q, H_p, H_s = P.D1, P.D2, P.D3
+    return H_p, -(H_q + p * H_s[..., None]), (p * H_p).sum(-1), P.L

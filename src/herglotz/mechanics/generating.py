@@ -4,7 +4,11 @@ S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 along the discrete solution that joins q̂0 to
 
     D2 S^k = p_k,    1 + D3 S^k = σ_k,    D1 S^k = −σ_k p̂0.
 
-Both functions below take S through the flow, never through those identities, so that the identities can be checked.
+Its left twin is a function of (q̂0, q_k, s_k), the value of s at the other end:
+
+    S^{k−}(q̂0, q_k, s_k) = s_k − ŝ0,    p̂0 = −D1 S^{k−},    p_k = D2 S^{k−} / (1 − D3 S^{k−}),    1 − D3 S^{k−} = 1/σ_k.
+
+Everything below takes S through the flow, never through those identities, so that the identities can be checked.
 """
 
 from __future__ import annotations
@@ -19,12 +23,12 @@ from herglotz.mechanics.contact import Flow, flow_derivative
 
 @dataclass(frozen=True)
 class GeneratingFunction:
-    """S^k and its derivatives at (q̂0, q_k, ŝ0), for a batch of solutions."""
+    """S^k and its derivatives at (q̂0, q_k, ŝ0), or the left one's at (q̂0, q_k, s_k), for a batch of solutions."""
 
     S: Tensor  # (...)
     D1: Tensor  # (..., n) ∂S/∂q̂0
     D2: Tensor  # (..., n) ∂S/∂q_k
-    D3: Tensor  # (...) ∂S/∂ŝ0
+    D3: Tensor  # (...) ∂S/∂ŝ0; left: ∂S/∂s_k
     q: Tensor  # (..., n) q_k
     p: Tensor  # (..., n) p_k as the flow carries it
     s: Tensor  # (...) s_k
@@ -56,10 +60,42 @@ def generating_function(
     D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
     D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
     D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
+    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(Y_p))
+
+
+def left_generating_function(flow_k: Flow, q: Tensor, p: Tensor, s: Tensor) -> GeneratingFunction:
+    """S^{k−}(q̂0, q_k, s_k) = s_k − ŝ0 and its three derivatives along the solutions from (q̂0, p̂0, ŝ0).
+
+    The chain rule through (p̂0, ŝ0) ↦ (q_k, s_k) at fixed q̂0 gives D2 and D3 together, and with them D1.
+
+    Parameters
+    ----------
+    flow_k, q, p, s
+        As for `generating_function`.
+
+    Returns
+    -------
+    GeneratingFunction
+        With D3 = ∂S^{k−}/∂s_k. Not defined where σ_k = 0 or at a caustic.
+
+    Source: erratum E5 for k = 1, composed.
+    """
+    n = q.shape[-1]
+    (q_k, p_k, s_k), D = flow_derivative(flow_k, q, p, s)
+    ends = torch.cat([D[..., :n, n:], D[..., 2 * n :, n:]], -2)  # ∂(q_k, s_k)/∂(p̂0, ŝ0)
+    rate = D[..., 2 * n, n:].clone()  # ∂(s_k − ŝ0)/∂(p̂0, ŝ0)
+    rate[..., n] -= 1.0
+    slopes = torch.linalg.solve_ex(ends.mT, rate[..., None])[0][..., 0]
+    D2, D3 = slopes[..., :n], slopes[..., n]
+    D1 = (1 - D3)[..., None] * D[..., 2 * n, :n] - (D[..., :n, :n].mT @ D2[..., None])[..., 0]
+    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(D[..., :n, n : 2 * n]))
+
+
+def _spread(Y_p: Tensor) -> Tensor:
+    """Smallest singular value of ∂q_k/∂p̂0; 0 where it is not finite."""
     # A failed step is NaN, which svdvals refuses for the whole batch; NaN there is at a caustic here.
     finite = torch.isfinite(Y_p).all(-1).all(-1)
-    spread = torch.linalg.svdvals(torch.where(finite[..., None, None], Y_p, 0.0))[..., -1]
-    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, spread)
+    return torch.linalg.svdvals(torch.where(finite[..., None, None], Y_p, 0.0))[..., -1]
 
 
 def hamilton_jacobi_residual(
@@ -76,3 +112,19 @@ def hamilton_jacobi_residual(
     Source: right discrete contact Hamilton–Jacobi equation of the paper.
     """
     return S1 - S0 - (dS1 * q1).sum(-1) + H_plus
+
+
+def left_hamilton_jacobi_residual(
+    S1: Tensor,  # (...) S^{k+1}(q_{k+1})
+    S0: Tensor,  # (...) S^k(q_k)
+    dS0: Tensor,  # (..., n) dS^k(q_k)
+    q0: Tensor,  # (..., n) q_k
+    H_minus: Tensor,  # (...) H⁻(dS^k(q_k), q_{k+1}, s_{k+1}), s_{k+1} = ŝ0 + S^{k+1}
+) -> Tensor:
+    """S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k(q_k)·q_k + H⁻(dS^k(q_k), q_{k+1}, s_{k+1}), shape (...).
+
+    Zero on an open set of q_k when q_{k+1} = Φ̃^γ(q_k), and only there (erratum E7).
+
+    Source: left discrete contact Hamilton–Jacobi equation, erratum E6.
+    """
+    return S1 - S0 + (dS0 * q0).sum(-1) + H_minus

@@ -1,5 +1,6 @@
 """Learnable discrete contact Lagrangians."""
 
-from herglotz.models.model import LEVELS, ContactLagrangian, ModelConfig
+from herglotz.models.config import LEVELS, ModelConfig
+from herglotz.models.model import ContactLagrangian, DrivenLagrangian
 
-__all__ = ["LEVELS", "ContactLagrangian", "ModelConfig"]
+__all__ = ["LEVELS", "ContactLagrangian", "DrivenLagrangian", "ModelConfig"]

@@ -15,7 +15,7 @@ from functools import lru_cache
 
 import torch
 from torch import Tensor
-from torch.nn.functional import linear
+from torch.nn.functional import linear, logsigmoid
 
 Constant = Tensor | float
 
@@ -94,11 +94,28 @@ class Jet:
         e = self.value.exp()
         return self.map(e, e, e)
 
+    def expm1(self) -> Jet:
+        """e^f − 1, accurate for small f."""
+        e = self.value.exp()
+        return self.map(self.value.expm1(), e, e)
+
     def tanh(self) -> Jet:
         """The hyperbolic tangent: f′ = 1 − t², f″ = −2 t f′."""
         t = self.value.tanh()
         f1 = 1 - t * t
         return self.map(t, f1, -2 * t * f1)
+
+    def softplus(self) -> Jet:
+        """log(1 + e^f): f′ is the logistic function σ, f″ = σ(1 − σ); 1 − σ(f) = σ(−f) does not cancel."""
+        x = self.value
+        up = x.sigmoid()
+        return self.map(-logsigmoid(-x), up, up * (-x).sigmoid())
+
+    def silu(self) -> Jet:
+        """The product f σ(f), with σ the logistic function."""
+        x = self.value
+        up, down = x.sigmoid(), (-x).sigmoid()
+        return self.map(x * up, up * (1 + x * down), up * down * (2 + x * (down - up)))
 
     def sin(self) -> Jet:
         """Sin f."""
@@ -165,6 +182,14 @@ def coordinates(q: Tensor, order: int) -> Jet:
     """The identity q ↦ q as a vector-valued jet over its own n components; q is (..., n)."""
     n = q.shape[-1]
     return affine(q, torch.eye(n, dtype=q.dtype, device=q.device), order)
+
+
+def variable(x: Tensor, index: int, size: int, order: int) -> Jet:
+    """The scalar x, shape (...), as number `index` of `size` variables."""
+    rows = 1 + size + (size * (size + 1) // 2 if order == 2 else 0)
+    zero = torch.zeros_like(x)[None]
+    before, after = zero.expand(index, *x.shape), zero.expand(rows - index - 2, *x.shape)
+    return Jet(torch.cat([x[None], before, torch.ones_like(zero), after]), size, order)
 
 
 def affine(value: Tensor, slope: Tensor, order: int) -> Jet:

@@ -2,87 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Partials
-from herglotz.models.jet import Jet
+from herglotz.mechanics import Forces, Partials
+from herglotz.models.action import ActionFlow
+from herglotz.models.blocks import action_partials, affine_partials
+from herglotz.models.config import ModelConfig
+from herglotz.models.friction import Friction
+from herglotz.models.jet import Jet, variable
+from herglotz.models.mass import PositionKinetic
+from herglotz.models.phase import Phase
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
-from herglotz.settings import from_plain
-
-LEVELS = ("linear", "affine")
-
-
-@dataclass(frozen=True)
-class ModelConfig:
-    """Everything that is needed to build a model; plain numbers, so that it can be stored as JSON.
-
-    `scale` and `speed` are typical sizes of q and v (data units); `stiffness`, `tilt` and `rate` start the
-    baseline.
-    A width of 0 leaves that network out. Without a `baseline` the correction is the whole of A: no kinetic term, no
-    potential; it is there to show why a baseline is needed (trap 2).
-    """
-
-    angles: tuple[bool, ...] = (True,)
-    level: str = "linear"
-    scale: tuple[float, ...] = (1.0,)
-    speed: tuple[float, ...] = (1.0,)
-    stiffness: tuple[float, ...] = (1.0,)
-    tilt: tuple[float, ...] = (0.0,)
-    rate: float = 0.1
-    potential_width: int = 8
-    potential_depth: int = 1
-    damping_width: int = 8
-    correction_width: int = 0
-    correction_depth: int = 2
-    baseline: bool = True
-    seed: int = 0
-
-    def __post_init__(self):
-        if self.level not in LEVELS:
-            raise InputError(f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}")
-        if not self.baseline and not self.correction_width:
-            raise InputError("a model without a baseline needs a correction network; set correction_width > 0")
-        for name in ("scale", "speed", "stiffness", "tilt"):
-            if len(getattr(self, name)) != len(self.angles):
-                given = getattr(self, name)
-                raise InputError(f"{name} needs one number a coordinate ({len(self.angles)}), got {given}")
-
-    @property
-    def dof(self) -> int:
-        """Number of coordinates n."""
-        return len(self.angles)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
-
-    @classmethod
-    def from_dict(cls, values: dict[str, Any]) -> ModelConfig:
-        """Inverse of `to_dict`; unknown keys are an error."""
-        return from_plain(cls, values)
 
 
 @dataclass(frozen=True)
 class Terms:
-    """The jets a model is made of at one set of points, for reports and tests."""
+    """The jets a model is made of at one set of points, for reports and tests; None for what it has not."""
 
-    g: Tensor | Jet
+    g: Tensor | Jet | None
     K: Jet | None
     V0: Jet | None
     V1: Jet | None
     N: Jet | None
+    b: Jet | None  # what the units of the full level read of q̄ and v
 
 
 class ContactLagrangian(nn.Module):
     """L_d = (c − 1)(s0 − h/2 V0) + √c K − h/2 (V0 + V1) + N with c = e^g.
 
+    * conservative: c = 1; nothing depends on s.
+    * linear: g = −γh. forced: the same, with friction and inputs as discrete forces (`Friction`).
+    * affine: g depends on position and velocity.
+    * full: the map of s over a step is half a step of `ActionFlow`, e^{g/2}, + K, e^{g/2}, and the flow's other half.
+
     A discrete Lagrangian for `herglotz.mechanics`: call it for the value, `partials` for closed-form derivatives.
     Every step h is allowed, and may differ from sample to sample.
+
+    Positions do not determine L_d (gauge): s′ = f(q, s) gives the same motion. The mass's first entry is fixed at 1,
+    which leaves s′ = s + b(q) — within the span of the terms — and a constant shift of s. Only the priors hold those.
 
     Parameters
     ----------
@@ -95,82 +56,177 @@ class ContactLagrangian(nn.Module):
         self.config = config
         make = torch.Generator().manual_seed(config.seed)
         c = config
-        self.kinetic = Kinetic(c.dof)
-        self.potential = Potential(
-            c.angles, c.scale, c.speed, c.stiffness, c.tilt, c.potential_width, c.potential_depth, make
-        )
-        if c.level == "linear":
-            self.damping: LinearDamping | AffineDamping = LinearDamping(c.rate)
-        else:
-            self.damping = AffineDamping(c.rate, c.angles, c.scale, c.speed, c.damping_width, 1, make)
-        self.correction = (
-            Correction(c.angles, c.scale, c.speed, c.correction_width, c.correction_depth, make, alone=not c.baseline)
-            if c.correction_width
-            else None
-        )
+        sizes, act = (c.angles, c.scale, c.speed), c.activation
+        self.kinetic: Kinetic | PositionKinetic = Kinetic(c.dof)
+        self.potential = Potential(*sizes, c.stiffness, c.tilt, c.potential_width, c.potential_depth, make, act)
+        self.damping: LinearDamping | AffineDamping | None = None
+        if c.level in ("linear", "forced"):
+            self.damping = LinearDamping(c.rate)
+        elif c.level in ("affine", "full"):  # the full level's units read q̄ and v: no second network for them
+            width = c.damping_width if c.level == "affine" else 0
+            self.damping = AffineDamping(c.rate, *sizes, width, 1, make, act)
+        self.correction: Correction | None = None
+        if c.correction_width:
+            self.correction = Correction(*sizes, c.correction_width, c.correction_depth, make, not c.baseline, act)
+        if c.mass_width:
+            self.kinetic = PositionKinetic(c, make)
+        self.action = ActionFlow(c, make) if c.level == "full" else None
+        self.friction = Friction(c) if c.level == "forced" else None
+
+    @property
+    def dof(self) -> int:
+        """Number of coordinates n."""
+        return self.config.dof
+
+    @property
+    def inputs(self) -> int:
+        """Number of inputs m."""
+        return self.config.inputs
 
     @property
     def s_enters_motion(self) -> bool:
-        """Whether the positions depend on s at all (they do not at the linear level)."""
-        return not self.damping.constant
+        """Whether the positions depend on s at all (they do at the affine and full levels)."""
+        return self.damping is not None and not self.damping.constant
 
     @property
     def linear_in_q1(self) -> bool:
-        """Whether the step equation is linear in q1, so that one Newton step solves it (leapfrog)."""
-        return self.damping.constant and self.correction is None
+        """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
+        if self.s_enters_motion or self.correction is not None or isinstance(self.kinetic, PositionKinetic):
+            return False
+        return self.friction is None or self.friction.linear
 
-    def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Terms:
+    def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Terms:
         """Evaluate every term once."""
         n = q0.shape[-1]
-        g = self.damping(q0, q1, h, order)
-        N = None if self.correction is None else self.correction(q0, q1, h, order)
+        phase = Phase(q0, q1, h, order, self.config, delta)
+        g = self.damping
+        if g is not None:
+            g = g(phase) if isinstance(g, AffineDamping) else g(q0, q1, h, order)
+        N = None if self.correction is None else self.correction(phase)
+        b = None if self.action is None else self.action.offsets(phase.features)
         if not self.config.baseline:
-            return Terms(g, None, None, None, N)
+            return Terms(g, None, None, None, N, b)
         V = self.potential(torch.stack([q0, q1]), order)  # both ends in one network call
-        return Terms(
-            g=g,
-            K=self.kinetic(q0, q1, h, order),
-            V0=Jet(V.data[:, 0], n, order).embed(2 * n, 0),
-            V1=Jet(V.data[:, 1], n, order).embed(2 * n, n),
-            N=N,
-        )
+        m = self.kinetic
+        K = m(q0, q1, h, order, delta) if isinstance(m, Kinetic) else m(phase)
+        V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
+        return Terms(g, K, V0, V1, N, b)
 
-    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
+    def partials(
+        self,
+        q0: Tensor,  # (..., n)
+        q1: Tensor,  # (..., n)
+        s0: Tensor,  # (...)
+        h: Tensor | float,
+        order: int = 1,
+        u: Tensor | None = None,  # (..., m) input; None: no input acts
+    ) -> Partials:
         """Value and derivatives in closed form; see `herglotz.mechanics.partials`."""
         q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
-        s0 = s0[..., 0]
+        return self._evaluate(q0, q1, s0[..., 0], h, order, u, None)
+
+    def partials_increment(
+        self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
+    ) -> Partials:
+        """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 when the step is small."""
+        q0, delta, s0 = torch.broadcast_tensors(q0, delta, s0[..., None])
+        return self._evaluate(q0, q0 + delta, s0[..., 0], h, order, u, delta)
+
+    def forces(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
+    ) -> tuple[Tensor, Tensor] | None:
+        """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but the forced one."""
+        if self.friction is None:
+            return None
         h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
-        t = self.terms(q0, q1, h, order)
-        c = t.g.exp()
+        force = self._forces(q0, q1, h, 1, u, None)
+        assert force is not None
+        return force.minus, force.plus
+
+    def at(self, u: Tensor) -> DrivenLagrangian:
+        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        if not self.config.inputs:
+            raise InputError("this model has no inputs; build it with level='forced' and inputs=m in its ModelConfig")
+        return DrivenLagrangian(self, u)
+
+    def forward(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
+    ) -> Tensor | Partials:
+        """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
+        if not order:
+            return self.partials(q0, q1, s0, h, 1).L
+        return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
+
+    def _evaluate(
+        self,
+        q0: Tensor,
+        q1: Tensor,
+        s0: Tensor,
+        h: Tensor | float,
+        order: int,
+        u: Tensor | None,
+        delta: Tensor | None,
+    ) -> Partials:
+        h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
+        t = self.terms(q0, q1, h, order, delta)
+        if self.action is not None:
+            return action_partials(self._through_action(self.action, t, s0, h, order))
+        c = None if t.g is None else t.g.exp()
         if t.K is None or t.V0 is None or t.V1 is None:
             assert t.N is not None  # checked by ModelConfig
-            L = t.N + (c - 1.0) * s0
+            L = t.N if c is None else t.N + (c - 1.0) * s0
         else:
-            L = (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - h / 2 * (t.V0 + t.V1)
+            V = h / 2 * (t.V0 + t.V1)
+            L = t.K - V if c is None or t.g is None else (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - V
             L = L if t.N is None else L + t.N
-        return _partials(L, t.g, c, q0.shape[-1], s0)
+        return affine_partials(L, t.g, c, s0, self._forces(q0, q1, h, order, u, delta))
 
-    def forward(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0) -> Tensor | Partials:
-        """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
-        return self.partials(q0, q1, s0, h, order) if order else self.partials(q0, q1, s0, h, 1).L
+    def _through_action(self, action: ActionFlow, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
+        """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
+        size = 2 * self.dof + 1
+        wide = lambda jet: None if jet is None else jet.embed(size, 0)  # noqa: E731
+        s, K, V0, V1, N, b = variable(s0, size - 1, size, order), *map(wide, (t.K, t.V0, t.V1, t.N, t.b))
+        assert isinstance(t.g, Jet)
+        assert b is not None
+        half_c = (t.g / 2).expm1().embed(size, 0)  # √c − 1
+        gained = s * 0.0 if V0 is None else -h / 2 * V0
+        gained = action(s, gained, b, h)
+        gained = gained + half_c * (s + gained)
+        gained = gained if K is None else gained + K
+        gained = gained + half_c * (s + gained)
+        gained = action(s, gained, b, h, backward=True)
+        gained = gained if V1 is None else gained - h / 2 * V1
+        return gained if N is None else gained + N
+
+    def _forces(
+        self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None
+    ) -> Forces | None:
+        if self.friction is None:
+            return None
+        assert isinstance(self.damping, LinearDamping)
+        v = (q1 - q0 if delta is None else delta) / h[..., None]
+        return self.friction(v, self.damping(q0, q1, h, order).exp(), h, order, u)
 
 
-def _partials(L: Jet, g: Tensor | Jet, c: Tensor | Jet, n: int, s0: Tensor) -> Partials:
-    """Split the jet over (q0, q1) into the blocks of `Partials`; L_d is affine in s0, so D3 = c − 1."""
-    gradient = L.gradient.movedim(0, -1)
-    zero = torch.zeros_like(gradient[..., :n])
-    D3 = torch.expm1(g.value if isinstance(g, Jet) else g).expand(s0.shape)
-    first = {"L": L.value, "D1": gradient[..., :n], "D2": gradient[..., n:], "D3": D3}
-    if L.order == 1:
-        return Partials(**first)
-    H = L.hessian().movedim((0, 1), (-2, -1))
-    dc = c.gradient.movedim(0, -1) if isinstance(c, Jet) else torch.cat([zero, zero], -1)
-    return Partials(
-        **first,
-        D11=H[..., :n, :n],
-        D12=H[..., :n, n:],
-        D22=H[..., n:, n:],
-        D13=dc[..., :n],
-        D23=dc[..., n:],
-        D33=torch.zeros_like(D3),
-    )
+@dataclass(frozen=True)
+class DrivenLagrangian:
+    """A model with its inputs at one step's value: a discrete Lagrangian with closed-form derivatives and forces."""
+
+    model: ContactLagrangian
+    u: Tensor  # (..., m)
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """L_d, shape (...)."""
+        return self.partials(q0, q1, s0, h).L
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
+        """See `herglotz.mechanics.partials`."""
+        return self.model.partials(q0, q1, s0, h, order, self.u)
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """`partials` at (q0, q0 + Δ, s0)."""
+        return self.model.partials_increment(q0, delta, s0, h, order, self.u)
+
+    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+        """F⁻ and F⁺, each (..., n)."""
+        return self.model.forces(q0, q1, s0, h, self.u)

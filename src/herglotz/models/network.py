@@ -9,9 +9,11 @@ from torch import Tensor, nn
 
 from herglotz.models.jet import Jet, affine, concatenate
 
+ACTIVATIONS = ("tanh", "softplus", "silu")
+
 
 class Network(nn.Module):
-    """tanh perceptron R^m → R with a zero-initialised last layer, so that a new model equals its baseline.
+    """Perceptron R^m → R (or R^k) with a zero-initialised last layer, so that a new model equals its baseline.
 
     (`zero=False` draws the last layer too, for a model that has no baseline.)
 
@@ -27,12 +29,26 @@ class Network(nn.Module):
         Source of the initial weights.
     zero
         Start the last layer at zero.
+    outputs
+        Length k of the result; None for a scalar.
+    activation
+        One of `ACTIVATIONS`: smooth, so that the Hessian is no zero (trap 6).
     """
 
     def __init__(
-        self, inputs: int, width: int, depth: int, gain: float, generator: torch.Generator, *, zero: bool = True
+        self,
+        inputs: int,
+        width: int,
+        depth: int,
+        gain: float,
+        generator: torch.Generator,
+        *,
+        zero: bool = True,
+        outputs: int | None = None,
+        activation: str = "tanh",
     ):
         super().__init__()
+        self.activation, self.scalar = activation, outputs is None
         sizes = [inputs] + [width] * depth
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
@@ -40,17 +56,24 @@ class Network(nn.Module):
             weight, bias = (torch.randn(b, k, generator=generator, dtype=torch.float64) for k in (a, 1))
             self.weights.append(nn.Parameter(weight * (gain / a**0.5)))
             self.biases.append(nn.Parameter(bias[:, 0] * gain))
-        last = torch.zeros(1, width, dtype=torch.float64)
+        last = torch.zeros(outputs or 1, width, dtype=torch.float64)
         if not zero:
-            last = torch.randn(1, width, generator=generator, dtype=torch.float64) / width**0.5
+            last = torch.randn(outputs or 1, width, generator=generator, dtype=torch.float64) / width**0.5
         self.weights.append(nn.Parameter(last))
 
     def forward(self, x: Jet) -> Jet:
-        """The network of a jet of features (..., m); the result is a scalar jet, shape (...)."""
+        """The network of a jet of features (..., m); the result is a scalar jet, or (..., k)."""
         hidden = list(self.weights)[:-1]
         for weight, bias in zip(hidden, self.biases, strict=True):
-            x = x.linear(weight, bias).tanh()
-        return x.linear(self.weights[len(hidden)]).select(0)
+            x = _activate(x.linear(weight, bias), self.activation)
+        last = self.weights[len(hidden)]
+        return x.linear(last).select(0) if self.scalar else x.linear(last)
+
+
+def _activate(x: Jet, activation: str) -> Jet:
+    if activation == "tanh":
+        return x.tanh()
+    return x.softplus() if activation == "softplus" else x.silu()
 
 
 def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]) -> Jet:
@@ -67,8 +90,10 @@ def feature_count(angles: tuple[bool, ...]) -> int:
     return sum(2 if angle else 1 for angle in angles)
 
 
-def midpoint_velocity_jets(q0: Tensor, q1: Tensor, h: Tensor, order: int) -> tuple[Jet, Jet]:
-    """q̄ = (q0 + q1)/2 and v = (q1 − q0)/h as jets over the 2n components of (q0, q1)."""
+def midpoint_velocity_jets(
+    q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None
+) -> tuple[Jet, Jet]:
+    """q̄ = (q0 + q1)/2 and v = Δ/h as jets over the 2n components of (q0, q1); Δ = q1 − q0 unless it is given."""
     n = q0.shape[-1]
     eye = torch.eye(n, dtype=q0.dtype, device=q0.device)
     shape = torch.broadcast_shapes(q0.shape[:-1], h.shape)
@@ -76,5 +101,5 @@ def midpoint_velocity_jets(q0: Tensor, q1: Tensor, h: Tensor, order: int) -> tup
     rate = 1 / h.expand(shape)[..., None]  # (..., 1)
     eye_v = eye.reshape(n, *(1,) * len(shape), n) * rate  # (n, ..., n)
     mean = affine((q0 + q1) / 2, torch.cat([eye, eye]) / 2, order)
-    velocity = affine((q1 - q0) * rate, torch.cat([-eye_v, eye_v]), order)
+    velocity = affine((q1 - q0 if delta is None else delta) * rate, torch.cat([-eye_v, eye_v]), order)
     return mean, velocity

@@ -11,13 +11,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.jet import Jet, concatenate, coordinates, pairs
-from herglotz.models.network import (
-    Network,
-    feature_count,
-    midpoint_velocity_jets,
-    position_features,
-)
+from herglotz.models.jet import Jet, coordinates, pairs
+from herglotz.models.network import Network, feature_count, position_features
+from herglotz.models.phase import Phase
 
 
 class Kinetic(nn.Module):
@@ -32,20 +28,24 @@ class Kinetic(nn.Module):
         self.log_diagonal = nn.Parameter(torch.zeros(dof - 1, dtype=torch.float64))
         self.off_diagonal = nn.Parameter(torch.zeros(dof * (dof - 1) // 2, dtype=torch.float64))
 
-    def mass(self) -> Tensor:
-        """The mass matrix, shape (n, n)."""
+    def factor(self) -> Tensor:
+        """C, lower triangular with C₁₁ = 1, shape (n, n)."""
         d = self.log_diagonal
         if self.dof == 1:
             return torch.ones(1, 1, dtype=d.dtype, device=d.device)
         C = torch.diag_embed(torch.cat([torch.ones(1, dtype=d.dtype, device=d.device), d.exp()]))
         i, j = torch.tril_indices(self.dof, self.dof, -1, device=d.device)
-        C = C.index_put((i, j), self.off_diagonal)
-        return C @ C.T
+        return C.index_put((i, j), self.off_diagonal)
 
-    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
-        """K as a jet over (q0, q1)."""
+    def mass(self) -> Tensor:
+        """The mass matrix, shape (n, n)."""
+        C = self.factor()
+        return C if self.dof == 1 else C @ C.T
+
+    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Jet:
+        """K as a jet over (q0, q1); Δ = q1 − q0 unless it is given."""
         n = self.dof
-        delta = q1 - q0
+        delta = q1 - q0 if delta is None else delta
         m = self.mass()
         momentum = delta @ m / h[..., None]  # (..., n)
         value = (momentum * delta).sum(-1) / 2
@@ -75,6 +75,7 @@ class Potential(nn.Module):
         width: int,
         depth: int,
         generator: torch.Generator,
+        activation: str = "tanh",
     ):
         super().__init__()
         self.angles = angles
@@ -82,7 +83,9 @@ class Potential(nn.Module):
         self.energy = sum(v * v for v in speed)
         self.stiffness = nn.Parameter(torch.tensor(stiffness, dtype=torch.float64))
         self.tilt = nn.Parameter(torch.tensor(tilt, dtype=torch.float64))
-        self.network = Network(feature_count(angles), width, depth, 1.0, generator) if width else None
+        self.network: Network | None = None
+        if width:
+            self.network = Network(feature_count(angles), width, depth, 1.0, generator, activation=activation)
 
     def baseline(self, q: Jet) -> Jet:
         """The part of V that no network is needed for."""
@@ -138,27 +141,29 @@ class AffineDamping(nn.Module):
         width: int,
         depth: int,
         generator: torch.Generator,
+        activation: str = "tanh",
     ):
         super().__init__()
         self.angles, self.scale, self.speed = angles, scale, speed
         self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
         self.drag = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
-        self.network = Network(feature_count(angles) + len(angles), width, depth, 0.3, generator) if width else None
+        self.network: Network | None = None
+        if width:
+            inputs = feature_count(angles) + len(angles)
+            self.network = Network(inputs, width, depth, 0.3, generator, activation=activation)
 
-    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
+    def forward(self, phase: Phase) -> Jet:
         """The exponent g as a jet over (q0, q1)."""
-        mean, velocity = midpoint_velocity_jets(q0, q1, h, order)
-        g = (velocity * self.drag).sum() - self.rate
+        g = (phase.velocity * self.drag).sum() - self.rate
         if self.network is not None:
-            g = g - self.network(_phase_features(mean, velocity, self.angles, self.scale, self.speed))
-        return g * h
+            g = g - self.network(phase.features)
+        return g * phase.h
 
     def departure(self, q: Tensor, v: Tensor) -> Tensor | None:
         """The network's rate G(q, v), shape (...), or None without a network."""
         if self.network is None:
             return None
-        mean, velocity = midpoint_velocity_jets(q - v / 2, q + v / 2, q.new_ones(()), 1)
-        return self.network(_phase_features(mean, velocity, self.angles, self.scale, self.speed)).value
+        return self.network(Phase(q - v / 2, q + v / 2, q.new_ones(()), 1, self).features).value
 
 
 class Correction(nn.Module):
@@ -178,24 +183,14 @@ class Correction(nn.Module):
         depth: int,
         generator: torch.Generator,
         alone: bool = False,
+        activation: str = "tanh",
     ):
         super().__init__()
         self.angles, self.scale, self.speed = angles, scale, speed
         self.energy = sum(v * v for v in speed)
         inputs, gain = feature_count(angles) + len(angles), 1.0 if alone else 0.1
-        self.network = Network(inputs, width, depth, gain, generator, zero=not alone)
+        self.network = Network(inputs, width, depth, gain, generator, zero=not alone, activation=activation)
 
-    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Jet:
+    def forward(self, phase: Phase) -> Jet:
         """N as a jet over (q0, q1)."""
-        mean, velocity = midpoint_velocity_jets(q0, q1, h, order)
-        x = _phase_features(mean, velocity, self.angles, self.scale, self.speed)
-        return self.network(x) * (h * self.energy)
-
-
-def _phase_features(
-    mean: Jet, velocity: Jet, angles: tuple[bool, ...], scale: tuple[float, ...], speed: tuple[float, ...]
-) -> Jet:
-    """Features of the position, then v / speed: what a network of (q̄, v) reads."""
-    x = position_features(mean, angles, scale)
-    v = Jet(velocity.data / velocity.data.new_tensor(speed), velocity.tangents, velocity.order)
-    return concatenate([x, v])
+        return self.network(phase.features) * (phase.h * self.energy)

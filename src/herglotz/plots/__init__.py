@@ -10,6 +10,7 @@ from herglotz.errors import InputError
 from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.motion import plot_data, plot_trajectory
+from herglotz.plots.parachute import plot_fall, plot_printed_map
 from herglotz.plots.phase import plot_phase_portrait
 from herglotz.plots.selection import plot_selection
 from herglotz.plots.style import save_figure
@@ -55,9 +56,11 @@ __all__ = [
     "FIGURES",
     "plot_bands",
     "plot_data",
+    "plot_fall",
     "plot_hamilton_jacobi_residual",
     "plot_momentum_vs_generating_function",
     "plot_phase_portrait",
+    "plot_printed_map",
     "plot_selection",
     "plot_training",
     "plot_trajectory",

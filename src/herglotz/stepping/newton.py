@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
+from math import isfinite
+from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_jacobian, momentum_residual, partials
+from herglotz.mechanics import DiscreteLagrangian, Partials
+from herglotz.stepping.equation import End, Equation, PartialsEquation
+from herglotz.stepping.newton_one import CLOSE, CONTRACTION, Found, find_one
 
 
 class Status(IntEnum):
@@ -18,24 +22,51 @@ class Status(IntEnum):
     MAX_ITERATIONS = 1  # no convergence within the allowed iterations
     SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
     DIVERGED = 3  # a value stopped being finite
+    STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
+
+
+@runtime_checkable
+class Increments(Protocol):
+    """A closed form that takes Δ = q1 − q0 in place of q1, so that nothing cancels when the step is small."""
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """`partials` at (q0, q0 + Δ, s0)."""
+        ...
 
 
 @dataclass(frozen=True)
 class Solution:
-    """The solved step; `P` (order 2) is evaluated at q1, so nothing has to be computed again."""
+    """The solved step; `P` is evaluated at q1, so nothing has to be computed again."""
 
     q1: Tensor  # (..., n)
-    P: Partials
+    P: Partials  # of order 2 unless `order=1` was asked for
     status: Tensor  # (...) Status values, uint8
     residual: Tensor  # (...) |J⁻¹F|, the error left in q1, in units of q
     iterations: int
+    increment: Tensor | None = None  # (..., n) Δ = q1 − q0 before rounding, where it was the unknown
 
 
 def solve(matrix: Tensor, vector: Tensor) -> Tensor:
-    """matrix⁻¹ vector without an exception: inf or nan where the matrix is singular; division for n = 1."""
-    if matrix.shape[-1] == 1:
+    """matrix⁻¹ vector without an exception: inf or nan where the matrix is singular; written out for n ≤ 2."""
+    n = matrix.shape[-1]
+    if n == 1:
         return vector / matrix[..., 0]
+    if n == 2:
+        return _eliminate(matrix, vector)
     return torch.linalg.solve_ex(matrix, vector[..., None])[0][..., 0]
+
+
+def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Gauss with a row exchange, for n = 2."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y = vector.unbind(-1)
+    swap = c.abs() > a.abs()
+    a, c = torch.where(swap, c, a), torch.where(swap, a, c)
+    b, d = torch.where(swap, d, b), torch.where(swap, b, d)
+    x, y = torch.where(swap, y, x), torch.where(swap, x, y)
+    factor = c / a
+    y = (y - factor * x) / (d - factor * b)
+    return torch.stack([(x - b * y) / a, y], -1)
 
 
 def solve_step(
@@ -47,51 +78,116 @@ def solve_step(
     guess: Tensor,  # (..., n) where the iteration starts
     tol: float,
     max_iterations: int = 30,
+    order: int = 2,
+    increments: bool = False,
 ) -> Solution:
     """Solve F(q1) = D1 L_d(q0, q1, s0) + c p0 = 0 for q1 (FL⁻ inverted; never through H⁺, erratum E4).
 
     A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples do not
-    influence one another: each has its own step length and its own status.
+    influence one another: each has its own Jacobian, its own step length and its own status.
+
+    Parameters
+    ----------
+    order
+        Derivatives of L_d in the result. With 1, an iteration that starts close to the solution keeps its Jacobian
+        and costs first derivatives only; the answer is the same to `tol`.
+    increments
+        Take Δ = q1 − q0 for the unknown, for an L_d with `partials_increment`: no cancellation at small h.
+        Convergence is then relative to the size of Δ.
     """
-    q1, P = guess, partials(L_d, q0, guess, s0, h, order=2)
-    delta, merit = _newton_direction(P, p0)
-    scale = torch.maximum(q0.abs().amax(-1), torch.maximum(guess.abs().amax(-1), delta.abs().amax(-1)))
-    scale = torch.nan_to_num(scale, nan=1.0, posinf=1.0)
-    done = _length(delta) <= tol * scale
-    length = torch.ones_like(merit)
-    floor = 1e3 * torch.finfo(q0.dtype).eps
-    iterations = 0
-    while not bool(done.all()) and iterations < max_iterations:
-        iterations += 1
-        move = torch.where(done[..., None], 0.0, length[..., None] * delta)
-        trial = q1 + move
-        P_trial = partials(L_d, q0, trial, s0, h, order=2)
-        delta_trial, merit_trial = _newton_direction(P_trial, p0)
-        better = merit_trial <= (1 - 1e-4 * length) * merit
-        settled = _length(delta_trial) <= tol * scale
-        stalled = ~better & (_length(delta) <= floor * scale)  # rounding, not a wrong direction
-        accept = ~done & (better | settled)
-        q1 = _where(accept, trial, q1)
-        P = P_trial.map(lambda new, old, accept=accept: _where(accept, new, old), P)
-        delta, merit = _where(accept, delta_trial, delta), torch.where(accept, merit_trial, merit)
-        length = torch.where(accept, 1.0, length / 2)
-        done = done | settled | stalled
+    assert not increments or isinstance(L_d, Increments)
+    equation = PartialsEquation(L_d, q0, p0, s0, h, order, increments)
+    found = find_root(equation, q0, guess, tol, max_iterations, order, increments)
+    P = found.point.rest
+    status, _ = status_of(found, End(P.D2, P.L, P.c))
+    if increments:
+        return Solution(q0 + found.x, P, status, found.residual, found.iterations, found.x)
+    return Solution(found.x, P, status, found.residual, found.iterations)
+
+
+def find_root(
+    equation: Equation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
+) -> Found:
+    """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
+    x = guess - q0 if increments else guess
+    if x.shape[:-1].numel() == 1:
+        return find_one(equation, q0, x, tol, max_iterations, order, increments)
+    point = equation(x, True)
+    assert point.J is not None
+    J = point.J
+    delta, merit = _direction(J, point.F)
     residual = _length(delta)
-    finite = torch.isfinite(merit) & torch.isfinite(P.L)
+    size = _length(x) + _length(solve(J, equation.push(point))) if increments else _length(q0)
+    scale = torch.maximum(size, torch.maximum(_length(x), residual))
+    limits = torch.finfo(scale.dtype)  # the floor: tolerances of denormal size would keep a motion from coming to rest
+    scale = torch.nan_to_num(scale, nan=1.0, posinf=1.0).clamp(min=limits.tiny / limits.eps)
+    tiny, floor, near = tol * scale, 1e3 * limits.eps * scale, CLOSE * scale
+    # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
+    done = (residual <= tiny) | ~torch.isfinite(residual)
+    length: Tensor | None = None  # None: every sample takes full steps
+    slow: Tensor | None = None  # samples whose old Jacobian has served its time
+    mixed, iterations = False, 0
+    while iterations < max_iterations and not bool(done.all()):
+        iterations += 1
+        move = delta if length is None else length[..., None] * delta
+        trial = x + torch.where(done[..., None], 0.0, move)
+        fresh = ~done & (residual > near)  # at a trial that may be far off, the Jacobian is wanted as well
+        fresh = fresh if slow is None else fresh | slow
+        second = order == 2 or bool(fresh.any())
+        point_trial, J_trial = equation(trial, second), J
+        if second:
+            assert point_trial.J is not None
+            J_trial = _where(fresh, point_trial.J, J) if order == 1 else point_trial.J
+        delta_trial, merit_trial = _direction(J_trial, point_trial.F)
+        left = _length(delta_trial)
+        settled = left <= tiny
+        gain = (1 - 1e-4) if length is None else 1 - 1e-4 * length
+        better = (merit_trial <= gain * merit) | settled
+        stalled = ~better & (residual <= floor)  # rounding, not a wrong direction
+        slow = None
+        if order == 1:
+            slow = ~fresh & ~done & ~settled & (left > CONTRACTION * residual) & torch.isfinite(left)
+            better = better | (slow & ~stalled)
+        accept = better & ~done
+        done_next = done | settled | stalled
+        if bool((better | done).all()):  # a done sample's trial is its own x: nothing to select
+            x, J, delta, merit, residual = trial, J_trial, delta_trial, merit_trial, left
+            point, mixed = point_trial, False
+            length = None if length is None else torch.ones_like(merit)
+        else:
+            x, J, delta = (_where(accept, new, old) for new, old in ((trial, x), (J_trial, J), (delta_trial, delta)))
+            merit, residual = torch.where(accept, merit_trial, merit), torch.where(accept, left, residual)
+            mixed = True  # the points of the samples are from different trials
+            length = torch.where(accept, 1.0, (torch.ones_like(merit) if length is None else length) / 2)
+        done = done_next
+    point = equation(x, order == 2) if mixed else point
+    return Found(x, point, merit, residual, done, iterations, healthy=False)
+
+
+def status_of(found: Found, end: End) -> tuple[Tensor, bool]:
+    """The status of each sample, and whether all of them have converged."""
+    merit, residual, done, L, c = found.merit, found.residual, found.done, end.L, end.c
+    if found.healthy:
+        good = isfinite(L.item()) and c.item() != 0
+    else:
+        good = bool((done & torch.isfinite(residual + merit + L) & (c != 0)).all())
+    if good:
+        return torch.zeros_like(merit, dtype=torch.uint8), True
+    finite = torch.isfinite(merit) & torch.isfinite(L)
     status = torch.full_like(merit, Status.MAX_ITERATIONS, dtype=torch.uint8)
     status = torch.where(done, Status.CONVERGED, status)
-    status = torch.where(~torch.isfinite(residual) | (P.c == 0), Status.SINGULAR, status)
-    status = torch.where(finite, status, Status.DIVERGED)
-    return Solution(q1, P, status.to(torch.uint8), residual, iterations)
+    status = torch.where(~torch.isfinite(residual) | (c == 0), Status.SINGULAR, status)
+    return torch.where(finite, status, Status.DIVERGED).to(torch.uint8), False
 
 
-def _newton_direction(P: Partials, p0: Tensor) -> tuple[Tensor, Tensor]:
+def _direction(J: Tensor, F: Tensor) -> tuple[Tensor, Tensor]:
     """−J⁻¹F and |F|."""
-    F = momentum_residual(P, p0)
-    return -solve(momentum_jacobian(P, p0), F), _length(F)
+    return -solve(J, F), _length(F)
 
 
 def _length(x: Tensor) -> Tensor:
+    if x.shape[-1] == 1:
+        return x[..., 0].abs()
     return x.abs().amax(-1) if x.shape[-1] else x.sum(-1)
 
 

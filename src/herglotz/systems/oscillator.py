@@ -12,7 +12,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
-from herglotz.systems.rules import all_rules
+from herglotz.systems.rules import all_rules, strang
 from herglotz.systems.scene import Scene, State, Step
 from herglotz.systems.special import as_step, cosw, sincw, versw
 
@@ -94,11 +94,14 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
     L_d = ExactOscillator(m, omega0, gamma)
     stiffness = m * omega0**2
 
+    def potential(q: Tensor) -> Tensor:
+        return 0.5 * stiffness * (q * q).sum(-1)
+
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * m * (v * v).sum(-1) - 0.5 * stiffness * (q * q).sum(-1) - gamma * s
+        return 0.5 * m * (v * v).sum(-1) - potential(q) - gamma * s
 
     def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return (p * p).sum(-1) / (2 * m) + 0.5 * stiffness * (q * q).sum(-1) + gamma * s
+        return (p * p).sum(-1) / (2 * m) + potential(q) + gamma * s
 
     def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
@@ -144,10 +147,11 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
         flow=flow,
         L_d=L_d,
         exact=True,
-        L_d_rules=all_rules(lagrangian),
+        L_d_rules={**all_rules(lagrangian), "strang": strang(potential, m, gamma)},
         q_range=(-1.5, 1.5),
         v_range=(-1.5, 1.5),
         h=0.1,
         H_plus=H_plus,
         H_minus=H_minus,
+        examples=({"m": 1.7, "omega0": 1.3, "gamma": 0.6}, {"m": 0.6, "omega0": 0.7, "gamma": 3.1}),
     )

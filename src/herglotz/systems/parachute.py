@@ -139,6 +139,26 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
         q1 = q0 + (torch.log1p(2 * (p - a) / (B + 2 * a + root)) / lam)[..., None]
         return (p1 * q1).sum(-1) - L_d(q0, q1, s0, h)
 
+    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = −p0·q0 − (s1 − s0), q0 = q1 + ln(y)/λ, where (a − B)y² + By = p0, on the branch that tends to q1.
+
+        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); solved for y − 1, which is
+        O(h). y = C − λv0S along the flow, whose branch it is while 2(1 − a/B)y > 1; beyond that fold H⁻ is not
+        single-valued, and NaN where the root is not real.
+        """
+        h = as_step(h, q1)
+        S, t = L_d.coefficients(h)
+        B = m / (lam * S)
+        a = 2 * lam * s1 - m * g * h * (0.5 * t - torch.exp(2 * lam * q1[..., 0]))
+        p = p0[..., 0]
+        root = torch.sign(B) * torch.sqrt(B**2 - 4 * (B - a) * p)
+        delta = -torch.log1p(2 * (a - p) / (B - 2 * a + root)) / lam
+        q0 = q1 - delta[..., None]
+        # L_d = e^{2λΔ}s0 − s0 + A, solved for s1 − s0 at fixed s1.
+        A = L_d(q0, q1, torch.zeros_like(s1), h)
+        increment = A * torch.exp(-2 * lam * delta) - torch.expm1(-2 * lam * delta) * s1
+        return -(p0 * q0).sum(-1) - increment
+
     def strang_exponential(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """L_d = (e^{2λΔ}−1)(s0 − hV0/2) + (m/2λ²h)(e^{λΔ}−1)² − (h/2)(V0+V1): order 2, explicit, c = e^{2λΔ}."""
         h = as_step(h, q0)
@@ -167,4 +187,6 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
         v_range=(-20.0, 5.0),
         h=0.1,
         H_plus=H_plus,
+        H_minus=H_minus,
+        examples=({"m": 1.4, "g": 7.0, "lam": 0.012},),
     )

@@ -8,8 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from herglotz.systems.exact import exact_discrete_lagrangian
+from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules
+from herglotz.systems.rules import all_rules, strang
 from herglotz.systems.scene import Scene, State, Step
 
 
@@ -31,14 +33,19 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
     def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         return 0.5 * p[..., 0] ** 2 + potential(q) + gamma * s
 
-    def vector_field(q: Tensor, p: Tensor, s: Tensor) -> State:
-        """X_H written out, so that the flow is differentiable; a test holds it to `contact_vector_field`."""
-        return p, -torch.sin(q) - gamma * p, lagrangian(q, p, s)
+    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return v
+
+    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return -torch.sin(q)
+
+    # Written out, so that the flow is differentiable and fast; a test holds it to `contact_vector_field`.
+    motion = herglotz_motion(lagrangian, momentum, momentum, force, constant_rate(-gamma))
 
     def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(vector_field, q, p, s, h)
+        return reference_flow(motion.vector_field, q, p, s, h)
 
-    rules = all_rules(lagrangian)
+    rules = {**all_rules(lagrangian), "strang": strang(potential, 1.0, gamma)}
     return Scene(
         name="damped_pendulum",
         description="damped pendulum, θ̈ = −sin θ − γθ̇; no closed form, reference flow to about 1e-13",
@@ -50,8 +57,8 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
         parameters={"gamma": gamma},
         hamiltonian=hamiltonian,
         lagrangian=lagrangian,
-        momentum=lambda q, v, s: v,  # noqa: ARG005
-        velocity=lambda q, p, s: p,  # noqa: ARG005
+        momentum=momentum,
+        velocity=momentum,
         flow=flow,
         L_d=rules["midpoint_heun"],
         exact=False,
@@ -59,4 +66,6 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
         q_range=(-2.5, 2.5),
         v_range=(-1.5, 1.5),
         h=0.5,
+        numerical=exact_discrete_lagrangian(motion),
+        examples=({"gamma": 0.35},),
     )

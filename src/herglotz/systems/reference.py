@@ -21,6 +21,8 @@ Derivative = Callable[[Tensor], Tensor]
 # |weights|: 26 with these six columns; two more would gain order and make it 119, above the tolerance at h ≥ 5.
 SEQUENCE = (2, 4, 6, 8, 10, 12)
 
+HOPELESS = 8  # substeps with which a sample that is still not finite is given up
+
 
 @dataclass(frozen=True)
 class ReferenceSolution:
@@ -56,24 +58,44 @@ def reference_solve(
     h = torch.as_tensor(h, dtype=torch.float64, device=q.device)
     batch = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, h.shape)
     x0 = torch.cat([q.expand(*batch, n), p.expand(*batch, n), s.expand(batch)[..., None]], -1).double()
-    span = h.expand(batch)[..., None]
 
     def f(x: Tensor) -> Tensor:
         q_dot, p_dot, s_dot = vector_field(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
         return torch.cat([q_dot, p_dot, s_dot[..., None]], -1)
 
-    substeps = 1
+    x, error = integrate(f, x0, h.expand(batch), tolerance, max_substeps)
+    x = x.to(dtype)
+    return ReferenceSolution(x[..., :n], x[..., n : 2 * n], x[..., 2 * n], error)
+
+
+def integrate(
+    f: Derivative,  # (..., d) → (..., d)
+    x0: Tensor,  # (..., d)
+    span: Tensor,  # (...)
+    tolerance: float = 1e-13,
+    max_substeps: int = 128,
+) -> tuple[Tensor, Tensor]:
+    """Integrate ẋ = f(x), the number of substeps doubled until a sample agrees with itself.
+
+    Returns
+    -------
+    tuple of Tensor
+        x at the end, (..., d), and the error of the coarser of its last two results, (...).
+    """
+    substeps, span = 1, span[..., None]
     x = _integrate(f, x0, span, substeps)
-    error = torch.full(batch, torch.inf, dtype=torch.float64, device=q.device)
-    while substeps < max_substeps and not bool((error <= tolerance).all()):
+    error = torch.full(x0.shape[:-1], torch.inf, dtype=x0.dtype, device=x0.device)
+    while substeps < max_substeps:
+        hopeless = ~torch.isfinite(error) & (substeps >= HOPELESS)
+        if bool(((error <= tolerance) | hopeless).all()):
+            break
         substeps *= 2
         finer = _integrate(f, x0, span, substeps)
         difference = ((finer - x).abs() / (1.0 + finer.abs())).amax(-1).detach()
         done = error <= tolerance
         x = torch.where(done[..., None], x, finer)
         error = torch.where(done, error, difference)
-    x = x.to(dtype)
-    return ReferenceSolution(x[..., :n], x[..., n : 2 * n], x[..., 2 * n], error)
+    return x, error
 
 
 def reference_flow(

@@ -7,15 +7,28 @@ import math
 from collections.abc import Callable
 
 from herglotz.errors import InputError
+from herglotz.systems.double_pendulum import double_pendulum
+from herglotz.systems.kepler import kepler
+from herglotz.systems.linear_drag import linear_drag
+from herglotz.systems.nonlinear_action import nonlinear_action
 from herglotz.systems.oscillator import damped_oscillator
 from herglotz.systems.parachute import parachute
 from herglotz.systems.pendulum import damped_pendulum
+from herglotz.systems.quadratic_drag import quadratic_drag
 from herglotz.systems.scene import Scene
 
 SCENES: dict[str, Callable[..., Scene]] = {
-    "damped_oscillator": damped_oscillator,
-    "damped_pendulum": damped_pendulum,
-    "parachute": parachute,
+    make.__name__: make
+    for make in (
+        damped_oscillator,
+        damped_pendulum,
+        double_pendulum,
+        kepler,
+        linear_drag,
+        nonlinear_action,
+        parachute,
+        quadratic_drag,
+    )
 }
 
 

@@ -12,6 +12,7 @@ from herglotz.mechanics import DiscreteLagrangian
 StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
 State = tuple[Tensor, Tensor, Tensor]
 Step = Tensor | float
+Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), a number or one a coordinate
 
 
 @dataclass(frozen=True)
@@ -37,7 +38,12 @@ class Scene:
         Right and left discrete Hamiltonians of `L_d`, H⁺(q0, p1, s0, h) and H⁻(p0, q1, s1, h) with the conventions of
         errata E5 and E9; None where no closed form is known.
     q_range, v_range, h
-        Typical initial positions, initial velocities and step: where examples and generated data start.
+        Typical initial positions, initial velocities and step: where examples and generated data start. A range is
+        (low, high), each a number or a tuple of `dof` numbers.
+    numerical
+        The exact L_d computed by shooting (`herglotz.systems.exact`), for a scene without a closed form.
+    examples
+        Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
     """
 
     name: str
@@ -56,8 +62,15 @@ class Scene:
     L_d: DiscreteLagrangian
     exact: bool
     L_d_rules: Mapping[str, DiscreteLagrangian]
-    q_range: tuple[float, float]
-    v_range: tuple[float, float]
+    q_range: Range
+    v_range: Range
     h: float
     H_plus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
     H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
+    numerical: DiscreteLagrangian | None = None
+    examples: tuple[Mapping[str, float], ...] = ()
+
+    @property
+    def L_d_exact(self) -> DiscreteLagrangian | None:
+        """The exact discrete Lagrangian: `L_d` where it is one, else the numerical one, else None."""
+        return self.L_d if self.exact else self.numerical

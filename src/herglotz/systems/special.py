@@ -36,6 +36,11 @@ def versw(x: Tensor) -> Tensor:
     return 0.5 * x * sincw(0.25 * x) ** 2
 
 
+def expm1w(x: Tensor) -> Tensor:
+    """(eˣ − 1)/x, 1 at 0; entire in x, any number of derivatives: e^{x/2} sinh(x/2)/(x/2)."""
+    return torch.exp(0.5 * x) * sincw(-0.25 * x * x)
+
+
 def as_step(h: Tensor | float, like: Tensor) -> Tensor:
     """The time step h, a number or a tensor, in the dtype and on the device of `like`."""
     return torch.as_tensor(h, dtype=like.dtype, device=like.device)

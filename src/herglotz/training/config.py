@@ -9,6 +9,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
+from herglotz.models.network import ACTIVATIONS
 from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
@@ -23,7 +24,9 @@ class FitConfig:
     Parameters
     ----------
     level
-        "linear" (one damping rate) or "affine" (damping depends on position and velocity).
+        "conservative" (no damping), "linear" (one damping rate), "affine" (damping depends on position and velocity),
+        "full" (on s as well; s at the start is unknown, so fit several seeds) or "forced" (one rate, and friction of
+        each joint).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
         "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
@@ -47,6 +50,14 @@ class FitConfig:
         trajectory fitting.
     learning_rate
         Of Adam.
+    activation
+        Of the networks: tanh, softplus or silu.
+    mass_width
+        Hidden units of a mass that depends on position; 0 for a constant one.
+    action_width
+        Units of the full level's map of s.
+    coulomb
+        Dry friction beside the viscous one at the forced level.
     """
 
     level: str = "linear"
@@ -62,12 +73,19 @@ class FitConfig:
     damping_width: int = 6
     correction_width: int = 16
     learning_rate: float = 3e-3
+    activation: str = "tanh"
+    mass_width: int = 0
+    action_width: int = 4
+    coulomb: bool = False
 
     def __post_init__(self):
         _choice("level", self.level, LEVELS)
         _choice("objective", self.objective, OBJECTIVES)
         _choice("optimiser", self.optimiser, OPTIMISERS)
         _choice("dtype", self.dtype, tuple(DTYPES))
+        _choice("activation", self.activation, ACTIVATIONS)
+        if self.coulomb and self.level != "forced":
+            raise InputError(f"coulomb is friction of the joints; set level='forced', not '{self.level}'")
         if not 0 < self.train_fraction <= 1:
             raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
         if self.iterations < 1:

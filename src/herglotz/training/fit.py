@@ -194,6 +194,10 @@ def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian
             correction_width=config.correction_width if network != "potential" else 0,
             baseline=network != "plain",
             seed=config.seed,
+            activation=config.activation,
+            mass_width=config.mass_width if network != "plain" else 0,
+            action_width=config.action_width,
+            coulomb=config.coulomb,
         )
     )
     return model.to(dtype=config.torch_dtype, device=config.device)

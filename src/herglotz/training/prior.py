@@ -11,6 +11,10 @@ from herglotz.models.jet import coordinates
 from herglotz.models.terms import AffineDamping
 from herglotz.training.flat import FlatModel
 
+# Parameters of order one, by the beginning of their names.
+NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.network", "action.log_slope",
+            "action.weight", "action.bias", "friction.log")  # fmt: skip
+
 
 class Prior:
     """Gaussian prior, as residuals that join a least-squares problem.
@@ -20,7 +24,8 @@ class Prior:
     * The damping's network G(q̄, v) (affine level) has there an RMS of N(0, (τ r)²), r the typical rate of the motion.
     * Every network weight is N(its start, `weight`²): weak, it only keeps unseen directions from drifting. (Centred
       at 0 it would switch the network off: behind a zero-initialised last layer nothing else holds the first one.)
-    * The damping rate and the drag coefficients (per unit of position) are N(their start, `rate_spread`²).
+    * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
+      friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²).
     """
 
     def __init__(
@@ -37,9 +42,9 @@ class Prior:
         self.flat = FlatModel(model)
         theta = self.flat.get()
         self.departure = departure
-        networks = ("potential.network", "damping.network", "correction")
-        self.weight_index = torch.cat([self.flat.index(prefix) for prefix in networks])
-        self.rate_index = torch.cat([self.flat.index("damping.rate"), self.flat.index("damping.drag")])
+        self.weight_index = self._index(*NETWORKS)
+        self.rate_index = self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous")
+        self.force_index = self._index("friction.coulomb", "friction.breakaway")
         self.start, self.rate_spread, self.weight = theta, rate_spread, weight
         unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
         speed = low.new_tensor(model.config.speed)
@@ -53,6 +58,8 @@ class Prior:
         """Prior residuals, (m,)."""
         moved = theta - self.start
         parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
+        if len(self.force_index):
+            parts.append(moved[self.force_index] / (self.rate_spread * max(self.flat.model.config.speed)))
         if self.departure is not None:
             parts += [x / (self.departure * x.numel() ** 0.5) for x in self._departures(theta)]
         return torch.cat(parts)
@@ -65,6 +72,9 @@ class Prior:
         """(½|r|², JᵀJ, Jᵀr) of the prior alone."""
         r, J = self.residuals(theta), jacrev(self.residuals)(theta)
         return r.square().sum() / 2, J.T @ J, J.T @ r
+
+    def _index(self, *prefixes: str) -> Tensor:
+        return torch.cat([self.flat.index(prefix) for prefix in prefixes])
 
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():

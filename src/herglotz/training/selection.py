@@ -19,6 +19,8 @@ from herglotz.training.config import FitConfig
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
 
+# Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
+CANDIDATES = tuple(level for level in LEVELS if level != "full")
 BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
 TIMED_STEPS = 20
 
@@ -101,7 +103,7 @@ class Selection:
 
 def select(
     data: Trajectories,
-    levels: Sequence[str] = LEVELS,
+    levels: Sequence[str] = CANDIDATES,
     seeds: int = 3,
     config: FitConfig | None = None,
     *,

@@ -1,7 +1,7 @@
 """Checks of the generating functions S^k and of the discrete Hamilton–Jacobi equation.
 
-S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 is taken through the flow; its derivatives through the endpoint map; H⁺ through L_d. None of
-the identities that are checked enters the computation of the other side.
+S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 is taken through the flow; its derivatives through the endpoint map; H⁺ through L_d and H⁻
+through L⁻. None of the identities that are checked enters the computation of the other side.
 """
 
 from __future__ import annotations
@@ -17,10 +17,14 @@ from herglotz.mechanics import (
     flow_derivative,
     generating_function,
     hamilton_jacobi_residual,
+    left_hamilton_jacobi_residual,
+    left_hamiltonian,
+    mixed_hessian,
     partials,
     right_hamiltonian,
     right_hamiltonian_on_flow,
 )
+from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import State
 from herglotz.verify.report import Check
 from herglotz.verify.subject import Subject
@@ -107,7 +111,7 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
                 regular = _single_valued(subject, before, after)
                 folds += int((keep & ~regular).sum())
                 keep = keep & regular
-            b, a = (GeneratingFunction(**{name: x[keep] for name, x in vars(g).items()}) for g in (before, after))
+            b, a = (_selected(g, keep) for g in (before, after))
             H = _right_hamiltonian(subject, b, a)
             residual = hamilton_jacobi_residual(a.S, b.S, a.D2, a.q, H)
             residuals.append(residual.abs())
@@ -122,6 +126,38 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
     return Check.at_most(
         "hamilton_jacobi", "discrete Hamilton–Jacobi equation on a fan", value, bound, "; ".join(notes)
     )
+
+
+def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
+    """S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k·q_k + H⁻(dS^k, q_{k+1}, s_{k+1}) = 0 (erratum E6), relative to its terms.
+
+    H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
+    """
+    assert subject.L_d is not None
+    residuals, sizes, folds = [], [], 0
+    for k in [k for k in f.S if k + 1 in f.S]:
+        before, after = f.S[k], f.S[k + 1]
+        keep = f.keep[k] & f.keep[k + 1]
+        with torch.no_grad():
+            regular = _left_single_valued(subject, before, after)
+            folds += int((keep & ~regular).sum())
+            b, a = (_selected(g, keep & regular) for g in (before, after))
+            guess = b.q - 1e-3 * (a.q - b.q)  # off by a little, so that the equation is really solved
+            H = left_hamiltonian(subject.L_d, b.D2, a.q, a.s, subject.h, guess)
+            residuals.append(left_hamilton_jacobi_residual(a.S, b.S, b.D2, b.q, H).abs())
+            sizes.append(a.S.abs() + b.S.abs() + (b.D2 * b.q).abs().sum(-1) + H.abs())
+    notes = [f.left_out()] if f.left_out() else []
+    if folds:
+        notes.append(f"{folds} left out near a fold of H⁻ (det D1D1 L⁻ = 0)")
+    size = worst(torch.cat(sizes))
+    value = worst(torch.cat(residuals)) / size if size > 0 else float("nan")
+    return Check.at_most(
+        "left_hamilton_jacobi", "left discrete Hamilton–Jacobi equation", value, bound, "; ".join(notes)
+    )
+
+
+def _selected(g: GeneratingFunction, keep: Tensor) -> GeneratingFunction:
+    return GeneratingFunction(**{name: x[keep] for name, x in vars(g).items()})
 
 
 def _right_hamiltonian(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
@@ -142,6 +178,14 @@ def _single_valued(subject: Subject, before: GeneratingFunction, after: Generati
     smallest[finite] = torch.linalg.svdvals(P.D22[finite])[..., -1]
     size = P.D12.abs().amax((-2, -1)) + P.D22.abs().amax((-2, -1))
     return smallest > FOLD * size
+
+
+def _left_single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
+    """Whether det D1D1 L⁻ is away from 0, so that H⁻ exists there."""
+    assert subject.L_d is not None
+    P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
+    M = mixed_hessian(P)
+    return scaled_margin(left_hessian(P), M, P.D11, P.D22) > FOLD
 
 
 def _usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.export import ExportedStepper, load_pt2
+from herglotz.export import CompiledStepper, DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
@@ -20,19 +20,26 @@ from herglotz.stepping import State, Step, Stepper
 from herglotz.systems import Scene, scene, scene_names
 from herglotz.training import Run, load_run
 
+# Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). Rounding: a step is
+# good to 10–100 eps, an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative is good to 1e-13–1e-12 (1e-5);
+# truncation, offset⁸ f⁽⁹⁾/630, is below that where f is smooth over the offsets. Products of such derivatives over k
+# steps and divisions by ∂q1/∂p0 ~ h multiply it by 10–1000. Null models miss by 1e-3 and more.
+DIFFERENCED = {torch.float64: 1e-9, torch.float32: 2e-3}
+
 
 @dataclass(frozen=True)
 class Subject:
     """A step map, where it is sampled and what else is known of it."""
 
     name: str
-    kind: str  # "scene", "run", "pt2", "stepper" or "L_d"
+    kind: str  # "scene", "run", "pt2", "aoti", "onnx", "c", "stepper" or "L_d"
     step: Callable[[State, float], Step]
     states: State  # (B, n), (B, n), (B)
     h: float
     L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
     scene: Scene | None = None
     run: Run | None = None
+    differenced: bool = False  # whether autograd cannot enter the map, so that derivatives are differences
 
     @property
     def dof(self) -> int:
@@ -83,16 +90,21 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
             target.model,
             run=target,
         )
-    if isinstance(target, ExportedStepper):
-        return Subject(target.path, "pt2", target.step, draw(target, samples, make), _step_size(h, target.h))
+    if isinstance(target, ExportedStepper | CompiledStepper):
+        kind = target.kind if isinstance(target, ExportedStepper) else "c"
+        closed = not getattr(target, "differentiable", False)
+        smooth = DifferencedStepper(target) if closed else target
+        states, size = draw(target, samples, make), _step_size(h, target.h)
+        return Subject(target.path, kind, smooth.step, states, size, differenced=closed)
     if isinstance(target, tuple) and len(target) == 2:
         return _pair(*target, h)
     raise InputError(
-        f"cannot verify a {type(target).__name__}; give a scene, a run, a .pt2 file or a pair (L_d or stepper, states)"
+        f"cannot verify a {type(target).__name__}; "
+        "give a scene, a run, an exported file or a pair (L_d or stepper, states)"
     )
 
 
-def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
+def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper | CompiledStepper:
     """A scene by name, a run by its folder, or an exported file."""
     if target in scene_names():
         return scene(str(target))
@@ -100,8 +112,8 @@ def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
     if path.is_dir():
         return load_run(path)
     if path.suffix == ".pt2" or path.is_file():
-        return load_pt2(path)
-    raise InputError(f"{target}: no such scene ({', '.join(scene_names())}), run folder or .pt2 file")
+        return load_exported(path)
+    raise InputError(f"{target}: no such scene ({', '.join(scene_names())}), run folder or .pt2, .onnx or .h file")
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:
@@ -129,9 +141,14 @@ def _step_size(h: float | None, default: float) -> float:
 
 
 def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
+    """Uniform draws; a range is a pair of numbers for all coordinates or a pair (low, high) of n numbers each."""
     shape = (samples, scene.dof)
-    q = torch.empty(shape, dtype=torch.float64).uniform_(*scene.q_range, generator=make)
-    v = torch.empty(shape, dtype=torch.float64).uniform_(*scene.v_range, generator=make)
+
+    def draw_from(limits: Any) -> Tensor:
+        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
+        return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=make)
+
+    q, v = draw_from(scene.q_range), draw_from(scene.v_range)
     s = torch.empty(samples, dtype=torch.float64).uniform_(-1.0, 1.0, generator=make)
     return State(q, scene.momentum(q, v, s), s)
 

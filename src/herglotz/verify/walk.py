@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import contact_defect, contact_form, flow_derivative
+from herglotz.mechanics import Forces, contact_defect, contact_form, flow_derivative
 from herglotz.stepping import State, Status
 from herglotz.verify.report import Check
 from herglotz.verify.subject import Subject
@@ -80,14 +80,22 @@ def positive_factor(w: Walk) -> Check:
     return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
 
 
-def contact(w: Walk, bound: float) -> Check:
-    """DΦ̃ᵀ η(x1) = c η(x0), relative to the terms that cancel."""
+def contact(w: Walk, bound: float, force: Forces | None = None) -> Check:
+    """DΦ̃ᵀ η(x1) = c η(x0) − F⁻dq0 − F⁺dq1, relative to the terms that cancel; without forces a contact map.
+
+    The forces, where the subject has any, are those of the steps that are ok.
+    """
     p0, p1 = w.p[:, :-1][w.ok], w.p[:, 1:][w.ok]
     D, c = w.derivative[w.ok], w.c[w.ok]
-    defect = contact_defect(D, p0, p1, c)
+    defect, claim = contact_defect(D, p0, p1, c), "contact map: DΦ̃ᵀη(x1) = c η(x0)"
+    if force is not None:
+        n = p0.shape[-1]
+        defect = defect + (D[..., :n, :].mT @ force.plus[..., None])[..., 0]
+        defect = torch.cat([defect[..., :n] + force.minus, defect[..., n:]], -1)
+        claim = "forced contact map: DΦ̃ᵀη(x1) = c η(x0) − F⁻dq0 − F⁺dq1"
     pulled = (D.abs().mT @ contact_form(p1).abs()[..., None])[..., 0]
     size = (pulled + c.abs()[..., None] * contact_form(p0).abs()).amax(-1)
-    return Check.at_most("contact", "contact map: DΦ̃ᵀη(x1) = c η(x0)", worst(defect.abs().amax(-1) / size), bound)
+    return Check.at_most("contact", claim, worst(defect.abs().amax(-1) / size), bound)
 
 
 def volume(w: Walk, bound: float) -> Check:

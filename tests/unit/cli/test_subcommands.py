@@ -32,7 +32,10 @@ def test_version(capsys):  # fails if the version is not the package's
     assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
 
 
-@pytest.mark.parametrize("command", ["simulate", "fit", "select", "rollout", "export", "verify", "trust", "plot"])
+COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "tune", "plot")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
 def test_help_teaches_every_option(capsys, command):  # fails if an option has no help, or there is no example
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
@@ -143,7 +146,7 @@ def test_export(
     tiny_pt2, tiny_run, tmp_path, capsys
 ):  # fails if the file does not load without herglotz, or lacks the box
     q, s = torch.zeros(2, 1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-    assert len(torch.export.load(tiny_pt2).module()(q, q + 1, s, s + 0.1)) == 6
+    assert len(torch.export.load(tiny_pt2).module()(q, q + 1, s, s + 0.1)) == 7
     code, report = run_json(capsys, "export", tiny_run, "--out", tmp_path / "b.pt2")
     assert code == 0
     assert report["metadata"]["names"] == ["theta"]

@@ -90,13 +90,13 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["simulate", "double_pendulum", "--out", "OUT.csv"], "unknown scene 'double_pendulum'"),
+        (["simulate", "triple_pendulum", "--out", "OUT.csv"], "unknown scene 'triple_pendulum'"),
         (["simulate", "parachute", "--out", "OUT.csv", "--param", "wind=3"], "no parameter 'wind'"),
         (["simulate", "parachute", "--out", "OUT.csv", "--param", "m"], "not NAME=VALUE"),
         (["simulate", "parachute", "--out", "OUT.csv", "--h", "0"], "must be > 0"),
         (["simulate", "parachute", "--out", "OUT.csv", "--noise", "-1"], "noise"),
         (["simulate", "parachute", "--out", "OUT.csv", "--trajectories", "0"], "trajectories"),
-        (["verify", "double_pendulum"], "double_pendulum"),
+        (["verify", "triple_pendulum"], "triple_pendulum"),
         (["verify", "missing.pt2"], "no such file"),
         (["verify", "damped_oscillator", "--samples", "0"], "--samples must be >= 1 and --steps >= 2"),
         (["fit", "missing.csv", "--out", "OUT"], "no such file"),

@@ -57,16 +57,25 @@ def relative(a, b):
 
 
 def eager_rollout(model, states, **options):
+    """Eager, solved to the last digit in float64: its default tolerance leaves 1e-12 after many steps."""
+    tol = 4e-16 if states.q.dtype == torch.float64 else None
     with torch.no_grad():
-        return Stepper(model).rollout(*states, **options)
+        return Stepper(model, tol=tol).rollout(*states, **options)
 
 
 @needs_compiler
-@pytest.mark.parametrize("n", [1, 2, 3])
-@pytest.mark.parametrize("kind", ["linear", "affine", "correction", "both"])
-def test_many_steps_agree_with_the_eager_stepper(n, kind):
+@pytest.mark.parametrize(
+    ("n", "kind", "steps"),
+    [
+        (2, "linear", 1000),
+        (1, "both", 100),
+        (2, "correction", 100),
+        pytest.param(3, "both", 100, marks=pytest.mark.slow),
+        pytest.param(1, "affine", 100, marks=pytest.mark.slow),
+    ],
+)
+def test_many_steps_agree_with_the_eager_stepper(n, kind, steps):
     # fails if a derivative of a term, a feature's chain rule or a carried potential is wrong
-    steps = 1000 if (n, kind) in ((2, "linear"), (1, "both"), (2, "correction")) else 100  # the eager ones are slow
     model, states = damped(n, kind), states_of(n, 2)
     eager = eager_rollout(model, states, h=0.1, steps=steps)
     ours = compile_c(model).rollout(*states, h=0.1, steps=steps)
@@ -78,18 +87,16 @@ def test_many_steps_agree_with_the_eager_stepper(n, kind):
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", ["linear", "affine", "correction"])
+@pytest.mark.parametrize("kind", ["linear", pytest.param("correction", marks=pytest.mark.slow)])
 def test_float32_agrees_over_many_steps(kind):
     # fails if a step is taken in positions instead of increments, which loses digits in float32
     model, states = damped(2, kind, torch.float32), states_of(2, 2, torch.float32)
     ours = compile_c(model).rollout(*states, h=0.1, steps=110)
-    single = eager_rollout(model, states, h=0.1, steps=110)
     exact = eager_rollout(model.double(), State(*(x.double() for x in states)), h=0.1, steps=110)
     assert ours.q.dtype == torch.float32
     assert ours.ok.all()
     for name in ("q", "p", "s", "sigma"):
-        error, eager_error = (relative(getattr(x, name).double(), getattr(exact, name)) for x in (ours, single))
-        assert error <= max(1e-5, 1.5 * eager_error), name  # a sensitive motion loses as much in either
+        assert relative(getattr(ours, name).double(), getattr(exact, name)) <= 1e-5, name
 
 
 @needs_compiler
@@ -106,7 +113,7 @@ def test_irregular_steps_and_single_steps():
 
 
 @needs_compiler
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["linear", "correction", "alone"])
 def test_init_from_two_positions(kind):
     # fails if FL⁺ uses D1, or s1 instead of s0 (erratum E3)
     model, (q, p, s) = damped(2, kind), states_of(2, 4)
@@ -134,7 +141,7 @@ def test_a_plain_network_agrees_with_the_eager_stepper():
 @needs_compiler
 def test_wide_networks():
     # fails if a block of a matrix product is skipped or summed twice: widths of one, several and odd blocks
-    for width in (3, 16, 37):
+    for width in (3, 37):
         size = (1.0,)
         config = ModelConfig((True,), "affine", size, size, size, (0.0,), 0.3, width, 3, width, width, 3)
         model = ContactLagrangian(config)
@@ -143,9 +150,11 @@ def test_wide_networks():
                 parameter += 0.05 * torch.randn(
                     parameter.shape, generator=torch.Generator().manual_seed(width), dtype=torch.float64
                 )
-        states = states_of(1, 2)
-        ours, eager = compile_c(model).rollout(*states, h=0.1, steps=20), eager_rollout(model, states, h=0.1, steps=20)
-        assert relative(ours.q, eager.q) <= 1e-13, width
+        compiled = compile_c(model)
+        for batch in (1, 2):  # one sample takes the product over units, two take the one over samples
+            states = states_of(1, batch)
+            eager = eager_rollout(model, states, h=0.1, steps=10)
+            assert relative(compiled.rollout(*states, h=0.1, steps=10).q, eager.q) <= 1e-13, width
 
 
 @needs_compiler
@@ -158,9 +167,19 @@ def test_no_compiler_warnings(tmp_path, language, dtype):
         pytest.skip("no C++ compiler in the PATH")
     source = tmp_path / "use.c"
     source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
-    for kind in KINDS:
-        export_c(damped(2, kind), tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
-        for level in ("-O2", "-O3"):
+    models = {kind: damped(2, kind) for kind in (["both", "alone"] if dtype == "float64" else ["linear", "correction"])}
+    options: dict[str, Any] = {"angles": (True, False), "potential_width": 3, "correction_width": 3}
+    options |= dict.fromkeys(("scale", "speed", "stiffness", "tilt"), (1.0, 1.0))
+    if dtype == "float64":
+        models["full"] = ContactLagrangian(ModelConfig(level="full", mass_width=3, **options))
+    else:
+        models["mass"] = ContactLagrangian(ModelConfig(level="affine", mass_width=3, **options))
+        models["viscous"] = ContactLagrangian(
+            ModelConfig(level="forced", inputs=1, **{**options, "correction_width": 0})
+        )
+    for kind, model in models.items():
+        export_c(model, tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
+        for level in ("-O3",) if language == "c" else ("-O2",):
             command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", level, "-c", str(source), "-o", "/dev/null"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             assert done.returncode == 0, (kind, level, done.stderr[:2000])
@@ -289,6 +308,7 @@ def test_unusable_arguments_are_refused(tmp_path, change, message):
 def test_weights_that_are_not_finite_are_refused(tmp_path):
     # fails if `nan` or `inf` is written as a C constant, or a float64 weight overflows in float32
     model = damped(1, "linear")
+    assert model.damping is not None
     with torch.no_grad():
         model.damping.rate.fill_(1e39)
     with pytest.raises(InputError, match="not finite in float32"):
@@ -341,7 +361,7 @@ def test_views_and_batches_of_any_shape():
     shaped = compiled.rollout(*view, h=0.1, steps=5)
     assert torch.equal(shaped.q.transpose(0, 1).reshape(plain.q.shape), plain.q)
     single = compiled.rollout(*(x[0] for x in states), h=0.1, steps=5)
-    assert torch.equal(single.q, plain.q[0])
+    assert relative(single.q, plain.q[0]) <= 1e-13  # one sample is summed in another order
 
 
 @needs_compiler

@@ -9,6 +9,8 @@ from herglotz.mechanics import (
     contact_defect,
     flow_derivative,
     herglotz_residual,
+    legendre_minus,
+    legendre_plus,
     partials,
     step_derivative,
 )
@@ -53,13 +55,16 @@ def test_a_step_solves_the_forced_equations():
         minus, plus = L_d.forces(state.q, q1, state.s, torch.tensor(H, dtype=torch.float64))
     torch.testing.assert_close(-(P.D1 + minus) / P.c[..., None], state.p, rtol=1e-12, atol=1e-12)
     torch.testing.assert_close(P.D2 + plus, step.state.p, rtol=0, atol=1e-13)
+    # fails if a transform forgets what the step equation knows
+    torch.testing.assert_close(legendre_minus(L_d, state.q, q1, state.s, H)[1], state.p, rtol=1e-12, atol=1e-12)
+    torch.testing.assert_close(legendre_plus(L_d, state.q, q1, state.s, H)[1], step.state.p, rtol=0, atol=1e-13)
 
 
 def test_the_derivative_of_a_forced_step_is_the_closed_form():
     # fails if a derivative of F⁻ or F⁺ is missing from J or from DΦ̃
     L_d, state = ForcedPendula(), states()
     stepper = Stepper(L_d)
-    (q1, _, _), D = flow_derivative(lambda q, p, s: tuple(stepper.step(State(q, p, s), H).state), *state)
+    (q1, _, _), D = flow_derivative(lambda q, p, s: stepper.step(State(q, p, s), H).state, *state)
     with torch.no_grad():
         P = partials(L_d, state.q, q1, state.s, H, 2)
         torch.testing.assert_close(step_derivative(P, state.p), D, rtol=1e-11, atol=1e-12)
@@ -73,6 +78,7 @@ def test_the_contact_defect_is_exactly_the_forces():
         P = partials(L_d, state.q, step.state.q, state.s, H, 2)
         D = step_derivative(P, state.p)
         defect = contact_defect(D, state.p, step.state.p, step.c)
+        assert P.force is not None
         minus, plus = P.force.minus, P.force.plus
         expected = -(D[..., :2, :].mT @ plus[..., None])[..., 0]
         expected[..., :2] -= minus

@@ -143,3 +143,12 @@ def test_rest_stays_at_rest():
     out = Stepper(scene("damped_pendulum").L_d).rollout(q, q, q[:, 0], h=0.1, steps=5)
     assert bool(out.ok.all())
     assert float(out.q.abs().max()) == 0
+
+
+def test_a_state_in_another_dtype_than_the_model_is_refused():
+    # fails if torch's own message about dtypes, which names neither, reaches the user
+    model = ContactLagrangian(ModelConfig())
+    state = State(torch.ones(1), torch.ones(1), torch.tensor(0.0))
+    for step in (lambda: Stepper(model).step(state, 0.1), lambda: Stepper(model).rollout(*state, h=0.1, steps=2)):
+        with pytest.raises(InputError, match=r"the state is torch\.float32 and the model torch\.float64"):
+            step()

@@ -1,4 +1,5 @@
-"""The exact L_d against quadrature of the action along the exact motion, 40 digits, at parameters nobody wrote down."""
+"""The exact L_d against quadrature of the action along the exact motion, 50 digits, at parameters nobody wrote down;
+with H⁺ = p1 q1 − L_d and H⁻ = −p0 q0 − L_d along the motion."""
 
 import mpmath as mp
 import pytest
@@ -56,9 +57,13 @@ def test_oscillator(case):
     # or if γ/4 (in ω²) or mγ/4 (in L_d) is off: the defaults m = Ω = 1 hide the powers of m and Ω
     m, w, gamma, h = OSCILLATORS[case]
     (q0, v0, s0), *_ = draws(100 + case, 1, (-2, 2), (-2, 2), (-1, 1))
-    with mp.workdps(40):
-        q1, p1, L = (float(x) for x in oscillator_answer(m, w, gamma, h, q0, v0, s0))
+    with mp.workdps(50):
+        q1, p1, L = oscillator_answer(m, w, gamma, h, q0, v0, s0)
+        H_plus, H_minus = float(p1 * q1 - L), float(-mp.mpf(m) * v0 * q0 - L)
+        q1, p1, L = float(q1), float(p1), float(L)
     system = scene("damped_oscillator", m=m, omega0=w, gamma=gamma)
+    assert system.H_plus is not None
+    assert system.H_minus is not None
     end = system.flow(vector(q0), vector(m * v0), scalar(s0), h)
     scale = m * (q0**2 + v0**2) + abs(s0)
     assert abs(end[0].item() - q1) < 1e-14 * (abs(q0) + abs(v0))
@@ -68,6 +73,9 @@ def test_oscillator(case):
     assert abs(P.L.item() - L) < 1e-14 * scale / min(h, 1.0)
     assert abs(P.D2.item() - p1) < 1e-14 * scale / min(h, 1.0)
     assert abs(-P.D1.item() / P.c.item() - m * v0) < 1e-14 * scale / min(h, 1.0) ** 2
+    # fails if either discrete Hamiltonian has a coefficient of its own regime
+    assert abs(system.H_plus(vector(q0), vector(p1), scalar(s0), h).item() - H_plus) < 2e-14 * scale / h**2
+    assert abs(system.H_minus(vector(m * v0), vector(q1), scalar(s0 + L), h).item() - H_minus) < 2e-14 * scale / h**2
 
 
 PARACHUTES = [
@@ -104,8 +112,11 @@ def test_parachute(case):
     # fails if a power of m, g or λ is off (the golden m = 1 hides m), if λ < 0 or g = 0 breaks ω, or if small λ cancels
     m, g, lam, h = PARACHUTES[case]
     (q0, v0, s0), *_ = draws(200 + case, 1, (-3, 5), (-3, 1), (-1, 1))
-    with mp.workdps(40):
-        q1, v1, L = (float(x) for x in parachute_answer(m, g, lam, h, q0, v0, s0))
+    with mp.workdps(50):
+        q1, v1, L = parachute_answer(m, g, lam, h, q0, v0, s0)
+        p1 = m * v1 + 2 * mp.mpf(lam) * (s0 + L)
+        H_plus, H_minus = float(p1 * q1 - L), float(-(m * v0 + 2 * mp.mpf(lam) * s0) * q0 - L)
+        q1, v1, L, p1 = float(q1), float(v1), float(L), float(p1)
     system = scene("parachute", m=m, g=g, lam=lam)
     p0 = system.momentum(vector(q0), vector(v0), scalar(s0))
     end = system.flow(vector(q0), p0, scalar(s0), h)
@@ -117,5 +128,10 @@ def test_parachute(case):
     assert abs(end[2].item() - s0 - L) < tolerance
     P = partials(system.L_d, vector(q0), vector(q1), scalar(s0), h)
     assert abs(P.L.item() - L) < tolerance
-    assert abs(P.D2.item() - (m * v1 + 2 * lam * (s0 + L))) < tolerance / h
+    assert abs(P.D2.item() - p1) < tolerance / h
     assert abs(-P.D1.item() / P.c.item() - p0.item()) < tolerance / h
+    # fails if the root of either quadratic is the wrong one, or cancels
+    assert system.H_plus is not None
+    assert system.H_minus is not None
+    assert abs(system.H_plus(vector(q0), vector(p1), scalar(s0), h).item() - H_plus) < 10 * tolerance / h
+    assert abs(system.H_minus(p0, vector(q1), scalar(s0 + L), h).item() - H_minus) < 10 * tolerance / h

@@ -45,6 +45,7 @@ def test_a_true_model_passes():
 def test_a_model_of_uniform_motion_fails():
     # fails if the null model is not beaten by a margin: without a potential and damping, J⁻¹R is the null's own error
     run = run_of(stiffness=0.0)
+    assert run.model.damping is not None
     torch.nn.init.zeros_(run.model.damping.rate)
     checks, numbers = named(run)
     assert not checks["one_step"].passed

@@ -1,0 +1,132 @@
+"""`herglotz tune`: an error or a budget in, the setting that meets it out."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from herglotz.cli.common import check_output_folder, count, positive, print_json
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.tune import Tuning
+
+DESCRIPTION = """\
+Trade speed for accuracy: measure the error and the cost of stepping RUN at several steps, with its own model and with
+big-step corrections re-trained on motions of that model, in PyTorch and in C, in float64 and float32; then take the
+cheapest setting within an error, or the most accurate one within a budget.
+
+The error is that of stepping: the largest departure of a position from the run's own motion over the horizon. 95 % of
+all starts keep the error quoted (with confidence 95 %); other starts than those that chose are counted to check it.
+FOLDER receives the tuned run (for `herglotz export`, `rollout`, ...), tuned.json and tuned.png.
+
+examples:
+  herglotz tune runs/pendulum --max-error 1e-3
+  herglotz tune runs/pendulum --budget-us 5 --horizon 20 --out runs/fast
+  herglotz export runs/fast --format c --out stepper.h
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("tune", help="trade speed for accuracy", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` wrote")
+    parser.add_argument("--max-error", type=positive, metavar="E", help="largest error of a position, in its unit")
+    parser.add_argument("--budget-us", type=positive, metavar="C", help="microseconds per unit of simulated time")
+    parser.add_argument(
+        "--horizon", type=positive, metavar="T",
+        help="length of the motions, in the data's unit of time (default: a typical trajectory, at most 200 steps)",
+    )  # fmt: skip
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for the result (default: RUN/tuned)")
+    parser.add_argument(
+        "--multiples", default="1,2,4,8", metavar="M",
+        help="steps to try, in steps of the run, with commas (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--widths", default="8,16", metavar="W",
+        help="hidden units of the re-trained corrections, with commas, or none (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--reference", choices=("own", "limit"), default="own",
+        help="measure against the model at its own step, or as h goes to 0 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--no-c", action="store_true", help="PyTorch only")
+    parser.add_argument("--starts", type=count, default=128, help="motions that choose (default %(default)s)")
+    parser.add_argument("--iterations", type=count, default=80, help="of a re-training, at most (default %(default)s)")
+    parser.add_argument("--seed", type=count, default=0, help="of the starts (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Search, save, draw, report."""
+    if (arguments.max_error is None) == (arguments.budget_us is None):
+        raise InputError("say what you need: either --max-error or --budget-us")
+    multiples = _numbers("--multiples", arguments.multiples)
+    widths = () if arguments.widths.strip() == "none" else _numbers("--widths", arguments.widths)
+    if any(not w.is_integer() for w in widths):
+        raise InputError(f"--widths needs whole numbers, got {arguments.widths}")
+    out: Path = arguments.out or arguments.source / "tuned"
+    check_output_folder(out)
+    if (out / "model.pt").exists() and not (out / "tuned.json").exists():
+        raise InputError(f"--out {out}: already holds a run that tune did not write; choose another folder")
+
+    from herglotz.data.files import write_atomically
+    from herglotz.plots import save_figure
+    from herglotz.plots.tuning import plot_tuning
+    from herglotz.training import load_run, save_run
+    from herglotz.tune import TuneConfig, tune
+
+    config = TuneConfig(
+        multiples=multiples,
+        widths=tuple(int(w) for w in widths),
+        artefacts=("eager",) if arguments.no_c else ("eager", "c"),
+        reference=arguments.reference,
+        starts=arguments.starts,
+        seed=arguments.seed,
+        iterations=arguments.iterations,
+    )
+    found = tune(
+        load_run(arguments.source), max_error=arguments.max_error, budget_us=arguments.budget_us,
+        horizon=arguments.horizon, config=config,
+    )  # fmt: skip
+    save_run(found.tuned_run(), out)
+    write_atomically(out / "tuned.json", (json.dumps(found.to_dict(), indent=2) + "\n").encode())
+    save_figure(plot_tuning(found), out / "tuned.png")
+    if arguments.json:
+        print_json(found.to_dict())
+    else:
+        _report(found, out)
+    return 0
+
+
+def _numbers(name: str, text: str) -> tuple[float, ...]:
+    try:
+        return tuple(float(x) for x in text.split(","))
+    except ValueError:
+        raise InputError(f"{name} needs numbers with commas between them, got {text!r}") from None
+
+
+def _report(found: Tuning, out: Path) -> None:
+    from herglotz.tune.result import time_label
+
+    print(found.table())
+    c, own, held = found.chosen, found.own, found.held_out
+    less = f"{own.us / c.us:.3g} times less than the run as it is"
+    if found.own_in_c is not None:
+        less += f", {found.own_in_c.us / c.us:.3g} times less than the same in C"
+    print(f"Chosen: {c.setting.name}: {c.us:.3g} {time_label(found.run)}")
+    print(f"  {less}")
+    print(
+        f"  over T = {found.horizon:g}, {100 * held['share_within']:.1f} % of {held['starts']} other starts within "
+        f"{held['limit']:.3g}; median {held['median']:.2g}, worst {held['worst']:.2g}"
+    )
+    known = {k: v for k, v in found.model_error.items() if v is not None}
+    print("  the model itself, against its data: " + ", ".join(f"{k} {v:.2g}" for k, v in known.items()))
+    for note in found.notes:
+        print(f"  {note}")
+    print(f"Figure: {out / 'tuned.png'}")
+    form = "c" if c.setting.artefact == "c" else "pt2"
+    print(f"Next: herglotz export {out} --format {form} --out stepper{'.h' if form == 'c' else '.pt2'}")

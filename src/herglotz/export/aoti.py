@@ -1,0 +1,81 @@
+"""A model as machine code in a `.pt2` file (AOTInductor): fast batches without Python, on one kind of processor."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch._inductor
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
+from herglotz.export.metadata import describe, to_json
+from herglotz.export.module import ITERATIONS
+from herglotz.export.pt2 import quiet, rollout_program
+from herglotz.models import ContactLagrangian
+
+KEY = "herglotz"  # of our metadata among those of torch
+
+
+def export_aoti(
+    model: ContactLagrangian,
+    path: PathLike,
+    *,
+    h: float,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    metadata: Mapping[str, Any] | None = None,
+    newton_iterations: int = ITERATIONS,
+) -> Path:
+    """Compile K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow to machine code.
+
+    h has the shape (K, B), and so have the outputs (q and p: (K, B, n)); K = 1 is one step. The compiled code checks
+    nothing and takes contiguous tensors of the model's dtype only: call it through `load_aoti`, which does check. It
+    runs on the kind of processor it was compiled on, without derivatives.
+
+    Parameters
+    ----------
+    model, path, h, box, units, metadata, newton_iterations
+        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        If there is no C++ compiler, an argument is not usable, or the file cannot be written.
+    """
+    entries = describe(model, h, box, units, newton_iterations, metadata or {})
+    settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
+    check_compiler()
+    with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+        package = str(Path(folder, "code.pt2"))
+        torch._inductor.aoti_compile_and_package(
+            rollout_program(model, entries), package_path=package, inductor_configs=settings
+        )
+        content = Path(package).read_bytes()
+    write_atomically(path, content)
+    return Path(path)
+
+
+def check_compiler() -> None:
+    """Raise unless a C++ compiler is there.
+
+    Raises
+    ------
+    InputError
+        Saying what to install.
+    """
+    given = os.environ.get("CXX", "")
+    names = [given.split()[0]] if given.split() else ["g++", "clang++", "c++"]
+    if not any(shutil.which(name) for name in names):
+        missing = f"$CXX names '{given}', which is not there" if given else "no C++ compiler (g++, clang++) in the PATH"
+        raise InputError(f"{missing}; install one, for example with: apt install g++, or export to --format c")

@@ -1,0 +1,67 @@
+"""`hz.compile`: the fastest stepper that this machine can offer for a model."""
+
+from __future__ import annotations
+
+import os
+import warnings
+from typing import Any
+
+from herglotz.data.files import PathLike
+from herglotz.errors import InputError
+from herglotz.export.c_stepper import CompiledStepper, compile_c, load_c
+from herglotz.export.c_wrapper import compiler
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+
+
+def compile(source: Stepper | ContactLagrangian | PathLike | Any) -> CompiledStepper | Stepper:
+    """A stepper with the interface of `Stepper` that steps in C, without derivatives.
+
+    Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
+    model that has no C, the eager stepper comes back, with one warning that says what is missing.
+
+    Parameters
+    ----------
+    source
+        A model, a `Stepper` of one, a run (its h, box and units are recorded), or a header that `export_c` wrote.
+
+    Returns
+    -------
+    CompiledStepper or Stepper
+        The second where C cannot be had.
+
+    Raises
+    ------
+    InputError
+        If the source is none of these, or a header cannot be compiled: it has no eager stepper to fall back on.
+    """
+    if isinstance(source, str | os.PathLike):
+        return load_c(source)
+    eager = source if isinstance(source, Stepper) else None
+    described: dict[str, Any] = {}
+    model: Any = source
+    if eager is not None:
+        model = eager.L_d
+    elif not isinstance(source, ContactLagrangian):
+        run: Any = source
+        model = getattr(run, "model", None)
+        if isinstance(model, ContactLagrangian):
+            described = {"h": run.h, "box": run.box, "units": run.data.units}
+    if not isinstance(model, ContactLagrangian):
+        if eager is None:
+            given = type(source).__name__
+            raise InputError(f"compile needs a model, a Stepper, a run or the path of a C header, got {given}")
+        return _fall_back(eager, f"{type(model).__name__} is no ContactLagrangian and has no C form")
+    eager = eager or Stepper(model)
+    if eager.throw:
+        return _fall_back(eager, "throw=True needs the eager stepper")
+    try:
+        compiler()
+        return compile_c(model, **described)
+    except InputError as error:
+        return _fall_back(eager, str(error))
+
+
+def _fall_back(eager: Stepper, reason: str) -> Stepper:
+    warnings.warn(f"hz.compile: stepping in PyTorch instead of C: {reason}", RuntimeWarning, stacklevel=3)
+    return eager

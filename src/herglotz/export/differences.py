@@ -1,0 +1,76 @@
+"""Derivatives of a step map that autograd cannot enter (ONNX, machine code, C), by central differences."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.stepping import State, Step
+
+# Central differences of order 8 at offsets 1 … 4.
+WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
+# Offset relative to 1 + |x_i|: truncation ~ offset⁸ and rounding ~ eps/offset are of one size near eps^{1/9}.
+OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
+
+
+class DifferencedStepper:
+    """A stepper whose `step` gives autograd a derivative, measured on the map itself by 8 (2n + 1) further steps.
+
+    For verification only. The error is about 1e-12 relative in float64 where the map is smooth over 4 % of its
+    arguments; in float32 about 1e-4.
+
+    Parameters
+    ----------
+    stepper
+        Anything with `step(state, h) -> Step`.
+    """
+
+    def __init__(self, stepper: Any):
+        self.stepper = stepper
+
+    def step(self, state: State, h: float) -> Step:
+        """One step; differentiable in the state, not in h."""
+        x = torch.cat([state.q, state.p, state.s[..., None]], -1)
+        found = self.stepper.step(_split(x.detach()), h)
+        if not (torch.is_grad_enabled() and x.requires_grad):
+            return found
+        y = _Differenced.apply(x, self, h)
+        return Step(_split(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
+
+    def values(self, x: Tensor, h: float) -> Tensor:
+        """The map on (..., 2n+1) points."""
+        q1, p1, s1 = self.stepper.step(_split(x), h).state
+        return torch.cat([q1, p1, s1[..., None]], -1)
+
+    def derivative(self, x: Tensor, h: float) -> Tensor:
+        """(B, 2n+1, 2n+1) by differences of all directions in one batch."""
+        size = x.shape[-1]
+        offset = OFFSET[x.dtype] * (1 + x.abs())
+        columns = 0.0
+        for k, weight in enumerate(WEIGHTS, 1):
+            move = torch.diag_embed(k * offset)  # row j moves x_j
+            ahead, behind = x[..., None, :] + move, x[..., None, :] - move
+            y = self.values(torch.stack([ahead, behind]).reshape(-1, size).contiguous(), h)
+            a, b = y.reshape(2, *move.shape)
+            columns = columns + weight * (a - b)
+        assert isinstance(columns, Tensor)
+        return (columns / offset[..., None]).mT
+
+
+class _Differenced(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, owner: DifferencedStepper, h: float) -> Tensor:  # pyright: ignore
+        ctx.save_for_backward(owner.derivative(x.detach(), h))
+        return owner.values(x.detach(), h)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
+        (D,) = ctx.saved_tensors
+        return (gradients[0][..., None, :] @ D)[..., 0, :], None, None
+
+
+def _split(x: Tensor) -> State:
+    n = (x.shape[-1] - 1) // 2
+    return State(x[..., :n].contiguous(), x[..., n : 2 * n].contiguous(), x[..., 2 * n].contiguous())

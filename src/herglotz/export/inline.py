@@ -1,0 +1,108 @@
+"""Exporting around a traced graph: one operator while torch traces what is around it, then the graph itself.
+
+torch.export evaluates every node with symbolic shapes, some milliseconds each; a traced graph knows its shapes already.
+"""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, fx, nn
+from torch.export import ExportedProgram
+
+from herglotz.export.trace import Example, Graph
+
+_library = torch.library.Library("herglotz", "DEF")
+_library.define("graph(Tensor[] arguments, int key) -> Tensor[]")
+_graphs: dict[int, Graph] = {}  # those that stand as an operator now
+
+
+@torch.library.register_fake("herglotz::graph", lib=_library)
+def _fake(arguments: list[Tensor], key: int) -> list[Tensor]:
+    """Empty outputs of the right shapes."""
+    graph = _graphs[key]
+    batch = next(x for x in arguments if x.ndim).shape[0]
+    outputs = (x.meta["example"] for x in _results(graph))
+    return [
+        arguments[0].new_empty_strided(_sized(shape, graph, batch), _sized(strides, graph, batch), dtype=dtype)
+        for shape, strides, dtype in outputs
+    ]
+
+
+@contextmanager
+def opaque(module: nn.Module) -> Iterator[None]:
+    """Inside, every `Graph` in the module is one operator."""
+    found = {id(x): x for x in module.modules() if isinstance(x, Graph)}
+    _graphs.update(found)
+    for key, graph in found.items():
+        graph.operator = lambda *x, key=key: tuple(torch.ops.herglotz.graph(list(x), key))
+    try:
+        yield
+    finally:
+        for graph in found.values():
+            graph.operator = None
+
+
+def inlined(program: ExportedProgram) -> ExportedProgram:
+    """The program with the graphs in place of their operators; changed in place."""
+    for module in list(program.graph_module.modules()):
+        if not isinstance(module, fx.GraphModule):
+            continue
+        for node in list(module.graph.nodes):
+            if node.target == torch.ops.herglotz.graph.default:
+                _inline(module.graph, node, _graphs[node.args[1]])
+        module.graph.eliminate_dead_code()
+        module.recompile()
+    _graphs.clear()
+    return program
+
+
+def _inline(outer: fx.Graph, call: fx.Node, graph: Graph) -> None:
+    arguments: Any = call.args[0]
+    example = next(x.meta["val"] for x in arguments if x.meta["val"].ndim)
+    batch, mode = example.shape[0], example.fake_mode
+    new: dict[fx.Node, Any] = {}
+    places = iter(arguments)
+    with outer.inserting_before(call):
+        for node in graph.code.graph.nodes:
+            if node.op == "placeholder":
+                new[node] = next(places)
+            elif node.op == "call_function":
+                new[node] = outer.node_copy(node, lambda x: new[x])
+                new[node].meta = {"val": _value(node.meta["example"], graph, batch, mode)}
+    results = [new[x] for x in _results(graph)]
+    for user in [x for x in call.users if not x.users]:
+        outer.erase_node(user)
+    for user in list(call.users):
+        assert user.target is operator.getitem
+        result, name = results[user.args[1]], user.name  # pyright: ignore[reportCallIssue, reportArgumentType]
+        user.replace_all_uses_with(result)
+        outer.erase_node(user)
+        if any(x.op == "output" for x in result.users):
+            result.name = name  # the program's signature knows its outputs by name
+    outer.erase_node(call)
+
+
+def _value(example: Any, graph: Graph, batch: Any, mode: Any) -> Any:
+    """What torch keeps of a node: empty tensors with symbolic shapes, or a size."""
+    if isinstance(example, Example):
+        with mode:
+            shape, strides = (_sized(x, graph, batch) for x in (example.shape, example.strides))
+            return torch.empty_strided(shape, strides, dtype=example.dtype)
+    if isinstance(example, (list, tuple)):
+        return [_value(x, graph, batch, mode) for x in example]
+    return _sized((example,), graph, batch)[0]
+
+
+def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
+    """Sizes at another batch."""
+    return [batch * (x // graph.batch) if x and x % graph.batch == 0 else x for x in sizes]
+
+
+def _results(graph: Graph) -> tuple[fx.Node, ...]:
+    (output,) = (x for x in graph.code.graph.nodes if x.op == "output")
+    return output.args[0]  # pyright: ignore[reportReturnType]

@@ -1,0 +1,132 @@
+"""What every exported file says of itself: one description, whatever the format."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import torch
+
+import herglotz
+from herglotz.data.files import PathLike
+from herglotz.errors import InputError
+from herglotz.export.equation import input_count
+from herglotz.models import ContactLagrangian
+
+FORMAT = 2  # 1 held a single step; 2 adds rollouts and starts from positions
+METADATA = "metadata.json"
+BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
+REQUIRED = ("format", "dof", "dtype", "h", "box", "newton_iterations", "newton_tolerance")
+TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up
+
+
+def describe(
+    model: ContactLagrangian,
+    h: float,
+    box: Mapping[str, Sequence[float]] | None,
+    units: Sequence[str],
+    newton_iterations: int,
+    extra: Mapping[str, Any],
+) -> dict[str, Any]:
+    """The metadata of a file: plain entries, checked, ready for JSON.
+
+    Raises
+    ------
+    InputError
+        If h, box, units or further entries are not usable.
+    """
+    dtype = next(model.parameters()).dtype
+    if dtype not in (torch.float32, torch.float64):
+        raise InputError(f"export needs a float32 or float64 model, got {dtype}; convert it with .double()")
+    if not (float(h) > 0 and float(h) < float("inf")):
+        raise InputError(f"h must be a finite number > 0, got {h}")
+    if units and len(units) != model.config.dof:
+        raise InputError(f"units needs one entry a coordinate ({model.config.dof}), got {list(units)}")
+    if newton_iterations < 2:
+        raise InputError(f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models")
+    entries: dict[str, Any] = {
+        "format": FORMAT,
+        "herglotz_version": herglotz.__version__,
+        "torch_version": str(torch.__version__),
+        "model": model.config.to_dict(),
+        "weights_sha256": weights_digest(model),
+        "level": model.config.level,
+        "dof": model.config.dof,
+        "inputs": input_count(model),
+        "dtype": str(dtype).removeprefix("torch."),
+        "h": float(h),
+        "units": list(units),
+        "angles": list(model.config.angles),
+        "box": None if box is None else _box(box, model.config.dof),
+        "newton_iterations": newton_iterations,
+        "newton_tolerance": TOLERANCE * torch.finfo(dtype).eps,
+    }
+    taken = sorted(set(extra) & set(entries))
+    if taken:
+        raise InputError(f"metadata may not replace {', '.join(taken)}; use another name")
+    entries.update(extra)
+    if (span := entries.get("h_range")) is not None and not (len(span) == 2 and 0 < span[0] <= h <= span[1]):
+        raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got {list(span)}")
+    return entries
+
+
+def weights_digest(model: torch.nn.Module) -> str:
+    """The sha256 (hex) of names, dtypes, shapes and values of a module's state."""
+    sha = hashlib.sha256()
+    for name, value in sorted(model.state_dict().items()):
+        sha.update(f"{name} {value.dtype} {tuple(value.shape)};".encode())
+        sha.update(value.detach().cpu().contiguous().numpy().tobytes())
+    return sha.hexdigest()
+
+
+def to_json(entries: Mapping[str, Any]) -> str:
+    """The entries as text.
+
+    Raises
+    ------
+    InputError
+        If one is not a plain finite number, text, list or dictionary.
+    """
+    try:
+        return json.dumps(entries, indent=1, allow_nan=False)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"metadata cannot be written as JSON ({error}); use plain finite numbers and text") from None
+
+
+def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
+    """The entries of a file that one of the exporters wrote.
+
+    Raises
+    ------
+    InputError
+        If it is not ours, or of another format version.
+    """
+    try:
+        entries = json.loads(text or "")
+    except json.JSONDecodeError:
+        entries = None
+    if not isinstance(entries, dict) or any(key not in entries for key in REQUIRED):
+        raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export")
+    if entries["format"] != FORMAT:
+        raise InputError(
+            f"{path}: is of format {entries['format']}, this herglotz reads {FORMAT}; export the model again"
+        )
+    return entries
+
+
+def _box(box: Mapping[str, Sequence[float]], dof: int) -> dict[str, list[float]]:
+    """The box with plain numbers, checked: q and p have n entries, s has one, low ≤ high."""
+    if set(box) != set(BOX_KEYS):
+        raise InputError(f"box needs exactly the keys {', '.join(BOX_KEYS)}; got {', '.join(sorted(box)) or 'none'}")
+    plain = {key: [float(x) for x in torch.as_tensor(box[key], dtype=torch.float64).reshape(-1)] for key in BOX_KEYS}
+    for key, values in plain.items():
+        size = 1 if key.startswith("s") else dof
+        if len(values) != size:
+            raise InputError(f"box {key} needs {size} numbers, got {values}")
+    for name in "qps":
+        low, high = plain[f"{name}_low"], plain[f"{name}_high"]
+        if not all(a <= b for a, b in zip(low, high, strict=True)):
+            raise InputError(f"box {name}_low must not exceed {name}_high, got {low} and {high}")
+    return plain

@@ -1,0 +1,113 @@
+"""The left discrete Lagrangian L⁻(q0, q1, s1) = s1 − s0(q0, q1, s1) of any L_d (erratum E5)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
+from herglotz.mechanics.root import find_root
+
+
+class LeftLagrangian:
+    """L⁻(q0, q1, s1) = s1 − s0, where s0 + L_d(q0, q1, s0) = s1.
+
+    1 − D3L⁻ = 1/c,    p0 = −D1L⁻,    p1 = D2L⁻ / (1 − D3L⁻).
+
+    The scalar equation is solved by Newton's method from s0 = s1; its slope is c, so it has one solution where c > 0
+    for every s0. Where c = 0, or no solution was found, value and derivatives are NaN; `regularity` says which.
+
+    Parameters
+    ----------
+    L_d
+        The (right) discrete Lagrangian.
+
+    Source: erratum E5, which replaces the left discrete Hamiltonian's L_d(q_k, q_{k+1}, s_{k+1}) in the paper.
+    """
+
+    def __init__(self, L_d: DiscreteLagrangian):
+        self.L_d = L_d
+
+    def previous_action(
+        self,
+        q0: Tensor,  # (..., n)
+        q1: Tensor,  # (..., n)
+        s1: Tensor,  # (...)
+        h: Tensor | float,
+    ) -> Tensor:
+        """s0 with s0 + L_d(q0, q1, s0) = s1, without a graph; shape (...), NaN where there is none."""
+
+        def equations(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+            P = partials(self.L_d, q0, q1, x[..., 0], h)
+            return (x[..., 0] + P.L - s1)[..., None], (P.c[..., None, None],)
+
+        with torch.no_grad():
+            q0, q1, s1 = q0.detach(), q1.detach(), s1.detach()
+            shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s1.shape, torch.as_tensor(h).shape)
+            return find_root(equations, s1.expand(shape)[..., None]).solved[..., 0]
+
+    def __call__(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
+        """L⁻, shape (...), differentiable three times: two Newton steps inside the graph, zero in value."""
+        s0 = self.previous_action(q0, q1, s1, h)
+        if torch.is_grad_enabled():
+            for _ in range(2):
+                P = partials(self.L_d, q0, q1, s0, h)
+                s0 = s0 - (s0 + P.L - s1) / P.c
+        return s1 - s0
+
+    def partials(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
+        """Value and derivatives of L⁻ with respect to (q0, q1, s1), by the implicit-function theorem.
+
+        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c.
+
+        Returns
+        -------
+        Partials
+            Of L⁻: its `c` is 1 + D3L⁻, not the conformal factor, which is 1/(1 − D3L⁻).
+
+        Raises
+        ------
+        InputError
+            If L_d comes with forces, for which there is no left Lagrangian.
+        """
+        s0 = self.previous_action(q0, q1, s1, h)
+        P = unforced(partials(self.L_d, q0, q1, s0, h, order))
+        c = P.c
+        g1, g2, g3 = -P.D1 / c[..., None], -P.D2 / c[..., None], 1 / c
+        first = (s1 - s0, -g1, -g2, 1 - g3)
+        if order == 1:
+            return Partials(*first)
+
+        def block(D: Tensor, a3: Tensor, a: Tensor, b3: Tensor, b: Tensor) -> Tensor:
+            outer = a3[..., :, None] * b[..., None, :] + a[..., :, None] * (b3 + P.D33[..., None] * b)[..., None, :]
+            return (D + outer) / c[..., None, None]
+
+        return Partials(
+            *first,
+            D11=block(P.D11, P.D13, g1, P.D13, g1),
+            D12=block(P.D12, P.D13, g1, P.D23, g2),
+            D22=block(P.D22, P.D23, g2, P.D23, g2),
+            D13=(P.D13 + P.D33[..., None] * g1) * (g3 / c)[..., None],
+            D23=(P.D23 + P.D33[..., None] * g2) * (g3 / c)[..., None],
+            D33=P.D33 * g3**2 / c,
+        )
+
+
+def left_momenta(P: Partials) -> tuple[Tensor, Tensor, Tensor]:
+    """p0 = −D1L⁻, p1 = D2L⁻/(1 − D3L⁻) and c = 1/(1 − D3L⁻), from the partials of L⁻."""
+    c = 1 / (1 - P.D3)
+    return -P.D1, c[..., None] * P.D2, c
+
+
+def unforced(P: Partials) -> Partials:
+    """P, unless it comes with forces: those are not derivatives of an action.
+
+    Raises
+    ------
+    InputError
+        If there are forces.
+    """
+    if P.force is not None:
+        raise InputError("this L_d comes with forces F⁻, F⁺; actions and discrete Hamiltonians need one without")
+    return P

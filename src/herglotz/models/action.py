@@ -1,0 +1,62 @@
+"""Damping that depends on s: the full level's map of the action, increasing for every weight."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.models.config import ModelConfig
+from herglotz.models.jet import Jet
+from herglotz.models.network import feature_count
+
+
+class ActionFlow(nn.Module):
+    """Maps s ↦ s + δ of J units, each the exact flow over half a step of ṡ = (r S/k) tanh(k s/S + b), in turn.
+
+    b = β + W·(features of q̄, v): together the units are a tanh network of (s/S, q̄, v) that adds to L. Written in
+    x = k s/S + b and a = r h/2, one unit's flow is y = asinh(eᵃ sinh x), that is
+
+        y − x = atanh( t (e^{2a} − 1) / (1 + eᵃ D) ),    t = tanh x,   D = √(1 + (e^{2a} − 1) t²),
+
+    whose terms are bounded for every x. Its slope dy/dx = eᵃ/D is positive and runs from eᵃ at x = 0 to 1 far away: a
+    composition of such maps is increasing, so 1 + D3 > 0 *by construction*, and as r has either sign its slope can be
+    anywhere in (0, ∞). L_s = Σ r sech²(k s/S + b) rises and falls with s: damping may decrease with s as well.
+
+    The rates r start at 0: the identity. Exact flows composed in one order before the kinetic term and in the opposite
+    order after it make a step that is its own adjoint, hence order 2 for every weight (a network of s in the rule
+    itself would be order 1, trap 1). Finite while |a| < 18 (float64).
+    """
+
+    def __init__(self, config: ModelConfig, generator: torch.Generator):
+        super().__init__()
+        J, inputs = config.action_width, feature_count(config.angles) + config.dof
+        draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
+        self.size = sum(a * b for a, b in zip(config.speed, config.scale, strict=True))  # S, natural size of s
+        self.rate = nn.Parameter(torch.zeros(J, dtype=torch.float64))
+        self.log_slope = nn.Parameter(torch.zeros(J, dtype=torch.float64))
+        self.weight = nn.Parameter(draw(J, inputs) * (0.3 / inputs**0.5))
+        # Centres on both sides of s = 0: units that bend alike there could not tell s from −s.
+        self.bias = nn.Parameter(torch.linspace(-1.0, 1.0, J, dtype=torch.float64) + 0.1 * draw(J))
+
+    def offsets(self, features: Jet) -> Jet:
+        """The b of every unit, vector-valued (..., J)."""
+        return features.linear(self.weight, self.bias)
+
+    def forward(self, s0: Jet, gained: Jet, offsets: Jet, h: Tensor, *, backward: bool = False) -> Jet:
+        """What s has gained after the units of half a step, given what it had before: increments do not cancel."""
+        slope, rate = self.log_slope.exp() / self.size, self.rate
+        order = range(len(rate))
+        for j in reversed(order) if backward else order:
+            x = (s0 + gained) * slope[j] + offsets.select(j)
+            gained = gained + unit_increment(x, rate[j] * h / 2) / slope[j]
+        return gained
+
+
+def unit_increment(x: Jet, a: Tensor) -> Jet:
+    """asinh(eᵃ sinh x) − x as a jet; a is (...)."""
+    t = x.value.tanh()
+    e, E = a.exp(), torch.expm1(2 * a)
+    D = (1 + E * t * t).sqrt()
+    sech = 1 - t * t
+    f2 = -e * E * t * sech / (D * D * D) if x.order == 2 else None
+    return x.map(torch.atanh(t * E / (1 + e * D)), E * sech / (D * (e + D)), f2)

@@ -1,0 +1,84 @@
+"""Forces: friction of each joint and inputs, which one scalar s cannot express (trap 4)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.errors import InputError
+from herglotz.mechanics import Forces
+from herglotz.models.config import ModelConfig
+from herglotz.models.jet import Jet
+
+SMOOTH, STRIBECK = 0.05, 0.2  # starting widths of dry friction, in typical speeds
+
+
+class Friction(nn.Module):
+    """f = −b v − (τ + ε e^{−(v/v_st)²}) tanh(v/v_s) + G u for each joint, F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
+
+    b is viscous, τ the Coulomb force and τ + ε the breakaway force of Stribeck's curve; all three are plain parameters
+    of either sign that start at 0 (a logarithm collapses on short horizons and never comes back), so positive friction
+    is found, not forced. Only the widths v_s and v_st, which cannot be 0, are logarithms. f is taken at the velocity of
+    the step in both forces, so the step stays order 2, and linear in q1 where friction is viscous alone.
+    The map G is learned from 0, or given.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        n, m = config.dof, config.inputs
+        zeros = lambda *shape: torch.zeros(*shape, dtype=torch.float64)  # noqa: E731
+        self.inputs, self.dry = m, config.coulomb
+        self.viscous = nn.Parameter(zeros(n))
+        if self.dry:
+            speed = torch.tensor(config.speed, dtype=torch.float64)
+            self.coulomb, self.breakaway = nn.Parameter(zeros(n)), nn.Parameter(zeros(n))
+            self.log_smooth = nn.Parameter((SMOOTH * speed).log())
+            self.log_stribeck = nn.Parameter((STRIBECK * speed).log())
+        self.input_map: Tensor
+        if config.input_map:
+            self.register_buffer("input_map", torch.tensor(config.input_map, dtype=torch.float64).reshape(n, m))
+        elif m:
+            self.input_map = nn.Parameter(zeros(n, m))
+
+    @property
+    def linear(self) -> bool:
+        """Whether f is linear in v."""
+        return not self.dry
+
+    def force(self, v: Tensor, u: Tensor | None) -> Jet:
+        """f, (..., n), with ∂f_i/∂v_i as its only tangent; u None: no input acts."""
+        x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
+        f = x * -self.viscous
+        if self.dry:
+            slow = x * (-self.log_stribeck).exp()
+            f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (-self.log_smooth).exp()).tanh()
+        return f if u is None else f + self._applied(u)
+
+    def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
+        """The force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet: what one iteration of a step needs."""
+        f, slope = -self.viscous * v, -self.viscous
+        if self.dry:
+            x, rate = v * (-self.log_stribeck).exp(), (-self.log_smooth).exp()
+            t, bump = (v * rate).tanh(), (-(x * x)).exp() * self.breakaway
+            grip = bump + self.coulomb
+            f = f - grip * t
+            slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x * (-self.log_stribeck).exp() * t
+        return f if u is None else f + self._applied(u), slope
+
+    def forward(self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None) -> Forces:
+        """F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2."""
+        f = self.force(v, u)
+        before, after = (c * h / 2)[..., None], (h / 2)[..., None]
+        minus, plus = before * f.value, after * f.value
+        if order == 1:
+            return Forces(minus, plus)
+        slope = f.gradient[0]  # ∂f/∂q1 = slope / h
+        minus_2, plus_2 = torch.diag_embed((c / 2)[..., None] * slope), torch.diag_embed(slope / 2)
+        zero = torch.zeros_like(minus)
+        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero)
+
+    def _applied(self, u: Tensor) -> Tensor:
+        """G u, (..., n)."""
+        if not self.inputs or u.shape[-1:] != (self.inputs,):
+            raise InputError(f"u needs shape (..., {self.inputs}), got {tuple(u.shape)}")
+        return u @ self.input_map.T

@@ -1,0 +1,144 @@
+"""A scalar network by one forward and one reverse sweep: the cheap twin of its jets, for a step's own derivatives.
+
+The step equation asks for the gradient of a network of (q̄, v) and for the derivative of that gradient along q1; a
+rollout asks for V and V′. A reverse sweep gives the gradient at the cost of the value, and tangents that go through
+both sweeps give its derivative: 1 + n rows where a jet over (q0, q1) carries 1 + 2n + n(2n + 1).
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import linear, logsigmoid
+
+from herglotz.models.network import Network
+
+
+class Trigonometry(NamedTuple):
+    """What features are made of, each (..., n): sin q and cos q of angles, q itself of other coordinates."""
+
+    s: Tensor  # sin q, or q
+    c: Tensor  # cos q
+    ds: Tensor  # ∂s/∂q: cos q, or 1
+    minus_sin: Tensor  # ∂c/∂q
+
+
+@lru_cache(maxsize=64)
+def _angle_mask(angles: tuple[bool, ...], device: torch.device) -> Tensor | None:
+    """(n,) which coordinates are angles; None: all."""
+    return None if all(angles) else torch.tensor(angles, device=device)
+
+
+def trigonometry(q: Tensor, angles: tuple[bool, ...]) -> Trigonometry:
+    """At q, (..., n)."""
+    sin, cos = q.sin(), q.cos()
+    mask = _angle_mask(angles, q.device)
+    if mask is None:
+        return Trigonometry(sin, cos, cos, -sin)
+    return Trigonometry(torch.where(mask, sin, q), cos, torch.where(mask, cos, 1.0), -sin)
+
+
+class Sweep:
+    """One scalar network at its present parameters, reading (s, c) or (s, c, v): `Trigonometry` and the velocity.
+
+    Parameters
+    ----------
+    network
+        Its features are those of `Phase`, or of `position_features` where `speed` is None.
+    angles, scale, speed
+        The coordinates; the sizes go into the weights of the first layer.
+    factor
+        Multiplies the network: a number, or a tensor (...) such as h.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        angles: tuple[bool, ...],
+        scale: tuple[float, ...],
+        speed: tuple[float, ...] | None,
+        factor: float | Tensor,
+    ):
+        weights = list(network.weights)
+        index, fold = _columns(angles, scale, speed, weights[0].dtype, weights[0].device)
+        self.hidden = [weights[0] if index is None else weights[0][:, index] * fold, *weights[1:-1]]
+        self.biases = list(network.biases)
+        self.activation = network.activation
+        if isinstance(factor, Tensor):
+            factor = factor[..., None]
+        self.last = weights[-1][0] * factor  # (width,) or (..., width)
+
+    def __call__(self, y: Tensor, dy: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
+        """Value (...), gradient (..., m) at the features y (..., m), and the gradient's tangents (k, ..., m).
+
+        Parameters
+        ----------
+        y
+            (..., m).
+        dy
+            (k, ..., m) tangents of y; without them the third result is None.
+        """
+        layers: list[tuple[Tensor, Tensor | None]] = []
+        for weight, bias in zip(self.hidden, self.biases, strict=True):
+            y, f1, f2 = activation(self.activation, linear(y, weight, bias), second=dy is not None)
+            if dy is None:
+                layers.append((f1, None))
+            else:
+                dz = linear(dy, weight) if not layers else linear(dy * layers[-1][0], weight)
+                layers.append((f1, f2 * dz))
+                dy = dz
+        last = self.last
+        value = y @ last if last.ndim == 1 else (y * last).sum(-1)
+        g, dg = last, None
+        for weight, (f1, turned) in zip(reversed(self.hidden), reversed(layers), strict=True):
+            if turned is not None:
+                dg = (g * turned if dg is None else torch.addcmul(dg * f1, turned, g)) @ weight
+            g = (g * f1) @ weight
+        return value, g, dg
+
+
+@lru_cache(maxsize=64)
+def _columns(
+    angles: tuple[bool, ...],
+    scale: tuple[float, ...],
+    speed: tuple[float, ...] | None,
+    dtype: torch.dtype,
+    device: torch.device,
+) -> tuple[Tensor | None, Tensor]:
+    """Which columns of the first layer read s, c and v, and the factors on them; None: they do already."""
+    sines, cosines, factors, column = [], [], [], 0
+    for angle in angles:
+        sines.append(column)
+        cosines.append(column + 1 if angle else column)  # a coordinate that is no angle has no cosine: factor 0
+        factors.append(1.0 if angle else 0.0)
+        column += 2 if angle else 1
+    fold = [1.0 if a else 1.0 / x for a, x in zip(angles, scale, strict=True)] + factors
+    index = sines + cosines
+    if speed is not None:
+        index += range(column, column + len(angles))
+        fold += [1.0 / v for v in speed]
+    plain = index == list(range(len(index))) and all(x == 1.0 for x in fold)
+    return None if plain else torch.tensor(index, device=device), torch.tensor(fold, dtype=dtype, device=device)
+
+
+@lru_cache(maxsize=16)
+def numbers(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """The tensors 0 and 1."""
+    with torch.inference_mode(False):
+        return torch.zeros((), dtype=dtype, device=device), torch.ones((), dtype=dtype, device=device)
+
+
+def activation(name: str, z: Tensor, *, second: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    """The activation, its derivative and (if asked for, else the derivative once more) its second derivative."""
+    if name == "tanh":
+        t, (zero, one) = z.tanh(), numbers(z.dtype, z.device)
+        f1 = torch.addcmul(one, t, t, value=-1)  # one operation, and no Python number to convert
+        return t, f1, torch.addcmul(zero, t, f1, value=-2) if second else f1
+    up, down = z.sigmoid(), (-z).sigmoid()
+    if name == "softplus":
+        return -logsigmoid(-z), up, up * down if second else up
+    f1 = up * (1.0 + z * down)
+    return z * up, f1, up * down * (2.0 + z * (down - up)) if second else f1  # silu

@@ -1,0 +1,132 @@
+"""The parachute, twice: the map that the paper prints, and a fall."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from herglotz.plots.style import (
+    ACCENT,
+    INK,
+    MODEL,
+    MUTED,
+    UNSEEN,
+    captions,
+    label,
+    new_figure,
+    number,
+    styled,
+)
+
+FLOOR = 1e-18  # where a difference of exactly 0 is drawn
+
+
+@dataclass(frozen=True)
+class PrintedOrbit:
+    """The printed map's first points; arrays over k = 0…K, the slopes over k = 1…K."""
+
+    q: np.ndarray
+    p: np.ndarray
+    dS: np.ndarray  # D2S^k(q_k), s as printed
+    p_squared: np.ndarray  # p_k with −2λ²s_k² in the s-line
+    dS_squared: np.ndarray
+    last: int  # the last k that is finite in float64
+
+
+@dataclass(frozen=True)
+class Fall:
+    """A fall in closed form, from h·0 to the last step before the ground; slopes from k = 1."""
+
+    t: np.ndarray
+    q: np.ndarray
+    v: np.ndarray
+    p: np.ndarray
+    dS: np.ndarray
+    residual: np.ndarray  # of the discrete Hamilton–Jacobi equation between k and k + 1, relative to its terms
+    landing_time: float
+    landing_speed: float  # signed
+    terminal_speed: float
+
+
+def plot_printed_map(orbit: PrintedOrbit) -> Figure:
+    """Draw what the paper's two figures plot: q_k and p_k of the printed map, and D2S^k(q_k) beside p_k.
+
+    The second panel has D2S^k twice: of the map as printed, and with the square that its s-line lacks (erratum E9).
+    """
+    k = np.arange(len(orbit.q))
+    with styled():
+        figure = new_figure(9.2, 4.2, "The printed map is no fall, and its $D_2S^k$ is not $p_k$")
+        left, right = figure.subplots(1, 2)
+        left.axhline(0.0, color=MUTED, lw=0.8, zorder=1)
+        left.plot(k, orbit.q, "o-", ms=4, color=UNSEEN, zorder=3)
+        left.plot(k, orbit.p, "s-", ms=4, color=MODEL, zorder=2)
+        label(left, k[-1], orbit.q[-1], "$q_k$", UNSEEN, xytext=(6, -4))
+        label(left, k[-1], orbit.p[-1], "$p_k$", MODEL, xytext=(6, -4))
+        captions(left, [(f"k = {orbit.last} is the last finite point in float64", INK)], "lower left")
+        left.set(xlabel="k (there is no h)", ylabel="as printed, without units", title="λ = −0.01, from (100, 1, 1)")
+        left.set_xlim(-0.3, k[-1] + 0.7)
+        right.axhline(0.0, color=MUTED, lw=0.8, zorder=1)
+        right.plot(k, orbit.p, "s-", ms=4, color=MODEL, zorder=2)
+        right.plot(k[1:], orbit.dS, "o", ms=8, mfc="none", mec=UNSEEN, mew=1.3, zorder=4)
+        right.plot(k, orbit.p_squared, "-", color=ACCENT, lw=1.0, zorder=2)
+        right.plot(k[1:], orbit.dS_squared, "D", ms=7, mfc="none", mec=ACCENT, mew=1.1, zorder=3)
+        captions(right, [("■ $p_k$ as printed", MODEL), (r"○ its $D_2S^k(q_k)$", UNSEEN)], "lower left")
+        captions(right, [(r"◇ $D_2S^k(q_k)$ on $p_k$ with $s_k^2$", ACCENT)], "upper right")
+        low, high = right.get_ylim()
+        right.set(xlabel="k", title="the paper's check, both ways", xticks=k)
+        right.set_ylim(low - 0.12 * (high - low), high + 0.1 * (high - low))
+        left.set_xticks(k)
+    return figure
+
+
+def plot_fall(fall: Fall) -> Figure:
+    """Draw the fall with λ = +0.01: height and velocity to the ground, and D2S^k(q_k) on the momentum."""
+    with styled():
+        title = f"A parachute lands after {number(fall.landing_time, 's')} at {number(-fall.landing_speed, 'm/s')}"
+        figure = new_figure(9.2, 5.0, title)
+        grid = figure.add_gridspec(2, 2, height_ratios=[1.6, 1.0])
+        _draw_height(figure.add_subplot(grid[0, 0]), fall)
+        _draw_velocity(figure.add_subplot(grid[1, 0]), fall)
+        _draw_momentum(figure.add_subplot(grid[0, 1]), fall)
+        _draw_differences(figure.add_subplot(grid[1, 1]), fall)
+    return figure
+
+
+def _draw_height(ax: Axes, fall: Fall) -> None:
+    t = np.append(fall.t, fall.landing_time)
+    ax.plot(t, np.append(fall.q, 0.0), color=UNSEEN)
+    ax.axhline(0.0, color=MUTED, lw=0.8)
+    ax.plot(fall.landing_time, 0.0, "o", color=INK, ms=5, clip_on=False, zorder=4)
+    label(ax, fall.landing_time, 0.0, f"{fall.landing_time:.6f} s", ha="right", xytext=(-34, 3))
+    ax.set(ylabel="height q (m)", xlim=(0.0, 1.02 * fall.landing_time), title="fall with λ = +0.01 1/m")
+    ax.tick_params(labelbottom=False)
+
+
+def _draw_velocity(ax: Axes, fall: Fall) -> None:
+    ax.plot(np.append(fall.t, fall.landing_time), np.append(fall.v, fall.landing_speed), color=MODEL)
+    ax.axhline(fall.terminal_speed, color=MUTED, lw=1.0, ls=(0, (4, 3)))
+    label(ax, 0.0, fall.terminal_speed, f"terminal −{-fall.terminal_speed:.1f} m/s", "#666666", xytext=(4, 3))
+    ax.plot(fall.landing_time, fall.landing_speed, "o", color=INK, ms=5, zorder=4)
+    ax.set(xlabel="time (s)", ylabel="velocity (m/s)", xlim=(0.0, 1.02 * fall.landing_time))
+    ax.set_ylim(1.1 * fall.terminal_speed, 3.0)
+
+
+def _draw_momentum(ax: Axes, fall: Fall) -> None:
+    ax.plot(fall.t, fall.p, color=MODEL)
+    ax.plot(fall.t[1:], fall.dS, "o", ms=4.5, mfc="none", mec=UNSEEN, mew=0.9)
+    captions(ax, [("━ $p_k$ of the stepper", MODEL), (r"○ $D_2S^k(q_k)$", UNSEEN)], "upper right")
+    ax.set(ylabel="momentum (kg m/s)", xlim=(0.0, 1.02 * fall.landing_time), title="the action's derivative")
+    ax.tick_params(labelbottom=False)
+
+
+def _draw_differences(ax: Axes, fall: Fall) -> None:
+    difference = np.abs(fall.dS - fall.p[1:]) / np.abs(fall.p[1:]).max()
+    ax.plot(fall.t[1:], np.maximum(difference, FLOOR), "o", ms=3, color=UNSEEN)
+    ax.plot(fall.t[2:], np.maximum(fall.residual, FLOOR), "x", ms=3.5, color=ACCENT)
+    ax.set(yscale="log", ylim=(FLOOR / 3, 1e-11), xlabel="time (s)", ylabel="relative")
+    ax.set_xlim(0.0, 1.02 * fall.landing_time)
+    ax.set_title(f"exact zeros are drawn at {FLOOR:.0e}", fontsize=8.5, loc="right")
+    captions(ax, [(r"● $|D_2S^k - p_k|$", UNSEEN), ("× Hamilton–Jacobi residual", ACCENT)])

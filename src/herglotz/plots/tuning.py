@@ -1,0 +1,60 @@
+"""Error against cost of every setting that `tune` tried, and the front it chose from."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
+
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, styled
+
+if TYPE_CHECKING:
+    from herglotz.tune.result import Tuning
+
+FLOOR = 1e-16  # an error of zero (the run's own setting) has no place on a logarithmic axis
+KINDS = (
+    ("eager", "float64", "o", MUTED, "PyTorch"),
+    ("c", "float64", "s", MODEL, "C, float64"),
+    ("c", "float32", "^", ACCENT, "C, float32"),
+)
+
+
+def plot_tuning(tuning: Tuning) -> Figure:
+    """Draw the error bound against the cost per unit of time; filled: distilled; the choice in colour."""
+    good = [c for c in tuning.candidates if math.isfinite(c.bound)]
+    share, unit = f"{100 * tuning.config.quantile:g} % of starts", tuning.run.data.time_unit
+    units = tuning.run.data.units
+    q_unit = f" ({units[0]})" if len(set(units)) == 1 and units[0] != "1" else ""
+    chosen = tuning.chosen
+    before, what = (tuning.own, "the run as it is") if tuning.own_in_c is None else (tuning.own_in_c, "the same in C")
+    with styled():
+        figure = new_figure(
+            7.6, 4.8, f"{before.us / chosen.us:.3g} times cheaper than {what}, within {chosen.bound:.2g}"
+        )
+        ax = figure.subplots()
+        front = tuning.front
+        ax.step([c.us for c in front], [max(c.bound, FLOOR) for c in front], where="post", color=INK, lw=0.9)
+        for artefact, dtype, mark, color, name in KINDS:
+            mine = [c for c in good if (c.setting.artefact, c.setting.dtype) == (artefact, dtype)]
+            for distilled in (False, True):
+                some = [c for c in mine if (c.setting.width is not None) == distilled]
+                if some:
+                    x, y = [c.us for c in some], [max(c.bound, FLOOR) for c in some]
+                    text = f"{name}, {'distilled' if distilled else 'own model'}"
+                    ax.plot(x, y, mark, color=color, mfc=color if distilled else "white", ms=5.5, label=text)
+        ax.plot([chosen.us], [max(chosen.bound, FLOOR)], "o", ms=14, mfc="none", mec=UNSEEN, mew=2)
+        label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, 8))
+        if "max_error" in tuning.asked:
+            ax.axhline(tuning.asked["max_error"], color=UNSEEN, lw=0.9, ls="--")
+        else:
+            ax.axvline(tuning.asked["budget_us"], color=UNSEEN, lw=0.9, ls="--")
+        known = tuning.model_error["extrapolation_rms"] or tuning.model_error["train_rms"]
+        if known:
+            ax.axhline(known, color=MUTED, lw=0.9, ls=":")
+            label(ax, max(c.us for c in good), known, "RMS of the model against its data", MUTED, ha="right")
+        ax.set(xscale="log", yscale="log", xlabel=f"cost (µs per {'unit of time' if unit == '1' else unit})")
+        ax.set_ylabel(f"error that {share} keep{q_unit}")
+        ax.grid(color="#EEEEEE", lw=0.8)
+        ax.legend(fontsize=8, loc="best")
+    return figure

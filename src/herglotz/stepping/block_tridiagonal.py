@@ -1,0 +1,68 @@
+"""Block tridiagonal systems, batched: elimination in order, and a dense solve for the samples it does not serve."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+# Diagonal blocks, those to the right and those to the left: (..., K, m, m) each. The last upper and the first lower
+# block are not used.
+Blocks = tuple[Tensor, Tensor, Tensor]
+
+
+def solve_blocks(blocks: Blocks, rhs: Tensor) -> Tensor:
+    """Solve the system for rhs (..., K, m).
+
+    Elimination takes pivots inside blocks only and fails where a leading part is singular though the whole is not
+    (a caustic that the curve has crossed exactly at a node): those samples are solved densely. Not finite where the
+    matrix is singular.
+    """
+    u = _eliminate(blocks, rhs)
+    defect = (multiply(blocks, u) - rhs).abs().flatten(-2).amax(-1)
+    good = defect <= 1e-3 * torch.finfo(rhs.dtype).eps ** 0.25 * rhs.abs().flatten(-2).amax(-1)
+    if bool(good.all()):
+        return u
+    bad = ~good
+    matrix = _assemble(tuple(x[bad] for x in blocks))  # type: ignore[arg-type]
+    fixed = torch.linalg.solve_ex(matrix, rhs[bad].flatten(-2)[..., None])[0][..., 0]
+    u = u.clone()
+    u[bad] = fixed.unflatten(-1, rhs.shape[-2:])
+    return u
+
+
+def multiply(blocks: Blocks, u: Tensor) -> Tensor:
+    """The matrix times u (..., K, m)."""
+    diagonal, upper, lower = blocks
+    zero = torch.zeros_like(u[..., :1, :])
+    after, before = torch.cat([u[..., 1:, :], zero], -2), torch.cat([zero, u[..., :-1, :]], -2)
+    return sum((a @ x[..., None])[..., 0] for a, x in ((diagonal, u), (upper, after), (lower, before)))  # type: ignore[return-value]
+
+
+def _eliminate(blocks: Blocks, rhs: Tensor) -> Tensor:
+    diagonal, upper, lower = blocks
+    count, m = rhs.shape[-2:]
+    columns = torch.cat([upper, rhs[..., None]], -1)
+    reduced: list[Tensor] = []
+    pivot, column = diagonal[..., 0, :, :], columns[..., 0, :, :]
+    for k in range(count):
+        reduced.append(torch.linalg.solve_ex(pivot, column)[0])
+        if k + 1 < count:
+            removed = lower[..., k + 1, :, :] @ reduced[-1]
+            pivot = diagonal[..., k + 1, :, :] - removed[..., :m]
+            column = torch.cat([upper[..., k + 1, :, :], (rhs[..., k + 1, :] - removed[..., m])[..., None]], -1)
+    u = [reduced[-1][..., m]]
+    for X in reversed(reduced[:-1]):
+        u.append(X[..., m] - (X[..., :m] @ u[-1][..., None])[..., 0])
+    return torch.stack(u[::-1], -2)
+
+
+def _assemble(blocks: Blocks) -> Tensor:
+    diagonal, upper, lower = blocks
+    count, m = diagonal.shape[-3:-1]
+    matrix = diagonal.new_zeros(*diagonal.shape[:-3], count, m, count, m)
+    for k in range(count):
+        matrix[..., k, :, k, :] = diagonal[..., k, :, :]
+        if k + 1 < count:
+            matrix[..., k, :, k + 1, :] = upper[..., k, :, :]
+            matrix[..., k + 1, :, k, :] = lower[..., k + 1, :, :]
+    return matrix.flatten(-2).flatten(-3, -2)

@@ -1,0 +1,162 @@
+"""Compositions: a method over several fractions of a step, some of them negative, makes one of higher order.
+
+Fractions that sum to 1 and whose (p+1)-th powers sum to 0 raise the order from p; a symmetric list of a method that is
+its own adjoint skips the odd orders. Every stage is a contact map, so the composition is one, with c = ∏ c_i.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.stepping.engine import Engine
+from herglotz.stepping.newton import Status
+from herglotz.stepping.state import Rollout, State, Step, StepError, check_h, check_state, step_sizes, throw_failure
+
+
+@runtime_checkable
+class Substeps(Protocol):
+    """A method that steps by itself, over a time of either sign."""
+
+    def substep(self, state: State, h: Tensor) -> Step:
+        """One step over h, which may be negative."""
+        ...
+
+
+Method = DiscreteLagrangian | Substeps
+MAX_ITERATIONS = 30
+
+
+class Composition:
+    """A stepper that applies several methods one after the other, each over its fraction of the step.
+
+    Parameters
+    ----------
+    stages
+        Pairs (method, fraction) in the order of application. A method is a discrete Lagrangian, which is stepped as
+        `Stepper` steps it, or has a `substep`, as `ContactSplitting` has. Fractions may be negative.
+    throw
+        Raise `StepError` at the first sample that fails, instead of reporting its status.
+
+    Raises
+    ------
+    InputError
+        If the fractions do not sum to 1.
+    """
+
+    def __init__(self, stages: Sequence[tuple[Method, float]], *, throw: bool = False):
+        total = sum(fraction for _, fraction in stages)
+        if not abs(total - 1.0) < 1e-12:
+            raise InputError(f"the fractions of a composition must sum to 1, got {total:.15g}")
+        engines: dict[int, Engine] = {}
+        for method, _ in stages:
+            if not isinstance(method, Substeps):
+                engines[id(method)] = Engine(method, None, MAX_ITERATIONS, False)
+        self.stages, self.throw, self._engines = tuple(stages), throw, engines
+
+    def step(self, state: State, h: Tensor | float) -> Step:
+        """One step of h > 0, scalar or (...): all stages. The status is that of the first stage that failed.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit or h is not positive.
+        """
+        state = check_state(state)
+        out = self.substep(state, check_h(h, state.q))
+        if self.throw:
+            throw_failure(out.status, out.residual)
+        return out
+
+    def substep(self, state: State, h: Tensor) -> Step:
+        """The same for h of either sign, unchecked, so that compositions can be composed."""
+        c, iterations = torch.ones_like(state.s), 0
+        residual = torch.zeros_like(state.s)
+        status = torch.zeros_like(state.s, dtype=torch.uint8)
+        for method, fraction in self.stages:
+            part = self._part(method, state, fraction * h)
+            state, c, iterations = part.state, c * part.c, iterations + part.iterations
+            first = status == Status.CONVERGED
+            residual = torch.where(first, torch.maximum(residual, part.residual), residual)
+            status = torch.where(first, part.status, status)
+        return Step(state, c, status, residual, iterations)
+
+    def rollout(
+        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
+    ) -> Rollout:
+        """Step K times from (q, p, s); h is a scalar with `steps`, (K,) or (..., K). s defaults to 0.
+
+        Raises
+        ------
+        InputError
+            If h is not positive or its length and `steps` disagree.
+        """
+        state = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        h_all = step_sizes(check_h(h, q), steps)
+        states, results = [state], []
+        for k in range(h_all.shape[-1]):
+            try:
+                results.append(self.step(states[-1], h_all[..., k]))
+            except StepError as error:
+                raise StepError(f"step {k}: {error}") from None
+            states.append(results[-1].state)
+        return Rollout.of(states, results)
+
+    def _part(self, method: Method, state: State, h: Tensor) -> Step:
+        if isinstance(method, Substeps):
+            return method.substep(state, h)
+        return self._engines[id(method)](state, h, state.q)[0]
+
+
+def yoshida(method: Method, order: int = 4, *, throw: bool = False) -> Composition:
+    """Order 4 with 3 stages or 6 with 7, from a method of order 2 that is its own adjoint.
+
+    Source: H. Yoshida, Phys. Lett. A 150 (1990) 262: the triple jump, and solution A of order 6.
+    """
+    cube = 2.0 ** (1 / 3)
+    outer = {4: (1 / (2 - cube),), 6: (0.784513610477560, 0.235573213359357, -1.17767998417887)}
+    return _symmetric(method, outer, order, "yoshida", throw)
+
+
+def suzuki(method: Method, order: int = 4, *, throw: bool = False) -> Composition:
+    """Order 4 with 5 stages or 6 with 25, from a method of order 2 that is its own adjoint.
+
+    More stages than Yoshida's and a much smaller error constant: the fractions stay below 1 in size.
+
+    Source: M. Suzuki, Phys. Lett. A 146 (1990) 319.
+    """
+    if order not in (4, 6):
+        raise InputError(f"suzuki has order 4 or 6, got {order}")
+    root = 4.0 ** (1 / (order - 1))
+    part = 1 / (4 - root)
+    base = method if order == 4 else suzuki(method, 4)
+    middle = 1 - 4 * part
+    return Composition([(base, part), (base, part), (base, middle), (base, part), (base, part)], throw=throw)
+
+
+def kahan_li(method: Method, order: int = 6, *, throw: bool = False) -> Composition:
+    """Order 6 with 9 stages, from a method of order 2 that is its own adjoint.
+
+    Source: W. Kahan, R.-C. Li, Math. Comp. 66 (1997) 1089, s9odr6a.
+    """
+    outer = {6: (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)}
+    return _symmetric(method, outer, order, "kahan_li", throw)
+
+
+def adjoint_pair(method: Method, adjoint: Method, *, throw: bool = False) -> Composition:
+    """Half a step of a method, then half of its adjoint: its own adjoint, of even order; left and right give 2."""
+    return Composition([(method, 0.5), (adjoint, 0.5)], throw=throw)
+
+
+def _symmetric(method: Method, outer: dict[int, tuple[float, ...]], order: int, name: str, throw: bool) -> Composition:
+    """The fractions w_1, …, w_k, 1 − 2Σw, w_k, …, w_1."""
+    if order not in outer:
+        raise InputError(f"{name} has order {' or '.join(map(str, outer))}, got {order}")
+    half = outer[order]
+    middle = 1.0 - 2.0 * sum(half)
+    return Composition([(method, w) for w in (*half, middle, *reversed(half))], throw=throw)

@@ -1,0 +1,122 @@
+"""Why a step fails: which condition of erratum E4, at which sample, at which h."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.regularity import CONDITIONS, Regularity, regularity
+from herglotz.stepping.newton import Status, solve_step
+from herglotz.stepping.state import State
+
+ATTEMPTS, ESCAPE = 60, 4.0
+STEPPING = ("finite", "c", "M", "pole")  # what a step needs; H⁺ and H⁻ may be lost
+
+
+def explain_step(
+    L_d: DiscreteLagrangian, state: State, h: torch.Tensor | float, *, max_iterations: int = 30
+) -> list[str]:
+    """One line for every sample whose step fails or cannot be trusted, naming the condition; empty if all is well.
+
+    The step is solved again and the conditions c ≠ 0, det M ≠ 0 and no pole of L_d are looked at where Newton ended.
+    A step can converge and still be lost: at a conjugate point q1 is right and p1 is rounding. Where Newton fails, the
+    longest step that exists is looked for, which tells a motion that runs off to infinity before h from one that ends.
+
+    Parameters
+    ----------
+    L_d
+        The discrete Lagrangian.
+    state
+        (q, p, s) with shapes (..., n), (..., n), (...).
+    h
+        Time step, scalar or (...).
+    max_iterations
+        Of Newton.
+
+    Returns
+    -------
+    list of str
+        E.g. `sample (3,), h = 5: SINGULAR: c = 0: FL⁻ is not defined`.
+
+    Source: erratum E4 and the critical steps of section 4 of `mathematics.md`.
+    """
+    q, p, s = (x.detach() for x in state)
+    sizes = torch.as_tensor(h, dtype=q.dtype, device=q.device)
+    if not bool((sizes > 0).all()):
+        raise InputError(f"h must be > 0, got {float(sizes.min()):g}")
+    with torch.no_grad():
+        solution = solve_step(L_d, q, p, s, sizes, q, 64 * torch.finfo(q.dtype).eps, max_iterations)
+        at = regularity(L_d, q, solution.q1, s, sizes)
+        failed = solution.status != Status.CONVERGED
+        reach, escapes = longest_step(L_d, state, at.h, max_iterations) if bool(failed.any()) else (at.h, failed)
+    lost = {name: at.lost(name) for name in STEPPING}
+    lines = []
+    for index in torch.ones_like(solution.status, dtype=torch.bool).nonzero().tolist():
+        i = tuple(index)
+        reasons = [CONDITIONS[name] for name in STEPPING if bool(lost[name][i])]
+        status = Status(int(solution.status[i]))
+        if status != Status.CONVERGED and bool(escapes[i]):
+            reasons = [f"the motion escapes: q1 grows without bound as h → {float(reach[i])!r}"]
+        elif status != Status.CONVERGED and bool(reach[i] >= at.h[i]):
+            reasons = ["a solution exists, continued from smaller h, but Newton does not reach it from q0"]
+        elif bool(lost["pole"][i]):
+            status = Status.SINGULAR
+        if status != Status.CONVERGED and not reasons:
+            reasons = [_no_solution(at, i, float(solution.q1[i].abs().max()), float(solution.residual[i]))]
+        elif status != Status.CONVERGED:
+            reasons.append(f"Newton ended at |q1| = {float(solution.q1[i].abs().max()):.3g}")
+        if reasons:
+            where = f"sample {i}, " if i else ""
+            lines.append(f"{where}h = {float(at.h[i])!r}: {status.name}: {'; '.join(reasons)}")
+    return lines
+
+
+def longest_step(
+    L_d: DiscreteLagrangian,
+    state: State,
+    h: Tensor,  # (...)
+    max_iterations: int = 30,
+) -> tuple[Tensor, Tensor]:
+    """The longest step up to h that can be taken from here, and whether the motion escapes there.
+
+    Returns
+    -------
+    tuple of Tensor
+        h' ≤ h, (...), and (...) bool: whether h' < h and q1 goes ESCAPE times as far between h'/2 and h' as before,
+        and a fifth of that in the last thousandth of h'. Towards a logarithmic pole, q1 = −ln(1 − h/h*)/λ, both ratios
+        grow without bound; towards a fold, q1 = q* − a√(h* − h), they are 2.4 and 0.04.
+    """
+    reach, end = _continued(L_d, state, h, max_iterations)
+    half, late = (_continued(L_d, state, part * reach, max_iterations)[1] for part in (0.5, 0.999))
+    before, after, last = ((b - a).norm(dim=-1) for a, b in ((state.q, half), (half, end), (late, end)))
+    return reach, (reach < h) & (after > ESCAPE * before) & (last > 0.2 * after)
+
+
+def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
+    """The largest h' ≤ h to which q1(h') can be continued from q1(0) = q0, and that q1; strides in h, extrapolated."""
+    q, p, s = (x.detach() for x in state)
+    tol = 64 * torch.finfo(q.dtype).eps
+    at, stride = torch.zeros_like(h), h / 4
+    q1, slope = q.expand(*h.shape, q.shape[-1]), torch.zeros_like(q)
+    for _ in range(ATTEMPTS):
+        trial = torch.minimum(at + stride, h)
+        moved = (trial - at)[..., None]
+        solution = solve_step(L_d, q, p, s, trial, q1 + slope * moved, tol, max_iterations)
+        good = (solution.status == Status.CONVERGED) & (at < h)
+        slope = torch.where(good[..., None], (solution.q1 - q1) / moved, slope)
+        q1 = torch.where(good[..., None], solution.q1, q1)
+        at, stride = torch.where(good, trial, at), torch.where(good, 1.5 * stride, 0.5 * stride)
+        if bool(((at >= h) | (stride < 1e-9 * h)).all()):
+            break
+    return at, q1
+
+
+def _no_solution(at: Regularity, i: tuple[int, ...], size: float, residual: float) -> str:
+    margins = {"c": float(at.c[i]), "det M": float(at.M[i])}
+    name = min(margins, key=lambda key: margins[key] if margins[key] == margins[key] else 0.0)
+    return (
+        f"no q1 was found with FL⁻(q0, q1, s0) = p0: Newton ended at |q1| = {size:.3g}, |J⁻¹F| = {residual:.3g}, "
+        f"where the margin of {name} ≠ 0 is {margins[name]:.2g}"
+    )

@@ -1,0 +1,148 @@
+"""The step in closed form where the terms of a model allow it: damped leapfrog, no iteration.
+
+With a constant mass m, a potential V, one damping rate (c = e^{−γh}, or 1) and, at the forced level, viscous friction
+b and inputs w = G u, the step equation D1 + c p0 + F⁻ = 0 is linear in Δ = q1 − q0:
+
+    r  = p0 − h/2 (V′(q0) − w),       (m + √c h/2 b) Δ  =  h √c r,       q1 = q0 + Δ,
+    p1 = c r − (1 + c)/2 b Δ − h/2 (V′(q1) − w),
+    s1 = s0 + (c − 1) s0 + c/2 Δ·(r − b Δ/2) − h/2 (c V(q0) + V(q1)).
+
+V(q1) and V′(q1) start the next step, so a rollout evaluates the potential once per step; Δ is made without a
+difference of positions, so nothing cancels when h is small.
+"""
+
+from __future__ import annotations
+
+from math import isfinite
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.models import ContactLagrangian
+from herglotz.models.terms import Kinetic, LinearDamping
+from herglotz.stepping.field import Field, FieldOf
+from herglotz.stepping.newton import Status
+
+
+class Move(NamedTuple):
+    """What one explicit step gives."""
+
+    delta: Tensor  # (..., n) q1 − q0
+    q1: Tensor  # (..., n)
+    p1: Tensor  # (..., n)
+    dp: Tensor | None  # (..., n) p1 − p0, made without that difference, where it was asked for
+    L: Tensor  # (...) s1 − s0
+    c: Tensor  # (...)
+    there: Field  # the potential at q1
+
+
+class _Constants(NamedTuple):
+    """What depends on h and the parameters only."""
+
+    half: Tensor  # (..., 1) h/2
+    half_h: Tensor  # (...)
+    c: Tensor  # (...)
+    c_1: Tensor  # (..., 1)
+    half_c: Tensor  # (...) c/2
+    c_minus_1: Tensor  # (...)
+    inverse: Tensor  # (n, n) or (..., n, n) of (m + √c h/2 b) / (h √c)
+    regular: bool  # c ≠ 0 in every sample
+
+
+class Leapfrog:
+    """The explicit step of one model at its present parameters; differentiable by plain autograd."""
+
+    def __init__(self, model: ContactLagrangian):
+        assert isinstance(model.kinetic, Kinetic)  # `leapfrog` checked
+        self.model = model
+        self.field = FieldOf(model.potential)
+        self.mass = model.kinetic.mass()
+        self.friction = None if model.friction is None else model.friction.viscous
+        self._constants: _Constants | None = None
+        self._h: Tensor | None = None
+
+    def __call__(
+        self,
+        q0: Tensor,
+        p0: Tensor,
+        s0: Tensor,
+        h: Tensor,
+        here: Field | None = None,
+        u: Tensor | None = None,
+        increments: bool = False,
+    ) -> Move:
+        """One step; `here` is the field at q0, where the step before has left it; `increments` asks for p1 − p0."""
+        k = self.constants(h)
+        V0, slope0 = self.field(q0) if here is None else here
+        w = self._applied(u)
+        push0 = slope0 if w is None else slope0 - w
+        r = torch.addcmul(p0, k.half, push0, value=-1)
+        delta = r @ k.inverse if k.inverse.ndim == 2 else (k.inverse @ r[..., None])[..., 0]
+        q1 = q0 + delta
+        there = self.field(q1)
+        push1 = there.slope if w is None else there.slope - w
+        p1, work, drag = torch.addcmul(k.c_1 * r, k.half, push1, value=-1), r, None
+        if self.friction is not None:
+            drag = self.friction * delta / 2
+            p1, work = p1 - (1.0 + k.c_1) * drag, r - drag
+        L = torch.addcmul(k.c_minus_1 * s0, k.half_c, (delta * work).sum(-1))
+        L = torch.addcmul(L, k.half_h, torch.addcmul(there.V, k.c, V0), value=-1)
+        dp = None
+        if increments:
+            dp = k.c_minus_1[..., None] * r - k.half * (push0 + push1)
+            dp = dp if drag is None else dp - (1.0 + k.c_1) * drag
+        return Move(delta, q1, p1, dp, L, k.c.expand(s0.shape), there)
+
+    def constants(self, h: Tensor) -> _Constants:
+        """The constants of a step h, kept between steps that pass the same tensor."""
+        if self._h is h and self._constants is not None:
+            return self._constants
+        g = torch.zeros_like(h)
+        if self.model.damping is not None:
+            assert isinstance(self.model.damping, LinearDamping)
+            g = self.model.damping(h, h, h, 1)
+        c_minus_1, root = torch.expm1(g), (g / 2).exp()
+        matrix, stretch, c, half = self.mass, h * root, 1.0 + c_minus_1, h / 2
+        if self.friction is not None:
+            matrix = matrix + torch.diag_embed((stretch / 2)[..., None] * self.friction)
+        inverse = torch.linalg.inv_ex(matrix)[0] * stretch[..., None, None]
+        constants = _Constants(
+            half[..., None], half, c, c[..., None], c / 2, c_minus_1, inverse, bool((c != 0).all())
+        )  # fmt: skip
+        self._h, self._constants = h, constants
+        return constants
+
+    def _applied(self, u: Tensor | None) -> Tensor | None:
+        """G u, (..., n)."""
+        if u is None:
+            return None
+        assert self.model.friction is not None  # a model with inputs is a forced one
+        return self.model.friction._applied(u)
+
+
+def leapfrog(L_d: DiscreteLagrangian) -> Leapfrog | None:
+    """The explicit step of L_d, or None where its terms ask for an iteration."""
+    return Leapfrog(L_d) if type(L_d) is ContactLagrangian and has_leapfrog(L_d) else None
+
+
+def has_leapfrog(L_d: DiscreteLagrangian) -> bool:
+    """Whether `leapfrog` knows a step of L_d."""
+    if type(L_d) is not ContactLagrangian or not (L_d.linear_in_q1 and L_d.config.baseline):
+        return False
+    return type(L_d.kinetic) is Kinetic and type(L_d.damping) in (LinearDamping, type(None))
+
+
+def explicit_status(q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, regular: bool) -> Tensor | None:
+    """(...) SINGULAR where c = 0, DIVERGED where a value is not finite, else CONVERGED; None: all have converged."""
+    if s1.numel() == 1 and regular:
+        numbers = (*q1.flatten().tolist(), *p1.flatten().tolist(), s1.item())
+        if all(map(isfinite, numbers)):
+            return None
+    total = (torch.cat([q1, p1, s1[..., None]], -1) * 0).sum(-1)  # 0 where all are finite, else NaN
+    good = total == 0
+    if regular and bool(good.all()):
+        return None
+    status = torch.where(c == 0, int(Status.SINGULAR), int(Status.CONVERGED))
+    return torch.where(good, status, int(Status.DIVERGED)).to(torch.uint8)

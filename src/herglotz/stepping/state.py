@@ -1,0 +1,150 @@
+"""What steppers take and give: states, steps, rollouts and the checks of their inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.stepping.newton import Status
+
+
+class StepError(RuntimeError):
+    """A step failed and `throw=True`; the message names the sample, the step and the residual."""
+
+
+class State(NamedTuple):
+    """A point of T*Q × R."""
+
+    q: Tensor  # (..., n) position
+    p: Tensor  # (..., n) momentum
+    s: Tensor  # (...) action variable
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step and how it went."""
+
+    state: State
+    c: Tensor  # (...) conformal factor of the step
+    status: Tensor  # (...) Status values
+    residual: Tensor  # (...) |J⁻¹F|: what is left of the step equation, in units of q
+    iterations: int
+
+
+@dataclass(frozen=True)
+class Crossings:
+    """Where one event happened, over all samples of a rollout, in the order of the steps."""
+
+    sample: Tensor  # (M, batch dimensions) index of the sample
+    step: Tensor  # (M,) the step k in which it happened
+    t: Tensor  # (M,) time since the start
+    state: State  # (M, n), (M, n), (M,)
+
+
+@dataclass(frozen=True)
+class Rollout:
+    """A trajectory of K steps; entry 0 is the start. Everything after a failed step is NaN, with its status.
+
+    With `every=m` there is one entry for m steps, and status and residual are the worst of the m.
+    """
+
+    q: Tensor  # (..., K+1, n)
+    p: Tensor  # (..., K+1, n)
+    s: Tensor  # (..., K+1)
+    sigma: Tensor  # (..., K+1) accumulated conformal factor σ_k = ∏ c_j
+    status: Tensor  # (..., K)
+    residual: Tensor  # (..., K)
+    events: tuple[Crossings, ...] = ()  # one for each event asked for
+
+    @classmethod
+    def of(cls, states: list[State], steps: list[Step]) -> Rollout:
+        """Join K+1 states and the K steps between them."""
+        factors = torch.stack([torch.ones_like(states[0].s), *(step.c for step in steps)], -1)
+        return cls(
+            q=torch.stack([x.q for x in states], -2),
+            p=torch.stack([x.p for x in states], -2),
+            s=torch.stack([x.s for x in states], -1),
+            sigma=factors.cumprod(-1),
+            status=torch.stack([step.status for step in steps], -1),
+            residual=torch.stack([step.residual for step in steps], -1),
+        )
+
+    @property
+    def final(self) -> State:
+        """The last state; for a sample that an event stopped, the state at the event."""
+        return State(self.q[..., -1, :], self.p[..., -1, :], self.s[..., -1])
+
+    @property
+    def ok(self) -> Tensor:
+        """(...) whether no step failed: each converged or came after a terminal event."""
+        return ((self.status == Status.CONVERGED) | (self.status == Status.STOPPED)).all(-1)
+
+
+def check_state(state: State, L_d: DiscreteLagrangian | None = None) -> State:
+    """The same state.
+
+    Raises
+    ------
+    InputError
+        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any.
+    """
+    q, p, s = state
+    if q.dtype not in (torch.float32, torch.float64):  # linear solves know no others, and 8 bits no increments
+        raise InputError(f"q must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()")
+    if p.shape != q.shape or s.shape != q.shape[:-1]:
+        raise InputError(f"q, p, s need shapes (..., n), (..., n), (...); got {[tuple(x.shape) for x in state]}")
+    if p.dtype != q.dtype or s.dtype != q.dtype:
+        raise InputError(f"q, p and s need one dtype, got {q.dtype}, {p.dtype}, {s.dtype}")
+    parameter = next(L_d.parameters(), None) if isinstance(L_d, torch.nn.Module) else None
+    if parameter is not None and parameter.dtype != q.dtype:
+        raise InputError(f"the state is {q.dtype} and the model {parameter.dtype}; convert one with .to(dtype)")
+    return State(q, p, s)
+
+
+def check_h(h: Tensor | float, like: Tensor) -> Tensor:
+    """The time step as a tensor of the dtype and device of `like`.
+
+    Raises
+    ------
+    InputError
+        If it is not positive.
+    """
+    h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
+    if not bool((h > 0).all()):
+        raise InputError(f"h must be > 0, got {float(h.min()):g}")
+    return h
+
+
+def step_sizes(h: Tensor, steps: int | None) -> Tensor:
+    """All K steps, (K,) or (..., K), from a scalar and a count or from a list.
+
+    Raises
+    ------
+    InputError
+        If a scalar comes without a count, or a list with another one.
+    """
+    if h.ndim == 0:
+        if steps is None or steps < 1:
+            raise InputError(f"a scalar h needs steps >= 1, got steps={steps}")
+        return h.expand(steps)
+    if steps is not None and steps != h.shape[-1]:
+        raise InputError(f"h lists {h.shape[-1]} steps but steps={steps}; give one of the two")
+    return h
+
+
+def throw_failure(status: Tensor, residual: Tensor) -> None:
+    """Raise `StepError` for the first sample that failed, if one did."""
+    if bool(((status != Status.CONVERGED) & (status != Status.STOPPED)).any()):
+        raise StepError(failure_message(status, residual))
+
+
+def failure_message(status: Tensor, residual: Tensor) -> str:
+    """Which sample failed first, how, and what to do."""
+    index = tuple(int(i) for i in ((status != Status.CONVERGED) & (status != Status.STOPPED)).nonzero()[0])
+    name = Status(int(status[index])).name
+    return f"step failed at sample {index}: {name}, residual {float(residual[index]):.3g}; try a smaller h"

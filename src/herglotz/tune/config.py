@@ -1,0 +1,109 @@
+"""What a search is asked to do: plain values, stored beside its result."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from herglotz.errors import InputError
+from herglotz.tune.reference import FINEST, REFERENCES
+
+ARTEFACTS = ("eager", "c")
+
+
+@dataclass(frozen=True)
+class TuneConfig:
+    """Settings of `tune`.
+
+    Parameters
+    ----------
+    multiples
+        Steps to try, in steps of the run: whole numbers, and multiples of 1/4 where the reference is the limit.
+    widths
+        Hidden units of the distilled corrections; none: nothing is re-trained.
+    artefacts
+        "eager" (PyTorch), "c" (compiled C, in float64 and float32).
+    tolerances
+        Newton tolerances of the eager stepper, relative to the size of the positions; None: its own.
+    reference
+        "own": the run's model at its own step; "limit": the same as h → 0.
+    starts
+        Motions that choose; as many others judge the choice.
+    quantile, confidence
+        The bound e of a setting: with this confidence this share of all starts stay within e.
+    seed
+        Of the starts: training, choosing and judging ones are drawn separately.
+    iterations, pairs
+        Of a distillation: iterations at most, and pairs of states.
+    rounds
+        Timings of each setting, in turn.
+    """
+
+    multiples: tuple[float, ...] = (1, 2, 4, 8)
+    widths: tuple[int, ...] = (8, 16)
+    artefacts: tuple[str, ...] = ARTEFACTS
+    tolerances: tuple[float | None, ...] = (None, 1e-7)
+    reference: str = "own"
+    starts: int = 128
+    quantile: float = 0.95
+    confidence: float = 0.95
+    seed: int = 0
+    iterations: int = 80
+    pairs: int = 1000
+    rounds: int = 7
+
+    def __post_init__(self):
+        if self.reference not in REFERENCES:
+            raise InputError(f"unknown reference '{self.reference}'; choose one of {', '.join(REFERENCES)}")
+        wrong = [x for x in self.artefacts if x not in ARTEFACTS]
+        if wrong or not self.artefacts:
+            raise InputError(f"artefacts must be some of {', '.join(ARTEFACTS)}, got {self.artefacts}")
+        part = 1 if self.reference == "own" else FINEST
+        for m in self.multiples:
+            if not (m > 0 and float(m * part).is_integer()):
+                whole = "whole numbers >= 1" if part == 1 else f"multiples of 1/{part}"
+                raise InputError(f"multiples must be {whole} with the reference '{self.reference}', got {m:g}")
+        if not self.multiples:
+            raise InputError("multiples is empty; give at least one, such as 1")
+        if any(w < 1 for w in self.widths):
+            raise InputError(f"widths must be >= 1, got {self.widths}; leave them all out for no distillation")
+        for name in ("quantile", "confidence"):
+            if not 0 < getattr(self, name) < 1:
+                raise InputError(f"{name} must be in (0, 1), got {getattr(self, name):g}")
+        for name in ("iterations", "pairs", "rounds"):
+            if getattr(self, name) < 1:
+                raise InputError(f"{name} must be >= 1, got {getattr(self, name)}")
+        allowed_failures(self.starts, self.quantile, self.confidence)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        return asdict(self)
+
+
+def allowed_failures(count: int, quantile: float, confidence: float) -> int:
+    """How many of `count` starts may exceed a bound that `quantile` of all starts keep, with this confidence.
+
+    The largest k with P(at most k of `count` exceed | each does with probability 1 − quantile) ≤ 1 − confidence: a
+    tolerance limit, true whatever the distribution of the errors.
+
+    Raises
+    ------
+    InputError
+        If so few starts cannot support the claim.
+
+    Source: S. S. Wilks, Ann. Math. Stat. 12 (1941) 91.
+    """
+    p, total, k = 1 - quantile, 0.0, 0
+    while k <= count:
+        total += math.comb(count, k) * p**k * quantile ** (count - k)
+        if total > 1 - confidence:
+            break
+        k += 1
+    if k == 0:
+        least = math.ceil(math.log(1 - confidence) / math.log(quantile))
+        raise InputError(
+            f"{count} starts cannot show that {quantile:g} of all keep a bound, with confidence {confidence:g}; "
+            f"take {least} or more"
+        )
+    return k - 1

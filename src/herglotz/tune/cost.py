@@ -1,0 +1,107 @@
+"""What a step costs: wall time of one motion at a time, all settings in turn, so that a slow minute hits them alike.
+
+Only steps inside the horizon are timed: a damped motion comes to rest, and a step at rest costs next to nothing.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Any
+
+import torch
+
+from herglotz.export import CompiledStepper
+from herglotz.stepping import State
+
+EAGER_STEPS, EAGER_STARTS = 48, 2  # each enough to make the call around them small
+C_STARTS, C_STEPS = 16, 4096  # motions, and steps of them all in one timing, at least
+
+
+@dataclass(frozen=True)
+class Cost:
+    """Microseconds a step: the best round, and how far the median round lies above it."""
+
+    step_us: float
+    spread_us: float
+
+
+@dataclass(frozen=True)
+class Timed:
+    """Something to time: `steps` steps, and the same calls without a step, where those cost anything."""
+
+    run: Callable[[], None]
+    steps: int
+    idle: Callable[[], None] | None = None
+
+
+def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
+    """Time each, `rounds` times, in turn; one untimed round first. What the idle calls take at best is left out."""
+    times = torch.zeros(2, len(timed), rounds, dtype=torch.float64)
+    for k in range(-1, rounds):
+        for i, one in enumerate(timed):
+            times[0, i, max(k, 0)] = _seconds(one.run)
+            times[1, i, max(k, 0)] = 0.0 if one.idle is None else _seconds(one.idle)
+    steps = torch.tensor([one.steps for one in timed], dtype=torch.float64)
+    best, middle = times[0].amin(1), times[0].median(1).values
+    idle = torch.minimum(times[1].amin(1), best / 2)  # on a busy machine an idle call may seem the longer one
+    costs = 1e6 * torch.stack([best - idle, middle - best]) / steps
+    return [Cost(float(a), float(b)) for a, b in costs.T]
+
+
+def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
+    """Rollouts of `steps` steps, one start after the other, without what surrounds them where that is possible."""
+    if isinstance(stepper, CompiledStepper):
+        count = min(C_STARTS, len(starts.s))
+        repeats = max(1, C_STEPS // (count * steps))
+        run, idle = (_native(stepper, starts, count, h, k, repeats) for k in (steps, 0))
+        return Timed(run, count * steps * repeats, idle)
+    steps, count = min(steps, EAGER_STEPS), min(EAGER_STARTS, len(starts.s))
+    single = [State(*(x[i : i + 1] for x in starts)) for i in range(count)]
+
+    def run() -> None:
+        with torch.no_grad():
+            for start in single:
+                stepper.rollout(*start, h=h, steps=steps)
+
+    return Timed(run, count * steps)
+
+
+def _native(
+    stepper: CompiledStepper, starts: State, count: int, h: float, steps: int, repeats: int
+) -> Callable[[], None]:
+    """Calls of the loop in C with arguments made beforehand: the checks in Python would take longer than the steps."""
+    n, dtype = stepper.dof, stepper.dtype
+    h_all = torch.full((max(steps, 1),), h, dtype=dtype)
+    outputs = [torch.empty(size, dtype=dtype) for size in ((steps + 1, n), (steps + 1, n), steps + 1, steps + 1)]
+    outputs += [torch.empty(steps + 1, dtype=torch.uint8), torch.empty(steps + 1, dtype=dtype)]
+    keep = [h_all, *outputs]
+    calls = []
+    for i in range(count):
+        start = [x[i : i + 1].to(dtype).contiguous() for x in starts]
+        keep += start
+        numbers = (1, steps, *start, h_all, 0, 1, None, 0, *outputs)
+        calls.append([_argument(x) for x in numbers])
+    function = stepper._library.herglotz_rollouts
+
+    def run() -> None:
+        for _ in range(repeats):
+            for arguments in calls:
+                function(*arguments)
+
+    run.keep = keep  # type: ignore[attr-defined]  # the buffers live as long as the function
+    return run
+
+
+def _argument(x: Any) -> Any:
+    if isinstance(x, int):
+        return ctypes.c_long(x)
+    return ctypes.c_void_p(None if x is None else x.data_ptr())
+
+
+def _seconds(run: Callable[[], None]) -> float:
+    started = perf_counter()
+    run()
+    return perf_counter() - started

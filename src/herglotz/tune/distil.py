@@ -1,0 +1,122 @@
+"""Re-train a model's big-step correction at another step, on motions of the accurate model.
+
+A motion known at every small step is an exact flow map at every multiple H of it. One discrete Lagrangian generates
+that map, in the same coordinates (q, p, s), so each pair of states (q0, p0, s0) → (q1, p1, s1) gives three residuals,
+
+    J⁻¹(D1 L_d + c p0),    J⁻¹(D2 L_d − p1),    (s0 + L_d − s1)/P,
+
+lengths all, with J = ∂(D1 L_d + c p0)/∂q1 and P a typical momentum. Nothing is latent and nothing is noisy, so
+Levenberg–Marquardt converges; and states of the run stay states of the distilled model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State, solve
+from herglotz.training import Prior, levenberg_marquardt
+from herglotz.training.flat import FlatModel
+
+EXACT = 1e-8  # σ of the residuals relative to the motion's size
+Callback = Callable[[int, float, Tensor], None]
+
+
+class FlowProblem:
+    """½ Σ |r|²/σ² + prior over the parameters, for pairs of states a time H apart.
+
+    Parameters
+    ----------
+    model
+        Its current parameters are not changed.
+    before, after
+        (T, n), (T, n), (T,) each.
+    h
+        The time H between them.
+    """
+
+    def __init__(self, model: ContactLagrangian, before: State, after: State, h: float, chunk: int = 1024):
+        self.flat, self.before, self.after, self.chunk = FlatModel(model), before, after, chunk
+        self.h = before.s.new_tensor(h)
+        self.momentum = float(before.p.square().mean().sqrt().clamp(min=1e-12))
+        self.sigma = EXACT * float(max(model.config.scale))
+        low, high = before.q.amin(0), before.q.amax(0)
+        self.prior = Prior(model, low, high, departure=None)
+
+    def start(self) -> Tensor:
+        """The parameters (P,)."""
+        return self.flat.get()
+
+    def residuals(self, theta: Tensor) -> Tensor:
+        """(T, 2n + 1), in units of q."""
+        with torch.no_grad():
+            return self._local(theta, *self.before, *self.after)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½ Σ |r|²/σ² + prior."""
+        return self.residuals(x).square().sum() / (2 * self.sigma**2) + self.prior.cost(x)
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
+        cost, A, b = self.prior.normal_equations(x)
+        slopes = vmap(jacrev(self._local), (None, *(0,) * 6))
+        for part in torch.arange(len(self.before.s)).split(self.chunk):
+            pair = [y[part] for y in (*self.before, *self.after)]
+            r = self._local(x, *pair).reshape(-1) / self.sigma
+            J = slopes(x, *pair).reshape(-1, len(x)) / self.sigma
+            cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
+        return cost, A, b
+
+    def _local(self, theta: Tensor, q0: Tensor, p0: Tensor, s0: Tensor, q1: Tensor, p1: Tensor, s1: Tensor) -> Tensor:
+        P = self.flat.partials(theta, q0, q1, s0, self.h, 2)
+        J = momentum_jacobian(P, p0)
+        action = (s0 + P.L - s1) / self.momentum
+        position, momentum = solve(J, momentum_residual(P, p0)), solve(J, momentum_plus(P) - p1)
+        return torch.cat([position, momentum, action[..., None]], -1)
+
+
+def widened(model: ContactLagrangian, width: int, depth: int = 2) -> ContactLagrangian:
+    """The same model with a correction of this size: its own where it has that size already, else a new one, zero."""
+    config = replace(model.config, correction_width=width, correction_depth=depth)
+    new = ContactLagrangian(config)
+    same = config == model.config
+    known = {k: v for k, v in model.state_dict().items() if same or not k.startswith("correction")}
+    new.load_state_dict(known, strict=False)
+    return new.to(next(model.parameters()).dtype)
+
+
+def pairs_of(states: State, stride: int, count: int, seed: int) -> tuple[State, State]:
+    """At most `count` random pairs (state, state `stride` later) of motions (B, K+1, …)."""
+    size = states.s.shape[1] - stride
+    flat = [(x[:, :size].flatten(0, 1), x[:, stride:].flatten(0, 1)) for x in states]
+    rows = torch.randperm(len(flat[2][0]), generator=torch.Generator().manual_seed(seed))[:count]
+    return State(*(a[rows] for a, _ in flat)), State(*(b[rows] for _, b in flat))
+
+
+def distil(
+    model: ContactLagrangian,
+    before: State,
+    after: State,
+    h: float,
+    *,
+    iterations: int = 80,
+    callback: Callback | None = None,
+) -> tuple[ContactLagrangian, float]:
+    """Fit every parameter of a model to a flow map over h; the model given is only the start.
+
+    Returns
+    -------
+    tuple
+        The distilled model, and the RMS of its one-step residuals, in units of q.
+    """
+    problem = FlowProblem(model, before, after, h)
+    result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3, callback=callback)
+    new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)
+    FlatModel(new).set(result.x)
+    return new, float(problem.residuals(result.x).square().mean().sqrt())

@@ -1,0 +1,181 @@
+"""What `tune` found: every setting with its error and cost, the front, and the choice as a run."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
+from herglotz.training import Run
+from herglotz.tune.config import TuneConfig
+from herglotz.tune.cost import Cost
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One way to step: which model, at which step, in which form."""
+
+    multiple: float  # of the run's step
+    h: float
+    width: int | None  # of the distilled correction; None: the run's own model
+    artefact: str
+    dtype: str
+    tol: float | None  # of the eager Newton iteration
+
+    @property
+    def name(self) -> str:
+        """For tables."""
+        net = "own model" if self.width is None else f"distilled {self.width}"
+        tol = "" if self.tol is None else f", tol {self.tol:g}"
+        return f"h {self.h:.4g}, {net}, {'C' if self.artefact == 'c' else self.artefact} {self.dtype}{tol}"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A setting, measured."""
+
+    setting: Setting
+    median: float  # error of the median start: largest |q − reference| over the horizon, in units of q
+    bound: float  # what the asked share of all starts keeps
+    worst: float
+    cost: Cost
+    model: ContactLagrangian = field(repr=False)
+
+    @property
+    def us(self) -> float:
+        """Microseconds for one unit of simulated time."""
+        return self.cost.step_us / self.setting.h
+
+    @property
+    def spread(self) -> float:
+        """Of `us`: the median round above the best."""
+        return self.cost.spread_us / self.setting.h
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain dictionary for JSON."""
+        s, e = self.setting, [self.median, self.bound, self.worst]
+        median, bound, worst = (x if math.isfinite(x) else None for x in e)  # JSON has no infinity: a step failed
+        return {
+            "h": s.h, "multiple": s.multiple, "width": s.width, "artefact": s.artefact, "dtype": s.dtype, "tol": s.tol,
+            "error_median": median, "error_bound": bound, "error_worst": worst,
+            "step_us": self.cost.step_us, "us_per_time": self.us, "us_per_time_spread": self.spread,
+            "parameters": sum(p.numel() for p in self.model.parameters()),
+        }  # fmt: skip
+
+
+def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """Those that no other beats in both error bound and cost, cheapest first."""
+    front: list[Candidate] = []
+    for c in sorted(candidates, key=lambda c: (c.us, c.bound)):
+        if c.bound < float("inf") and (not front or c.bound < front[-1].bound):
+            front.append(c)
+    return front
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """All settings tried, the one chosen, and how it did on starts that had no part in the choice."""
+
+    run: Run
+    config: TuneConfig
+    horizon: float
+    asked: dict[str, float]  # max_error or budget_us
+    candidates: list[Candidate]
+    chosen: Candidate
+    held_out: dict[str, Any]
+    reference_error: float  # of the reference itself
+    motions: State  # the reference's training motions at the chosen step, (B, K+1, …)
+    notes: list[str]  # what could not be tried, and why
+
+    @property
+    def front(self) -> list[Candidate]:
+        """The Pareto front, cheapest first."""
+        return pareto(self.candidates)
+
+    @property
+    def own(self) -> Candidate:
+        """The run as it is: its own model at its own step, eager."""
+        return self.candidates[0]
+
+    @property
+    def own_in_c(self) -> Candidate | None:
+        """The run's own model at its own step in C, the faster of the two precisions; None without C."""
+        found = [c for c in self.candidates if c.setting.artefact == "c" and c.model is self.own.model]
+        found = [c for c in found if c.setting.multiple == 1]
+        return min(found, key=lambda c: c.us, default=None)
+
+    @property
+    def model_error(self) -> dict[str, float | None]:
+        """Errors of the run against its data, RMS in units of q: what the errors of stepping come on top of."""
+        names = ("extrapolation_rms", "train_rms", "one_step_rms")
+        return {name: self.run.metrics.get(name) for name in names}
+
+    def tuned_run(self) -> Run:
+        """The chosen model as a run with its own step, on motions of the reference: `save_run` it, then export it.
+
+        States (q, p, s) of the old run are states of this one.
+        """
+        s = self.chosen.setting
+        dtype = getattr(torch, s.dtype)
+        states = State(*(x.flatten(0, 1).to(dtype) for x in self.motions))
+        count, length = self.motions.s.shape
+        old = self.run.data
+        data = Trajectories(
+            (s.h * torch.arange(length, dtype=dtype)).repeat(count),
+            states.q,
+            (length,) * count,
+            names=old.names, units=old.units, angles=old.angles, time_unit=old.time_unit,
+            source=f"motions of the run on {old.source or 'data'} at h={s.h:g}",
+        )  # fmt: skip
+        metrics = {**self.run.metrics, "tuned": self.summary()}
+        config = replace(self.run.config, dtype=s.dtype)
+        return replace(
+            self.run, model=self.chosen.model.to(dtype), config=config, metrics=metrics, data=data,
+            train_lengths=data.lengths, states=states, h=s.h,
+        )  # fmt: skip
+
+    def summary(self) -> dict[str, Any]:
+        """The choice and its measurements, for JSON."""
+        return {
+            "asked": self.asked, "chosen": self.chosen.to_dict(), "held_out": self.held_out,
+            "reference": self.config.reference, "horizon": self.horizon, "model_error": self.model_error,
+        }  # fmt: skip
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything, for JSON."""
+        front = self.front
+        return {
+            **self.summary(),
+            "reference_error": self.reference_error,
+            "time_unit": self.run.data.time_unit,
+            "own": self.own.to_dict(),
+            "candidates": [{**c.to_dict(), "front": c in front} for c in self.candidates],
+            "config": self.config.to_dict(),
+            "notes": self.notes,
+        }
+
+    def table(self) -> str:
+        """The front, the run as it is and the choice (*), for people."""
+        per, share = time_label(self.run), f"{100 * self.config.quantile:g} %"
+        shown = self.front
+        shown += [c for c in (self.own, self.chosen) if c not in shown]
+        width = max(len(c.setting.name) for c in shown)
+        lines = [f"  {'setting':<{width}}  {'median':>8}  {share:>8}  {'worst':>8}  {per:>8}  {'±':>7}  {'µs/step':>8}"]
+        for c in sorted(shown, key=lambda c: c.us):
+            mark = "*" if c is self.chosen else " "
+            lines.append(
+                f"{mark} {c.setting.name:<{width}}  {c.median:>8.2g}  {c.bound:>8.2g}  {c.worst:>8.2g}  "
+                f"{c.us:>8.3g}  {c.spread:>7.2g}  {c.cost.step_us:>8.3g}"
+            )
+        return "\n".join(lines)
+
+
+def time_label(run: Run) -> str:
+    """µs per unit of simulated time, in words."""
+    return "µs/time" if run.data.time_unit == "1" else f"µs/{run.data.time_unit}"

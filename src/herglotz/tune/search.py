@@ -1,0 +1,247 @@
+"""`tune`: an error or a budget in, the setting that meets it out, with the front it was chosen from."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from herglotz.errors import InputError
+from herglotz.export import compile_c
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+from herglotz.training import Run
+from herglotz.tune.config import TuneConfig, allowed_failures
+from herglotz.tune.cost import Cost, measure_costs, timed_stepping
+from herglotz.tune.distil import distil, pairs_of, widened
+from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
+from herglotz.tune.result import Candidate, Setting, Tuning
+
+HOPELESS = 10.0  # a distilled model this many times over the limit: no larger step is tried at its width
+LONGEST = 200  # steps of the run in a horizon that nobody gave
+
+
+@dataclass(frozen=True)
+class _Tried:
+    setting: Setting
+    model: ContactLagrangian
+    stepper: Any
+    errors: Tensor  # (B,) of the choosing starts
+
+
+def tune(
+    run: Run,
+    *,
+    max_error: float | None = None,
+    budget_us: float | None = None,
+    horizon: float | None = None,
+    config: TuneConfig | None = None,
+    progress: bool | None = None,
+) -> Tuning:
+    """Search step, correction, precision and form of a run's stepper.
+
+    The error of a setting is that of its *stepping*: the largest |q − q_ref| over the horizon, for each start. The
+    reference is the run's own model (`TuneConfig.reference`); its error against the data, which comes on top, is in
+    `Tuning.model_error`. Costs are wall time, one motion at a time.
+
+    Parameters
+    ----------
+    run
+        Not changed.
+    max_error
+        Take the cheapest setting whose bound is no larger, in units of q.
+    budget_us
+        Take the most accurate setting that costs no more microseconds per unit of simulated time.
+    horizon
+        Length of the motions, in the data's unit of time; default: a typical trajectory, at most 200 steps.
+    progress
+        Show a progress bar; None: on a terminal only.
+
+    Raises
+    ------
+    InputError
+        If not exactly one of the two demands is made, no setting meets it, or the run cannot be tuned.
+    """
+    config = config or TuneConfig()
+    asked = _demand(max_error, budget_us)
+    if run.model.inputs:
+        raise InputError("tune cannot steer a model with inputs: the reference motions would need them")
+    horizon = _horizon(run, config, horizon)
+    # Three sets of starts that have nothing in common: to train on, to choose by, to judge with.
+    training, choosing, judging = (
+        record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon, config.reference) for k in range(3)
+    )
+    tried: list[_Tried] = []
+    notes: list[str] = []
+    total = len(config.multiples) * (1 + len(config.widths))
+    with tqdm(total=total, desc="settings", disable=None if progress is None else not progress, leave=False) as bar:
+        for key, model in _models(run, config, training, choosing, max_error, notes, bar):
+            tried += _forms(key, model, key[0] * run.h, config, choosing, notes)
+            bar.update(1)
+    costs = _costs(tried, choosing, config.rounds)
+    candidates = [_candidate(t, cost, config) for t, cost in zip(tried, costs, strict=True)]
+    chosen = choose(candidates, asked)
+    errors = _errors(tried[candidates.index(chosen)].stepper, chosen.setting.h, judging)
+    held_out = _held_out(errors, chosen.bound if max_error is None else max_error, config)
+    stride = round(chosen.setting.h / training.base)
+    reference_error = max(training.error, choosing.error)
+    return Tuning(
+        run, config, horizon, asked, candidates, chosen, held_out, reference_error, training.every(stride),
+        list(dict.fromkeys(notes)),
+    )  # fmt: skip
+
+
+def _demand(max_error: float | None, budget_us: float | None) -> dict[str, float]:
+    asked = {k: v for k, v in (("max_error", max_error), ("budget_us", budget_us)) if v is not None}
+    if len(asked) != 1:
+        raise InputError("say what you need: either --max-error or --budget-us")
+    ((name, value),) = asked.items()
+    if not (value > 0 and math.isfinite(value)):
+        raise InputError(f"{name} must be a finite number > 0, got {value:g}")
+    return asked
+
+
+def _horizon(run: Run, config: TuneConfig, horizon: float | None) -> float:
+    """The horizon asked for, or that of a typical trajectory; room for two of the largest steps."""
+    if horizon is None:
+        length = float(torch.tensor(run.data.lengths).double().median()) - 1
+        horizon = run.h * max(min(length, LONGEST), 2 * max(config.multiples))
+    if not (math.isfinite(horizon) and horizon >= 2 * max(config.multiples) * run.h * (1 - 1e-9)):
+        needed = 2 * max(config.multiples) * run.h
+        raise InputError(f"a horizon of {horizon:g} is shorter than two of the largest steps, {needed:g}; take longer")
+    return horizon
+
+
+def _models(
+    run: Run,
+    config: TuneConfig,
+    training: Motions,
+    choosing: Motions,
+    max_error: float | None,
+    notes: list[str],
+    bar: tqdm,
+) -> Iterator[tuple[tuple[float, int | None], ContactLagrangian]]:
+    """((multiple, width), model) of everything to try: the run's own at every step, then the distilled ones."""
+    own = frozen_double(run)
+    yield (1, None), own  # the run as it is comes first
+    multiples = sorted(config.multiples)
+    for m in multiples:
+        if m != 1:
+            yield (m, None), own
+    for width in config.widths:
+        for m in multiples:
+            if m < 1 or (m == 1 and config.reference == "own" and width >= run.model.config.correction_width):
+                continue  # nothing to gain: the run's own model is exact there, and no larger
+            h = m * run.h
+            bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
+            before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
+            start = widened(own, width, max(run.model.config.correction_depth, 1))
+            model, _ = distil(start, before, after, h, iterations=config.iterations)
+            model.requires_grad_(False)
+            yield (m, width), model
+            bound = bound_of(_errors(Stepper(model), h, choosing), config)
+            if not math.isfinite(bound) or (max_error is not None and bound > HOPELESS * max_error):
+                notes.append(f"width {width}: no step beyond h = {h:.4g}, where the bound is {bound:.2g}")
+                break
+
+
+def _forms(
+    key: tuple[float, int | None],
+    model: ContactLagrangian,
+    h: float,
+    config: TuneConfig,
+    choosing: Motions,
+    notes: list[str],
+) -> Iterator[_Tried]:
+    """A model in every form asked for, with its errors; the first is always the eager one in float64."""
+
+    def tried(stepper: Any, artefact: str, dtype: str, tol: float | None = None) -> _Tried:
+        setting = Setting(key[0], h, key[1], artefact, dtype, tol)
+        return _Tried(setting, model, stepper, _errors(stepper, h, choosing))
+
+    own = key == (1, None)
+    if own or "eager" in config.artefacts:
+        solved = model.linear_in_q1  # nothing iterates
+        for tol in dict.fromkeys((None, *(() if solved else config.tolerances))):
+            yield tried(Stepper(model, tol=tol), "eager", "float64", tol)
+    if "c" in config.artefacts:
+        try:
+            for dtype in ("float64", "float32"):
+                yield tried(compile_c(model, h=h, dtype=dtype), "c", dtype)
+        except InputError as error:
+            notes.append(f"no C: {error}")
+
+
+def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
+    """Largest |q − reference| of each motion, (B,), in float64; infinite where a step fails."""
+    reference = motions.every(round(h / motions.base))
+    dtype = getattr(stepper, "dtype", torch.float64)
+    with torch.no_grad():
+        start = (x.to(dtype).contiguous() for x in motions.starts())
+        out = stepper.rollout(*start, h=h, steps=reference.s.shape[1] - 1)
+    error = (out.q.double() - reference.q).abs().flatten(1)
+    return error.nan_to_num(nan=math.inf, posinf=math.inf).amax(1)
+
+
+def bound_of(errors: Tensor, config: TuneConfig) -> float:
+    """The error that `quantile` of all starts keep, with `confidence`: an order statistic of these."""
+    allowed = allowed_failures(len(errors), config.quantile, config.confidence)
+    return float(errors.sort(descending=True).values[allowed])
+
+
+def _costs(tried: list[_Tried], choosing: Motions, rounds: int) -> list[Cost]:
+    timed = []
+    for t in tried:
+        stride = round(t.setting.h / choosing.base)
+        steps = (choosing.states.s.shape[1] - 1) // stride
+        timed.append(timed_stepping(t.stepper, choosing.starts(), t.setting.h, steps))
+    return measure_costs(timed, rounds)
+
+
+def _candidate(t: _Tried, cost: Cost, config: TuneConfig) -> Candidate:
+    e = t.errors
+    return Candidate(t.setting, float(e.median()), bound_of(e, config), float(e.max()), cost, t.model)
+
+
+def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:
+    """The cheapest candidate within max_error, or the most accurate one within budget_us.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message says what can be had.
+    """
+    if "max_error" in asked:
+        good = [c for c in candidates if c.bound <= asked["max_error"]]
+        if good:
+            return min(good, key=lambda c: (c.us, c.bound))
+        best = min(candidates, key=lambda c: c.bound)
+        raise InputError(
+            f"no setting keeps --max-error {asked['max_error']:g}: the smallest bound found is {best.bound:.3g} "
+            f"({best.setting.name}); ask for that, or try smaller --multiples or a shorter --horizon"
+        )
+    good = [c for c in candidates if c.us <= asked["budget_us"] and c.bound < math.inf]
+    if good:
+        return min(good, key=lambda c: (c.bound, c.us))
+    fast = min(candidates, key=lambda c: c.us)
+    raise InputError(
+        f"no setting costs {asked['budget_us']:g} µs per unit of time or less: the cheapest found takes {fast.us:.3g} "
+        f"({fast.setting.name}); ask for that, or try larger --multiples or smaller --widths"
+    )
+
+
+def _held_out(errors: Tensor, limit: float, config: TuneConfig) -> dict[str, Any]:
+    """How the choice does on starts that had no part in it: `limit` is what it promised."""
+    return {
+        "starts": len(errors),
+        "limit": limit,
+        "share_within": float((errors <= limit).double().mean()),
+        "median": float(errors.median()),
+        "quantile": float(errors.quantile(config.quantile, interpolation="higher")),
+        "worst": float(errors.max()),
+    }  # infinite where a step failed

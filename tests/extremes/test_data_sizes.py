@@ -1,0 +1,102 @@
+"""From one triple to a million samples, and the files that nobody wants."""
+
+import time
+
+import pytest
+import torch
+
+import herglotz
+from herglotz import FitConfig, Trajectories
+from herglotz.errors import InputError
+from herglotz.training.baseline import estimate_baseline
+from herglotz.verify import verify
+
+RATE, STIFFNESS = 0.2, 1.01  # of q = e^{−t/10} cos t
+
+
+def motion(t):
+    t = torch.as_tensor(t, dtype=torch.float64)
+    return t, torch.exp(-0.1 * t) * torch.cos(t)
+
+
+def seeded(count, seed=0):
+    return torch.rand(count, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def test_two_samples_are_refused():
+    # fails if a trajectory without a single discrete Herglotz equation is accepted
+    with pytest.raises(InputError, match="has 2 samples, at least 3 are needed"):
+        Trajectories.of(*motion([0.0, 0.1]))
+
+
+def test_one_triple_is_data_but_cannot_be_split():
+    # fails if one equation crashes the baseline, or is fitted with nothing left to judge by
+    data = Trajectories.of(*motion([0.0, 0.1, 0.2]))
+    assert len(data.triples()) == 1
+    base = estimate_baseline(data)
+    assert torch.isfinite(torch.tensor([base.rate, *base.stiffness, *base.tilt, *base.speed])).all()
+    with pytest.raises(InputError, match=r"cuts trajectory 0 into 2 and 1 samples, each part needs 3; change the frac"):
+        herglotz.fit(data)
+
+
+def test_one_triple_can_be_fitted_whole():
+    # fails if a fit with fewer equations than parameters is not finite, or hangs
+    data = Trajectories.of(*motion([0.0, 0.1, 0.2]))
+    run = herglotz.fit(data, FitConfig(train_fraction=1.0, iterations=5))
+    q, p, s = run.states_at_end()
+    assert bool(torch.isfinite(torch.cat([q.flatten(), p.flatten(), s.flatten()])).all())
+
+
+def test_one_trajectory_is_enough():
+    # fails if a single short trajectory cannot be fitted
+    run = herglotz.fit(Trajectories.of(*motion(torch.arange(60) * 0.1)), FitConfig(iterations=5))
+    assert run.metrics["extrapolation_status"] == "ok"
+    assert run.metrics["extrapolation_rms"] < 1e-5
+
+
+@pytest.mark.parametrize("value", [0.0, 0.3])
+def test_a_constant_trajectory_is_refused(value):
+    # fails if a motion that determines nothing is fitted: every L_d with M ≠ 0 that rests there would do
+    data = Trajectories.of(torch.arange(50) * 0.1, torch.full((50,), value))
+    with pytest.raises(InputError, match="coordinate 'q' never moves; leave it out"):
+        herglotz.fit(data)
+
+
+def test_steps_that_vary_by_ten_thousand():
+    # fails if short steps, whose second difference is rounding over h², drown the long ones
+    data = Trajectories.of(*motion(torch.cumsum(10 ** (-4 * seeded(300)), 0)))
+    h = data.steps().h
+    assert float(h.max() / h.min()) > 5e3
+    base = estimate_baseline(data)
+    assert base.rate == pytest.approx(RATE, rel=0.01)
+    assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=0.01)
+
+
+def test_half_of_the_samples_missing():
+    # fails if gaps are stepped over as if they were typical steps, or leave nothing to fit
+    kept = seeded(400) < 0.5
+    run = herglotz.fit(Trajectories.of(*motion((torch.arange(400) * 0.1)[kept])), FitConfig(iterations=5))
+    assert run.metrics["extrapolation_status"] == "ok"
+    assert run.metrics["extrapolation_rms"] < 2e-3
+
+
+def test_outliers_are_reported_and_not_removed():
+    # fails if samples that are off by fifty amplitudes give NaN, or a run that passes for a good one
+    t, q = motion(torch.arange(300) * 0.1)
+    q[::37] += 50
+    run = herglotz.fit(Trajectories.of(t, q), FitConfig(iterations=5))
+    assert run.metrics["one_step_rms"] < float("inf")
+    assert run.metrics["one_step_rms"] > 0.3 * run.metrics["one_step_rms_constant_velocity"]
+    with torch.no_grad():
+        assert not verify(run).passed
+
+
+def test_a_million_samples():
+    # fails if loading, windows or the baseline are slower than linear, or loop over samples in Python
+    begin = time.perf_counter()
+    data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
+    assert len(data.triples()) == 999_998
+    base = estimate_baseline(data)
+    assert time.perf_counter() - begin < 20
+    assert base.rate == pytest.approx(RATE, rel=1e-6)
+    assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=1e-6)

@@ -1,0 +1,88 @@
+"""float64, float32 and weights of bfloat16; increments against positions at h = 1e-6."""
+
+from typing import Any
+
+import pytest
+import torch
+from extreme_cases import build, starts, state
+
+from herglotz.errors import InputError
+from herglotz.stepping import Stepper
+
+SETTINGS: dict[str, dict[str, Any]] = {
+    "explicit": {"rate": 0.4},
+    "correction": {"rate": 0.4, "correction_width": 8},
+    "affine": {"rate": 0.4, "level": "affine"},
+    "full": {"rate": 0.4, "level": "full"},
+}
+
+
+def errors(model, reference, dtype, steps=60):
+    """Relative errors of the positions against the reference, (20, steps + 1); 20 starts below the separatrix."""
+    q, p, s = starts(20)
+    x = (q.clamp(-1.5, 1.5), p.clamp(-0.7, 0.7), s)
+    with torch.no_grad():
+        exact = Stepper(reference).rollout(*(y.to(dtype).double() for y in x), h=0.125, steps=steps)
+        out = Stepper(model).rollout(*(y.to(dtype) for y in x), h=0.125, steps=steps)
+    assert bool(exact.ok.all())
+    assert bool(out.ok.all())
+    return ((out.q.double() - exact.q).abs() / (1 + exact.q.abs()))[..., 0]
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+def test_float32_follows_float64(name):
+    # fails if float32 loses more than rounding over 60 damped steps: (q1 − q0)/h would lose 1e-5 a step (trap 6)
+    single = build(0.1, dtype=torch.float32, **SETTINGS[name])
+    error = errors(single, build(0.1, **SETTINGS[name]).float().double(), torch.float32)
+    eps = torch.finfo(torch.float32).eps
+    assert float(error.max()) < 60 * eps
+    assert float(error.amax(-1).median()) < 20 * eps
+
+
+@pytest.mark.parametrize("name", SETTINGS)
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=str)
+def test_bfloat16_weights_change_the_model_and_not_the_arithmetic(name, dtype):
+    # fails if weights of 8 bits cost more than their own rounding, 2⁻⁹ relative, or the step loses structure
+    coarse = build(0.1, **SETTINGS[name]).to(torch.bfloat16).to(dtype)
+    error = errors(coarse, build(0.1, **SETTINGS[name]), dtype)
+    twin = errors(coarse, build(0.1, **SETTINGS[name]).to(torch.bfloat16).double(), dtype)
+    assert 1e-5 < float(error.max()) < 0.05
+    if dtype == torch.float64:
+        assert float(twin.max()) < 1e-12
+    assert float(twin.max()) < 1e-2 * float(error.max())
+
+
+@pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
+def test_half_precision_states_are_refused(dtype):
+    # fails if a state of 8 or 11 bits reaches a solver that has no such type
+    with pytest.raises(InputError, match=r"q must be floating point of 32 or 64 bits, got torch\.\w*float16; convert"):
+        Stepper(build(dtype=dtype)).step(state([0.1], [0.2], dtype=dtype), 0.1)
+
+
+class ByPosition:
+    """A model that offers no increments."""
+
+    def __init__(self, model):
+        self.model = model
+
+    def __call__(self, q0, q1, s0, h):
+        return self.model(q0, q1, s0, h)
+
+    def partials(self, q0, q1, s0, h, order=1):
+        return self.model.partials(q0, q1, s0, h, order)
+
+
+@pytest.mark.parametrize("level", ["correction", "affine", "full"])
+def test_increments_against_positions_at_a_microsecond(level):
+    # fails if a step of 1e-6 is solved for q1 in float32: then Δ = q1 − q0 is rounding, and so is p (trap 6)
+    settings, h = SETTINGS[level], float(torch.tensor(1e-6))
+    single, double = build(0.1, dtype=torch.float32, **settings), build(0.1, **settings).float().double()
+    start = starts(10, torch.float32)
+    with torch.no_grad():
+        exact = Stepper(double).rollout(*(x.double() for x in start), h=h, steps=20)
+        out = Stepper(single).rollout(*start, h=h, steps=20)
+        naive = Stepper(ByPosition(single)).rollout(*start, h=h, steps=20)
+    error, before = (float((x.p.double() - exact.p).abs().nan_to_num(1e3).max()) for x in (out, naive))
+    assert bool(out.ok.all())
+    assert error < 20 * 4 * torch.finfo(torch.float32).eps * 4  # 4 ε |Δ| is Newton's tolerance in increments
+    assert before > 1e4 * error

@@ -1,0 +1,74 @@
+"""Random weights a hundred times too large: Newton fails for some samples, says for which, and harms no other."""
+
+import pytest
+import torch
+from extreme_cases import assert_nothing_silent, build, starts
+
+import herglotz
+from herglotz.errors import InputError
+from herglotz.export.c_wrapper import compiler
+from herglotz.stepping import StepError, Stepper, explain_step
+
+WILD = {
+    "mass": (100.0, {"mass_width": 6}),
+    "forced": (100.0, {"level": "forced", "coulomb": True, "correction_width": 8}),
+    "correction": (30.0, {"correction_width": 8}),  # at 100 eager Newton solves none of these
+}
+
+
+def wild(name):
+    noise, settings = WILD[name]
+    return build(noise, draw=1, **settings)
+
+
+@pytest.mark.parametrize("name", WILD)
+def test_a_failed_sample_is_named_and_alone(name):
+    # fails if one sample's failed Newton changes a neighbour by a bit, or has no reason
+    model, start = wild(name), starts(16)
+    with torch.no_grad():
+        out = Stepper(model, max_iterations=12).rollout(*start, h=0.5, steps=1)
+        ok = out.ok
+        assert 0 < int(ok.sum()) < 16
+        assert_nothing_silent(out)
+        alone = Stepper(model, max_iterations=12).rollout(*(x[ok] for x in start), h=0.5, steps=1)
+    assert torch.equal(alone.q[:, 1], out.q[ok][:, 1])
+    assert torch.equal(alone.p[:, 1], out.p[ok][:, 1])
+    first = int((~ok).nonzero()[0])
+    with pytest.raises(StepError, match=rf"step failed at sample \({first},\): [A-Z_]+, residual"), torch.no_grad():
+        Stepper(model, max_iterations=12, throw=True).step(start, 0.5)
+
+
+def test_explain_names_every_failed_sample():
+    # fails if a sample that Newton gave up has no line
+    model, start = wild("mass"), starts(3)
+    with torch.no_grad():
+        failed = ~Stepper(model).rollout(*start, h=0.5, steps=1).ok
+    lines = explain_step(model, start, 0.5)
+    for i in failed.nonzero()[:, 0].tolist():
+        assert any(line.startswith(f"sample ({i},), h = 0.5: ") for line in lines)
+
+
+@pytest.mark.parametrize("level", ["affine", "full"])
+def test_weights_that_overflow_end_with_a_status(level):
+    # fails if e^g = inf, or inf · 0, comes out as a number
+    with torch.no_grad():
+        out = Stepper(build(1e4, draw=1, level=level)).rollout(*starts(10), h=0.5, steps=2)
+    assert_nothing_silent(out)
+    assert not bool(out.ok.all())
+
+
+@pytest.mark.parametrize("name", ["forced", "correction"])
+def test_lanes_of_the_compiled_step_are_apart(name):
+    # fails if the samples that C steps side by side, in the registers of the processor, share a failure
+    try:
+        compiler()
+    except InputError as error:
+        pytest.skip(str(error))
+    stepper, start = herglotz.compile(wild(name)), starts(60)
+    out = stepper.rollout(*start, h=0.5, steps=1)
+    assert_nothing_silent(out)
+    assert 0 < int(out.ok.sum()) < 60
+    keep = torch.randperm(60, generator=torch.Generator().manual_seed(0))[:23]  # other neighbours, other lanes
+    alone = stepper.rollout(*(x[keep] for x in start), h=0.5, steps=1)
+    assert torch.equal(alone.status, out.status[keep])
+    torch.testing.assert_close(alone.q, out.q[keep], rtol=0, atol=0, equal_nan=True)

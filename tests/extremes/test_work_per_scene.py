@@ -1,0 +1,154 @@
+"""Only what a scene requires: what its terms do not name is neither stored, nor evaluated, nor solved for."""
+
+from collections import Counter
+from typing import Any
+
+import pytest
+import torch
+from extreme_cases import build, starts
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import herglotz.stepping.engine as engine
+import herglotz.stepping.newton as newton
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.action import ActionFlow
+from herglotz.models.network import Network
+from herglotz.stepping import ContactSplitting, Stepper
+from herglotz.stepping.field import FieldOf
+
+# What each scene names, and the parameters that this brings.
+BASE = {"kinetic", "potential"}
+SCENES: dict[str, tuple[dict[str, Any], set[str]]] = {
+    "pendulum, no friction": ({"level": "conservative"}, BASE),
+    "pendulum, one rate": ({"level": "linear"}, BASE | {"damping.rate"}),
+    "oscillator": ({"potential_width": 0, "angles": (False,)}, BASE | {"damping.rate"}),
+    "parachute": (
+        {"level": "affine", "damping_width": 0, "angles": (False,)},
+        BASE | {"damping.rate", "damping.drag"},
+    ),
+    "drag by position and speed": ({"level": "affine"}, BASE | {"damping.rate", "damping.drag", "damping.network"}),
+    "damping by s": ({"level": "full"}, BASE | {"damping.rate", "damping.drag", "action"}),
+    "joints with viscous friction": ({"level": "forced"}, BASE | {"damping.rate", "friction"}),
+    "joints with dry friction": ({"level": "forced", "coulomb": True}, BASE | {"damping.rate", "friction"}),
+    "big steps": ({"correction_width": 4}, BASE | {"damping.rate", "correction"}),
+    "mass that depends on position": ({"mass_width": 4}, BASE | {"damping.rate"}),
+}
+EXPLICIT = {"pendulum, no friction", "pendulum, one rate", "oscillator", "joints with viscous friction"}
+
+
+class Operations(TorchDispatchMode):
+    """Counts every tensor operation by name."""
+
+    def __init__(self):
+        super().__init__()
+        self.count = Counter()
+
+    def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        self.count[func.overloadpacket.__name__] += 1
+        return func(*args, **(kwargs or {}))
+
+
+def count_calls(monkeypatch, *places):
+    """How often each (owner, name) is called from now on."""
+    calls = Counter()
+    for owner, name in places:
+        plain = getattr(owner, name)
+
+        def counted(*args, plain=plain, name=name, **kwargs):
+            calls[name] += 1
+            return plain(*args, **kwargs)
+
+        monkeypatch.setattr(owner, name, counted)
+    return calls
+
+
+def operations(settings, steps=10):
+    """Tensor operations of a step of a rollout, after the first."""
+    stepper, found = Stepper(build(0.1, **settings)), []
+    for k in (1, steps + 1):
+        with torch.no_grad(), Operations() as counter:
+            stepper.rollout(*starts(3), h=0.1, steps=k)
+        found.append(counter.count)
+    return {name: (found[1][name] - found[0][name]) / steps for name in found[1]}
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_model_holds_the_parameters_that_its_scene_names(name):
+    # fails if a term that the scene does not name is built, stored and fitted
+    settings, wanted = SCENES[name]
+    model = ContactLagrangian(ModelConfig(**settings))
+    held = {p for p, value in model.named_parameters() if value.numel()}
+    assert all(any(p == w or p.startswith(w + ".") for w in wanted) for p in held)
+    assert all(any(p == w or p.startswith(w + ".") for p in held) for w in wanted - {"kinetic"})  # n = 1: m = 1
+    networks = {m for m, module in model.named_modules() if isinstance(module, Network)}
+    with_width = {"potential.network": "potential_width", "damping.network": "damping_width",
+                  "correction.network": "correction_width", "kinetic.network": "mass_width"}  # fmt: skip
+    for place, width in with_width.items():
+        has_term = place.startswith("potential") or any(w.startswith(place.split(".")[0]) for w in wanted)
+        if place == "damping.network":
+            has_term = place in wanted
+        assert (place in networks) == (has_term and getattr(model.config, width) > 0)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_a_separable_scene_solves_nothing(name, monkeypatch):
+    # fails if Newton or a linear solve runs for a scene whose step is explicit, or a jet where a sweep is enough
+    settings, _ = SCENES[name]
+    model = build(0.1, **settings)
+    calls = count_calls(
+        monkeypatch,
+        (engine, "find_root") if hasattr(engine, "find_root") else (engine, "solve_step"),
+        (newton, "solve"),
+        (torch.linalg, "solve_ex"),
+        (Network, "forward"),
+        (ActionFlow, "forward"),
+        (FieldOf, "__call__"),
+    )
+    with torch.no_grad():
+        Stepper(model).rollout(*starts(3), h=0.1, steps=10)
+    solves = calls["find_root"] + calls["solve_step"]
+    if name in EXPLICIT:
+        assert solves == calls["solve"] == calls["solve_ex"] == calls["forward"] == 0
+        assert calls["__call__"] == 11  # the force at q0, then once a step
+    else:
+        assert solves == 10
+        assert calls["solve_ex"] == 0  # n = 1: a division
+
+
+def test_splittings_solve_nothing(monkeypatch):
+    # fails if the explicit splitting of a separable H goes through Newton
+    calls = count_calls(monkeypatch, (newton, "solve"), (torch.linalg, "solve_ex"))
+    splitting = ContactSplitting(lambda q: (1 - torch.cos(q)).sum(-1), 1.0, 0.2, force=lambda q: -torch.sin(q))
+    splitting.rollout(*starts(3), h=0.1, steps=10)
+    assert not calls
+
+
+def test_the_conservative_level_computes_no_damping():
+    # fails if c = e^{−γh} is made where there is no γ, or s enters an operation beside its own sum
+    conservative, linear = (operations({"level": level}) for level in ("conservative", "linear"))
+    for name in ("exp", "expm1"):
+        assert conservative.get(name, 0) == 0
+    assert sum(conservative.values()) <= sum(linear.values())
+    with torch.no_grad():
+        P = build(0.1, level="conservative").partials(*starts(3)[:2], starts(3).s, 0.1, 2)
+    for zero in (P.D3, P.D13, P.D23, P.D33):
+        assert not bool(zero.any())
+
+
+def test_the_action_flow_is_evaluated_at_the_full_level_only(monkeypatch):
+    # fails if units of s, and jets over 2n + 1 variables, are carried where s enters linearly or not at all
+    calls = count_calls(monkeypatch, (ActionFlow, "forward"), (ActionFlow, "offsets"))
+    for name, (settings, _) in SCENES.items():
+        calls.clear()
+        with torch.no_grad():
+            Stepper(build(0.1, **settings)).rollout(*starts(2), h=0.1, steps=2)
+        assert bool(calls) == (name == "damping by s")
+
+
+def test_the_levels_cost_what_they_say():
+    # fails if a level that says less is dearer than one that says more
+    cost = [sum(operations({"level": level}).values()) for level in ("conservative", "linear", "affine", "full")]
+    assert cost == sorted(cost)
+    assert cost[2] > 3 * cost[1]  # no longer explicit
+    without, with_network = (sum(operations({"potential_width": w}).values()) for w in (0, 8))
+    assert without < with_network

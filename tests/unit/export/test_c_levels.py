@@ -1,0 +1,173 @@
+"""C for every level of the ladder: it computes what the eager stepper does, in float64 and in float32."""
+
+import shutil
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export import compile_c
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.mass import PositionKinetic
+from herglotz.stepping import State, Stepper
+
+pytestmark = pytest.mark.skipif(
+    not any(shutil.which(c) for c in ("cc", "gcc", "clang")), reason="no C compiler in the PATH"
+)
+H = 0.1
+CASES: dict[str, dict[str, Any]] = {
+    "conservative": {"level": "conservative"},
+    "linear": {"level": "linear"},
+    "linear, silu": {"level": "linear", "correction_width": 6, "activation": "silu"},
+    "affine, tanh": {"level": "affine"},
+    "affine, softplus": {"level": "affine", "correction_width": 5, "activation": "softplus"},
+    "viscous": {"level": "forced"},
+    "dry": {"level": "forced", "coulomb": True, "correction_width": 4},
+    "viscous, motors": {"level": "forced", "inputs": 2},
+    "full": {"level": "full", "action_width": 3},
+    "full, correction": {"level": "full", "correction_width": 4, "activation": "silu", "mass_width": 3},
+    "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
+    "motors": {"level": "forced", "coulomb": True, "inputs": 3},
+}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cache(tmp_path_factory):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
+def damped(case):
+    """A damped model of an angle and a length whose every parameter is random."""
+    sizes = (1.0, 1.1)
+    options = {"potential_width": 4, "potential_depth": 2, "damping_width": 4, **CASES[case]}
+    config = ModelConfig((True, False), scale=sizes, speed=sizes, stiffness=sizes, tilt=(0.0, 0.0), **options)
+    model = ContactLagrangian(config)
+    make = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        if model.friction is not None:
+            model.friction.viscous.abs_()
+        if model.action is not None:  # so large that a missing term is seen
+            model.action.rate.mul_(6)
+        if isinstance(model.kinetic, PositionKinetic):
+            model.kinetic.network.weights[-1].mul_(6)
+    return model
+
+
+def problem(case, steps, dtype=torch.float64):
+    """Model, states and the options of a rollout."""
+    model = damped(case).to(dtype)
+    x = torch.randn(3, 5, generator=torch.Generator().manual_seed(5), dtype=torch.float64).to(dtype) / 2
+    options: dict[str, Any] = {"h": H, "steps": steps}
+    if model.inputs:
+        u = torch.randn(3, steps, model.inputs, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+        options["inputs"] = (0.3 * u).to(dtype)
+    return model, State(x[:, :2], x[:, 2:4], x[:, 4]), options
+
+
+def one(b, states, options):
+    """Sample b by itself."""
+    inputs = {"inputs": options["inputs"][b]} if "inputs" in options else {}
+    return State(*(x[b] for x in states)), {**options, **inputs}
+
+
+def relative(a, b):
+    return float((a.double() - b.double()).abs().max() / b.double().abs().max())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_every_level_agrees_with_the_eager_stepper(case):
+    # fails if a force enters one momentum only, an activation's slope is wrong, or lanes differ from single samples
+    model, states, options = problem(case, 60)
+    with torch.no_grad():
+        eager = Stepper(model, tol=4e-16).rollout(*states, **options)
+    compiled = compile_c(model)
+    ours = compiled.rollout(*states, **options)
+    assert eager.ok.all()
+    assert ours.ok.all()
+    start, alone = one(0, states, options)
+    single = compiled.rollout(*start, **alone)
+    for name in ("q", "p", "s", "sigma"):
+        assert relative(getattr(ours, name), getattr(eager, name)) <= 1e-12, name
+        assert relative(getattr(single, name), getattr(ours, name)[0]) <= 1e-12, name
+
+
+@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full"])
+def test_float32_keeps_its_digits_over_many_steps(case):
+    # fails if c is multiplied into p or sigma: 1 + E rounds, and 1000 steps add it up to 3e-5
+    model, states, options = problem(case, 1000, torch.float32)
+    compiled = compile_c(model)
+    ours, single = compiled.rollout(*states, **options), compiled.rollout(*(x[0] for x in states), **options)
+    wide = State(*(x.double() for x in states))
+    exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=1000)
+    assert ours.ok.all()
+    for name in ("q", "p", "s", "sigma"):
+        assert relative(getattr(ours, name), getattr(exact, name)) <= 1e-5, name
+        assert relative(getattr(single, name), getattr(exact, name)[0]) <= 1e-5, name
+    for sigma, truth in ((ours.sigma, exact.sigma), (single.sigma, exact.sigma[0])):  # it falls: entry by entry
+        rounded = 1000 * 6e-8 * float((truth[..., 1] / truth[..., 0] - 1).abs().max())  # c - 1, once a step
+        assert (sigma / truth - 1).abs().max() <= 1e-6 + rounded
+
+
+def test_no_inputs_is_not_a_missing_input():
+    # fails if the C reads inputs where there are none, or the input of another step
+    model, states, options = problem("motors", 20)
+    compiled = compile_c(model)
+    still = {**options, "inputs": torch.zeros_like(options["inputs"])}
+    free = {k: v for k, v in options.items() if k != "inputs"}
+    assert torch.equal(compiled.rollout(*states, **still).q, compiled.rollout(*states, **free).q)
+    shared = compiled.rollout(*states, h=H, inputs=options["inputs"][1])
+    assert relative(shared.q[1], compiled.rollout(*states, **options).q[1]) <= 1e-14
+    step = compiled.step(states, H, u=options["inputs"][:, 0])
+    assert relative(step.state.q, compiled.rollout(*states, **options).q[:, 1]) <= 1e-14
+    with torch.no_grad():
+        eager = Stepper(model).init(states.q, states.q + 0.1 * states.p, states.s, H, options["inputs"][:, 0])
+    ours = compiled.init(states.q, states.q + 0.1 * states.p, states.s, H, options["inputs"][:, 0])
+    assert relative(ours.p, eager.p) <= 1e-13
+
+
+@pytest.mark.parametrize("change", [{"inputs": torch.zeros(20, 2)}, {"inputs": torch.zeros(3, 19, 3)}])
+def test_wrong_inputs_are_refused(change):
+    # fails if a wrong number of motors or of steps reaches C, where it would read other memory
+    model, states, options = problem("motors", 20)
+    with pytest.raises(InputError, match="u needs 3"):
+        compile_c(model).rollout(*states, **{**options, "inputs": change["inputs"].double()})
+
+
+def test_the_terms_of_the_full_level_and_of_the_mass_are_seen():
+    # fails if the models above would agree without the flow of s, or without the mass that depends on position
+    for case in ("full", "mass"):
+        model, states, options = problem(case, 60)
+        with torch.no_grad():
+            start = compile_c(model).rollout(*states, **options)
+            if model.action is not None:
+                model.action.rate.zero_()
+            if isinstance(model.kinetic, PositionKinetic):
+                model.kinetic.network.weights[-1].zero_()
+        assert relative(compile_c(model).rollout(*states, **options).q, start.q) >= 1e-2, case
+
+
+@pytest.mark.parametrize("case", ["full", "full, correction", "mass", "viscous, motors"])
+def test_init_of_the_new_terms(case):
+    # fails if p1 is not D2 L_d, or what positions and s have gained is missing in s1
+    model, (q, p, s), _ = problem(case, 1)
+    with torch.no_grad():
+        eager = Stepper(model).init(q, q + 0.1 * p, s, H)
+    for ours, theirs in zip(compile_c(model).init(q, q + 0.1 * p, s, H), eager, strict=True):
+        assert relative(ours, theirs) <= 1e-13
+
+
+def test_viscous_friction_needs_no_iteration():
+    # fails if a step equation that is linear in q1 is solved by Newton, or its matrix is kept when h changes
+    model, states, _ = problem("viscous, motors", 1)
+    h = torch.tensor([0.1, 0.3, 0.1, 0.2], dtype=torch.float64)
+    u = torch.ones(4, 2, dtype=torch.float64)
+    ours = compile_c(model).rollout(*states, h=h, inputs=u)
+    with torch.no_grad():
+        eager = Stepper(model).rollout(*states, h=h, inputs=u)
+    assert bool((ours.residual == 0).all())
+    assert relative(ours.q, eager.q) <= 1e-14

@@ -1,0 +1,214 @@
+"""ONNX files: the same motion as the eager stepper, on onnxruntime and numpy alone, with a status for every failure."""
+
+import subprocess
+import sys
+
+import pytest
+import torch
+from test_pt2 import BOX, SMALL, beside, damped, model_of, states_of
+
+from herglotz.errors import InputError
+from herglotz.export import DifferencedStepper, compare, export_onnx, load_onnx, weights_digest
+from herglotz.mechanics import flow_derivative, partials, step_derivative
+from herglotz.models import LEVELS
+from herglotz.stepping import State, Status, Stepper
+
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxruntime")
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """(model, path, loaded) in two coordinates, where every step is a Newton solve of a 2 × 2 system."""
+    model = model_of(2, "affine")
+    path = tmp_path_factory.mktemp("onnx") / "affine.onnx"
+    export_onnx(model, path, h=0.1, box=BOX, units=["rad", "m"], metadata={"data": "none"})
+    return model, path, load_onnx(path)
+
+
+def test_a_file_matches_the_eager_stepper_at_every_batch_size(written):
+    # fails if the graph is specialised to a batch or to a number of steps, or mixes samples
+    model, _, exported = written
+    result = compare(exported, Stepper(model), steps=20, batches=(1, 7, 4096))
+    assert max(result[key] for key in ("q", "p", "s", "c")) <= 1e-12, result
+    assert result["status"] == result["failed"] == 0
+
+
+def test_unequal_steps_and_single_steps(written):
+    # fails if the guess assumes equal steps, or the loop reads the wrong row of h
+    model, _, exported = written
+    q, p, s = (x.reshape(2, 3, *x.shape[1:]) for x in states_of(2, 6))
+    h = torch.tensor([0.1, 0.2, 0.05, 0.05], dtype=torch.float64)
+    with torch.no_grad():
+        ours, eager = exported.rollout(q, p, s, h=h), Stepper(model).rollout(q, p, s, h=h)
+        one, first = exported.step(State(q, p, s), 0.1), Stepper(model).step(State(q, p, s), 0.1)
+    for a, b in ((ours.q, eager.q), (ours.p, eager.p), (ours.s, eager.s), (ours.sigma, eager.sigma)):
+        torch.testing.assert_close(a, b, rtol=1e-11, atol=1e-11)
+    for a, b in zip((*one.state, one.c), (*first.state, first.c), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+
+
+def test_a_file_steps_without_torch_and_herglotz(written, tmp_path):
+    # fails if the graph needs a custom operator, or bad input gives numbers without a status
+    script = """
+import sys
+class Blocked:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("torch", "herglotz", "onnx"):
+            raise ImportError(name + " is not installed here")
+sys.meta_path.insert(0, Blocked())
+import numpy as np, onnxruntime as ort, json
+session = ort.InferenceSession(sys.argv[1], providers=["CPUExecutionProvider"])
+known = json.loads(session.get_modelmeta().custom_metadata_map["herglotz"])
+assert (known["dof"], known["dtype"], known["level"]) == (2, "float64", "affine")
+names = [x.name for x in session.get_outputs()]
+def roll(q, p, s, h, dtype=float):
+    feeds = {k: np.asarray(x, dtype) for k, x in zip(("q", "p", "s", "h"), (q, p, s, h))}
+    return dict(zip(names, session.run(None, feeds)))
+good = roll([[0.25, 0.5]], [[-0.125, 0.25]], [0.0], [[0.1]] * 50)
+assert not good["status"].any() and good["q_out"].shape == (50, 1, 2)
+print(*good["q_out"][-1, 0], *good["p_out"][-1, 0], good["s_out"][-1, 0])
+# Bad values: a status in that sample, NaN behind it, and nothing in its neighbour.
+for h in (0.0, np.nan, np.inf):
+    found = roll([[0.1, 0.1]] * 2, [[0.1, 0.1]] * 2, [0, 0], [[h, 0.1]])
+    assert found["status"][0, 0] != 0 and found["status"][0, 1] == 0, h
+    assert np.isnan(found["q_out"][0, 0]).all() and np.isfinite(found["q_out"][0, 1]).all()
+found = roll([[np.nan, 0.1]], [[0.1, 0.1]], [0], [[0.1]] * 2)
+assert (found["status"] != 0).all() and np.isnan(found["q_out"]).all() and (found["outside"] == 1).all()
+assert roll([[3.0, 0.0]], [[0.0, 0.0]], [0.0], [[0.1]])["outside"].all()
+# Bad shapes and dtypes: an error.
+for arguments in (([[0.1]], [[0.1, 0.1]], [0], [[0.1]]), ([[0.1, 0.1]] * 3, [[0.1, 0.1]] * 2, [0, 0], [[0.1, 0.1]])):
+    try:
+        roll(*arguments)
+    except Exception:
+        continue
+    raise SystemExit("accepted " + repr(arguments))
+try:
+    roll([[0.1, 0.1]], [[0.1, 0.1]], [0], [[0.1]], np.float32)
+except Exception:
+    sys.exit(0)
+raise SystemExit("accepted float32")
+"""
+    (tmp_path / "alone.py").write_text(script)
+    command = [sys.executable, "-I", str(tmp_path / "alone.py"), str(written[1])]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    alone = torch.tensor([float(x) for x in done.stdout.split()], dtype=torch.float64)
+    start = (torch.tensor([x], dtype=torch.float64) for x in ([0.25, 0.5], [-0.125, 0.25]))
+    with torch.no_grad():
+        final = Stepper(written[0]).rollout(*start, h=0.1, steps=50).final
+    torch.testing.assert_close(alone, torch.cat([x.reshape(-1) for x in final]), rtol=1e-12, atol=1e-12)
+
+
+def test_a_negative_step_has_no_status_of_success(written):
+    # fails if h < 0, for which the graph could find a solution, counts as a step
+    import onnxruntime as ort
+
+    session = ort.InferenceSession(str(written[1]), providers=["CPUExecutionProvider"])
+    one = {"q": [[0.1, 0.1]], "p": [[0.1, 0.1]], "s": [0.0], "h": [[-0.1]]}
+    feeds = {name: torch.tensor(x, dtype=torch.float64).numpy() for name, x in one.items()}
+    (status,) = session.run(["status"], feeds)
+    assert int(status.item()) != Status.CONVERGED  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_file_is_small_and_says_what_it_is(written):
+    # fails if weights are stored twice, local paths are shipped, or the metadata is lost
+    model, path, exported = written
+    content = path.read_bytes()
+    assert len(content) < 100_000
+    assert b"site-packages" not in content
+    assert b"src/herglotz" not in content
+    known = exported.metadata
+    assert (known["box"], known["units"], known["data"]) == (BOX, ["rad", "m"], "none")
+    assert known["weights_sha256"] == weights_digest(model)
+    assert exported.kind == "onnx"
+
+
+def test_differences_are_the_derivative(written):
+    # fails if a weight of the difference formula, an offset or the order of the columns is wrong
+    model, _, exported = written
+    q, p, s = states_of(2, 5)
+    (q1, _, _), D = flow_derivative(lambda *x: DifferencedStepper(exported).step(State(*x), 0.1).state, q, p, s)
+    with torch.no_grad():
+        exact = step_derivative(partials(model, q, q1, s, 0.1, 2), p)
+    torch.testing.assert_close(D, exact, rtol=1e-9, atol=1e-9)
+
+
+def test_wrong_states_are_refused(written):
+    # fails if the loader leaves the checks to onnxruntime
+    exported = written[2]
+    q, p, s = states_of(2, 4)
+    with pytest.raises(InputError, match=r"q must be torch.float64, got torch.float32"):
+        exported.step(State(q.float(), p, s), 0.1)
+    with pytest.raises(InputError, match="need shapes"):
+        exported.step(State(q, p[:3], s), 0.1)
+    with pytest.raises(InputError, match="p must be finite"):
+        exported.rollout(q, p * torch.nan, s, h=0.1, steps=2)
+    with pytest.raises(InputError, match="has no derivatives"):
+        exported.step(State(q.requires_grad_(), p, s), 0.1)
+    with pytest.raises(InputError, match="h must be finite and > 0"):
+        exported.step(State(q.detach(), p, s), -0.1)
+    with pytest.raises(InputError, match=r"use a \.pt2 file for init"):
+        exported.init(q.detach(), p, s, 0.1)
+
+
+def test_strided_states_step_like_others(written):
+    # fails if memory is read without its strides
+    q, p, s = states_of(2, 8)
+    wide = torch.cat([q, p], -1).T.contiguous().T
+    a = written[2].step(State(wide[::2, :2], wide[::2, 2:], s[::2]), 0.1).state
+    b = written[2].step(State(q[::2].clone(), p[::2].clone(), s[::2].clone()), 0.1).state
+    for x, y in zip(a, b, strict=True):
+        torch.testing.assert_close(x, y, rtol=0, atol=0)
+
+
+def test_unreadable_files_and_missing_packages(written, tmp_path, monkeypatch):
+    # fails if onnxruntime's own exceptions reach the user, or a missing package is a traceback
+    with pytest.raises(InputError, match="no such file"):
+        load_onnx(tmp_path / "nothing.onnx")
+    (tmp_path / "half.onnx").write_bytes(written[1].read_bytes()[:1000])
+    with pytest.raises(InputError, match=r"not a readable \.onnx"):
+        load_onnx(tmp_path / "half.onnx")
+    other = onnx.load(written[1])
+    del other.metadata_props[:]
+    onnx.save(other, tmp_path / "other.onnx")
+    with pytest.raises(InputError, match="no herglotz metadata"):
+        load_onnx(tmp_path / "other.onnx")
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match="pip install onnxruntime"):
+        load_onnx(written[1])
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(InputError, match=r"pip install 'herglotz\[export\]'"):
+        export_onnx(written[0], tmp_path / "a.onnx", h=0.1)
+
+
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_level(level, tmp_path):
+    # fails if an operation is translated wrongly, or inputs u reach another step than theirs
+    inputs = 2 if level == "forced" else 0
+    model = damped(level, torch.float64, inputs)
+    exported = load_onnx(export_onnx(model, tmp_path / "level.onnx", h=0.1))
+    q, p, s = states_of(1, 5)
+    u = torch.linspace(-1, 1, 5 * 30 * 2, dtype=torch.float64).reshape(5, 30, 2) if inputs else None
+    with torch.no_grad():
+        ours = exported.rollout(q, p, s, h=0.1, steps=30, u=u)
+        eager = beside(model).rollout(q, p, s, h=0.1, steps=30, inputs=u)
+    assert ours.ok.all()
+    for name in ("q", "p", "s", "sigma"):
+        torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=1e-12, atol=1e-12)
+    if u is not None:
+        for bad in (None, u[..., :1], u.float(), u * torch.nan):
+            with pytest.raises(InputError, match=r"input|finite"):
+                exported.rollout(q, p, s, h=0.1, steps=30, u=bad)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+@pytest.mark.parametrize("level", LEVELS)
+def test_every_level_over_a_thousand_steps(level, dtype, tmp_path):
+    # fails if a level's graph is wrong, or a float64 constant turns a float32 graph into a mixed one
+    model = damped(level, dtype)
+    exported = load_onnx(export_onnx(model, tmp_path / "level.onnx", h=0.1, box=SMALL))
+    result = compare(exported, beside(model), batches=(1, 1009, 4096), steps=1000)
+    assert max(result[key] for key in ("q", "p", "s", "c")) <= (1e-12 if dtype == torch.float64 else 1e-5), result
+    assert result["status"] == result["failed"] == 0

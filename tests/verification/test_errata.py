@@ -1,0 +1,171 @@
+"""Each erratum: the printed formula's residual is clear, the corrected one's is rounding; the scripts of the paper."""
+
+import importlib.util
+import json
+import sys
+from pathlib import Path
+
+import mpmath
+import pytest
+import torch
+
+from herglotz.mechanics import contact_defect, contact_vector_field, flow_derivative
+from herglotz.systems import PrintedParachute, scene
+from herglotz.systems.printed_parachute import MAP_START
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(f"train_{name}", ROOT / "train" / f"{name}.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
+
+
+errata, parachute = script("errata"), script("parachute")
+
+
+@pytest.mark.parametrize("make", errata.ERRATA, ids=lambda f: f.__name__)
+def test_printed_formulas_are_wrong_and_corrected_ones_right(make):
+    # fails if a corrected formula carries a wrong sign, index or factor, or a check would accept the printed one
+    erratum = make()
+    assert erratum.rows
+    for row in erratum.rows:
+        assert row.corrected <= 1e-10, row
+        assert row.printed >= 1e-3, row
+
+
+def test_the_page_is_the_scripts_output():
+    # fails if docs/errata.md was edited by hand or is older than the script (numbers apart: they are rounding)
+    page = (ROOT / "docs" / "errata.md").read_text(encoding="utf-8")
+    for make in errata.ERRATA:
+        e = make()
+        assert f"## {e.number}\n" in page
+        assert e.printed in page
+        assert e.right in page
+        for row in e.rows:
+            assert f"| {row.setting.replace('|', chr(92) + '|')} | {row.printed:.3g} |" in page
+    for name in ("parachute_map.png", "parachute_fall.png"):
+        assert f"images/{name}" in page
+        assert (ROOT / "docs" / "images" / name).exists()
+
+
+def printed_orbit(steps, digits=60):
+    with mpmath.workdps(digits):
+        q, p, s = (mpmath.mpf(x) for x in (100, 1, 1))
+        lam = -mpmath.mpf(1) / 100
+        points = []
+        for _ in range(steps):
+            p1 = (1 - 10 * mpmath.e ** (2 * lam * q) / p) / (2 * lam) - 2 * lam * s
+            q1 = p1 + 2 * lam * s
+            s = s + p1**2 / 2 - 2 * lam**2 * s - 5 / lam * (mpmath.e ** (2 * lam * q) - 1)
+            q, p = q1, p1
+            points.append((float(q), float(p), float(s)))
+    return points
+
+
+def test_the_printed_map_point_by_point():
+    # fails if one of the three printed lines is altered, or an overflow counts as a point
+    q, p, s = (torch.tensor(x, dtype=torch.float64) for x in MAP_START)
+    (q, p, s), last = PrintedParachute().orbit(q[None], p[None], s, steps=12)
+    assert last == 8
+    for k, point in enumerate(printed_orbit(8), 1):
+        # the k-th point has lost about as many digits as the map stretches: 1e-12 at k = 8
+        torch.testing.assert_close(
+            (q[k, 0], p[k, 0], s[k]), tuple(torch.tensor(x, dtype=torch.float64) for x in point), rtol=2e-12, atol=0
+        )
+    golden = (
+        (17.667641618306346, 17.687641618306346, -274.90622537287229),
+        (-30.14632588428771, -35.644450391745156, 211.57685030235712),
+        (-75.634552554348327, -71.403015548301184, 3174.45938646582),
+    )
+    for k, (a, b, c) in enumerate(golden, 1):
+        assert abs(float(q[k, 0]) / a - 1) < 1e-14
+        assert abs(float(p[k, 0]) / b - 1) < 1e-14
+        assert abs(float(s[k]) / c - 1) < 2e-14
+    two = PrintedParachute(squared=True).orbit(q[0], p[0], s[0], steps=2)[0][2][2]
+    assert abs(float(two) / 196.40718250753046 - 1) < 2e-14
+
+
+def test_only_the_square_makes_the_printed_map_a_contact_map():
+    # fails if −2λ²s/m is as good as −2λ²s²/m
+    x = tuple(torch.tensor(v, dtype=torch.float64) for v in ([30.0], [-12.0], -40.0))
+    defects = []
+    for squared in (True, False):
+        step = PrintedParachute(squared=squared)
+        (q1, p1, _), D = flow_derivative(step, *x)
+        defects.append(float(contact_defect(D, x[1], p1, step.conformal_factor(q1)).abs().max()))
+    assert defects[0] < 1e-11
+    assert defects[1] > 1e-3
+
+
+def test_printed_hamiltonian_accelerates_upwards():
+    # fails if the sign of E9 is "corrected" in the printed map
+    printed = PrintedParachute()
+
+    def H(q, p, s):
+        return (p[..., 0] + 2 * printed.lam * s) ** 2 / (2 * printed.m) + printed.potential(q)
+
+    one = torch.ones((), dtype=torch.float64)
+    _, p_dot, s_dot = contact_vector_field(H, 100 * one[None], 0.02 * one[None], one)
+    assert abs(float(p_dot + 2 * printed.lam * s_dot) - 7.29) < 5e-3
+
+
+def landing_reference():
+    with mpmath.workdps(40):
+        g, lam, q0, v0 = mpmath.mpf(10), mpmath.mpf(1) / 100, mpmath.mpf(100), mpmath.mpf("0.98")
+        w = mpmath.sqrt(lam * g)
+        time = mpmath.findroot(
+            lambda t: mpmath.cosh(w * t) - lam * v0 / w * mpmath.sinh(w * t) - mpmath.e ** (lam * q0), 5
+        )
+        C, S = mpmath.cosh(w * time), mpmath.sinh(w * time)
+        speed = (v0 * C - g / w * S) / (C - lam * v0 / w * S)
+        assert mpmath.nstr(time, 18) == "5.34099635306509637"
+        assert mpmath.nstr(speed, 18) == "-29.4073918049426436"
+        return float(time), float(speed)
+
+
+def test_the_landing_to_fifteen_digits():
+    # fails if the closed form takes the other root, or the flow another velocity
+    time, speed = landing_reference()
+    x = parachute.start()
+    v0 = float(scene("parachute").velocity(*x))
+    for t, v in (parachute.landing(100.0, v0), parachute.landing_by_root(x, time)):
+        assert abs(t / time - 1) < 1e-15
+        assert abs(v / speed - 1) < 1e-15
+
+
+@pytest.fixture(scope="module")
+def run_of_the_script(tmp_path_factory):
+    out = tmp_path_factory.mktemp("parachute")
+    arguments, sys.argv = sys.argv, ["parachute.py", "--out", str(out)]
+    threads = torch.get_num_threads()
+    try:
+        assert parachute.main() == 0
+    finally:
+        sys.argv = arguments
+        torch.set_num_threads(threads)
+    return out
+
+
+def test_the_script_writes_numbers_and_figures(run_of_the_script):
+    # fails if D2S^k is compared with itself, or the landing comes from one source only
+    numbers = json.loads((run_of_the_script / "parachute.json").read_text(encoding="utf-8"))
+    time, speed = landing_reference()
+    for value in numbers["fall"]["landing_time"].values():
+        assert abs(value / time - 1) < 1e-12
+    for value in numbers["fall"]["landing_velocity"].values():
+        assert abs(value / speed - 1) < 1e-14
+    assert numbers["fall"]["worst_dS_minus_p_relative"] < 1e-12
+    assert numbers["fall"]["worst_hamilton_jacobi_residual_relative"] < 1e-14
+    for name, smallest, largest in (("printed", 1.0, 2.0), ("squared", 0.0, 1e-13)):
+        x = numbers["printed_map"][name]
+        worst = abs(x["dS"][2] / x["points"][3]["p"] - 1)
+        assert smallest <= worst <= largest
+    assert numbers["printed_map"]["printed"]["last_finite_k"] == 8
+    for name in ("parachute_map.png", "parachute_fall.png"):
+        assert (run_of_the_script / name).read_bytes()[:4] == b"\x89PNG"
