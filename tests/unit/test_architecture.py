@@ -12,7 +12,7 @@ ORDER = "mechanics | systems models | stepping | data | training | export | tune
 LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.split()}
 RUNTIME = {"torch", "numpy", "matplotlib", "tqdm", "herglotz"} | set(sys.stdlib_module_names)
 # Extras that only some users install: for the ONNX files, and inside functions, so that nothing else needs them.
-EXTRAS = {"onnx", "onnxruntime", "onnxscript"}
+EXTRAS = {"onnx", "onnxruntime"}
 FILES = sorted(SOURCE.rglob("*.py"))
 
 

@@ -102,7 +102,7 @@ def rollout_program(model: ContactLagrangian | Equations, entries: Mapping[str, 
 @contextmanager
 def quiet() -> Iterator[None]:
     """Without the remarks that torch's exporters make on their own code."""
-    logs = [logging.getLogger(name) for name in ("torch.export", "torch.onnx", "torch._inductor", "onnxscript")]
+    logs = [logging.getLogger(name) for name in ("torch.export", "torch.onnx", "torch._inductor")]
     levels = [log.level for log in logs]
     for log in logs:
         log.setLevel(logging.CRITICAL)
