@@ -1,7 +1,8 @@
 """Normal equations and gradients shared by the processes of `torchrun`; nothing at all in a single process.
 
 Every process holds the data and runs the same optimiser. The work that grows with the data (Jacobians of chunks of
-triples or steps) is dealt out; the sums are all-reduced, so that all processes take the same decisions.
+triples or steps) is dealt out and the sums are all-reduced. The last bits of what a process computes by itself depend
+on where its memory lies; what decides the optimiser's path is therefore taken from the first process.
 """
 
 from __future__ import annotations
@@ -41,6 +42,25 @@ def add_over_processes(*tensors: Tensor) -> None:
     for x in tensors:
         dist.all_reduce(x)
         dist.broadcast(x, 0)
+
+
+def of_first(*tensors: Tensor) -> tuple[Tensor, ...]:
+    """The first process's values of these tensors, everywhere."""
+    if world()[1] == 1:
+        return tensors
+    shared = tuple(x.detach().clone() for x in tensors)
+    for x in shared:
+        dist.broadcast(x, 0)
+    return shared
+
+
+def everywhere(holds: bool) -> bool:
+    """Whether something holds in every process."""
+    if world()[1] == 1:
+        return holds
+    flag = torch.tensor(float(holds), device="cuda" if dist.get_backend() == "nccl" else "cpu")
+    dist.all_reduce(flag, dist.ReduceOp.MIN)
+    return bool(flag)
 
 
 @contextmanager

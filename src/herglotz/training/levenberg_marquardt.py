@@ -9,6 +9,8 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
+from herglotz.training.distributed import everywhere, of_first
+
 
 class LeastSquares(Protocol):
     """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, so that they may work in chunks."""
@@ -65,7 +67,7 @@ def levenberg_marquardt(
     OptimiserResult
         Always the best finite point; `reason` tells why the search ended.
     """
-    cost, A, b = problem.normal_equations(x)
+    cost, A, b = of_first(*problem.normal_equations(x))
     best = float(cost)
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, best, "not_finite", 0)
@@ -74,13 +76,13 @@ def levenberg_marquardt(
     history, reason, iteration = [best], "max_iterations", 0
     for iteration in range(1, max_iterations + 1):
         step = _damped_step(A, b, damping * _floored(scale))
-        new = problem.cost(x + step) if step is not None else None
+        new = of_first(problem.cost(x + step))[0] if step is not None else None
         predicted = 0.0 if step is None else float(-(b @ step) - 0.5 * step @ (A @ step))
         if step is not None and new is not None and bool(torch.isfinite(new)) and float(new) < best and predicted > 0:
             gain = (best - float(new)) / predicted
             quiet = quiet + 1 if best - float(new) <= rtol * best else 0
             x = x + step
-            cost, A, b = problem.normal_equations(x)
+            cost, A, b = of_first(*problem.normal_equations(x))
             best = float(cost)
             history.append(best)
             scale = torch.maximum(scale, A.diagonal())
@@ -108,7 +110,8 @@ def _floored(scale: Tensor) -> Tensor:
 def _damped_step(A: Tensor, b: Tensor, diagonal: Tensor) -> Tensor | None:
     matrix = (A + torch.diag(diagonal)).double()  # squared condition numbers need float64
     factor, info = torch.linalg.cholesky_ex(matrix)
-    if int(info) != 0:
+    if not everywhere(int(info) == 0):
         return None
     step = -torch.cholesky_solve(b.double()[:, None], factor)[:, 0].to(b.dtype)
+    (step,) = of_first(step)
     return step if bool(torch.isfinite(step).all()) else None

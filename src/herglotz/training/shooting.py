@@ -20,7 +20,7 @@ from herglotz.data import Trajectories
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
-from herglotz.training.distributed import add_over_processes, own_share, world
+from herglotz.training.distributed import add_over_processes, everywhere, own_share, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.grid import SegmentGrid
 from herglotz.training.lifted import Path, solve_path
@@ -111,7 +111,7 @@ class ShootingProblem:
         """(cost, JᵀJ, Jᵀr); remembers the trajectory for the next solve."""
         theta, _ = self.unpack(x)
         path = self.solve(x)
-        if path is None:
+        if not everywhere(path is not None) or path is None:
             return x.new_full((), torch.inf), x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         self.path = path
         grid, n, d, P = self.grid, self.n, self.d, self.P
