@@ -7,6 +7,7 @@ import copy
 import torch
 from torch import Tensor, nn
 
+from herglotz.errors import InputError
 from herglotz.export.c_action import ACTION, ACTION_LEGENDRE_PLUS
 from herglotz.export.c_equation import CONSTANT_MASS, EVALUATION, LEGENDRE_PLUS, POSITION_MASS, TYPES
 from herglotz.export.c_jet import JETS, KINETIC
@@ -211,7 +212,7 @@ def _constants(model: ContactLagrangian, dtype: str) -> str:
         "/* The mass matrix (at q = 0) and its inverse, row by row. */",
         f"static const real NAME_mass[NAME_N * NAME_N] = {{{numbers(mass.reshape(-1).tolist(), dtype)}}};",
         "static const real NAME_inverse_mass[NAME_N * NAME_N] = "
-        f"{{{numbers(torch.linalg.inv(mass).reshape(-1).tolist(), dtype)}}};",
+        f"{{{numbers(_inverse(mass).reshape(-1).tolist(), dtype)}}};",
     ]
     vectors = {"drag": damping.drag} if isinstance(damping, AffineDamping) else {}
     if model.friction is not None:
@@ -247,6 +248,20 @@ def _mass_constants(kinetic: PositionKinetic) -> dict[str, Tensor]:
         "mass_factor": kinetic.constant.factor(),
         "mass_origin": kinetic.network(Jet(kinetic.origin[None], 0, 1)).value,
     }
+
+
+def _inverse(mass: Tensor) -> Tensor:
+    """The inverse of the mass matrix.
+
+    Raises
+    ------
+    InputError
+        If the mass is singular: then no step is defined (erratum E4).
+    """
+    inverse, info = torch.linalg.inv_ex(mass)
+    if int(info) != 0 or not bool(torch.isfinite(inverse).all()):
+        raise InputError(f"the mass matrix {mass.tolist()} is singular, so the model has no step; fit it again")
+    return inverse
 
 
 def _friction_constants(friction: Friction) -> dict[str, Tensor]:
