@@ -86,11 +86,6 @@ def is_run(path: Path) -> bool:
     return path.is_dir()
 
 
-def is_exported(path: Path) -> bool:
-    """Whether a path is named like an exported model."""
-    return path.suffix.lower() == ".pt2"
-
-
 def print_json(values: dict[str, Any]) -> None:
     """Print one JSON object; NaN and infinities, which JSON lacks, become null."""
     print(json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False))

@@ -18,11 +18,10 @@ from herglotz.data.files import PathLike, write_atomically
 from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import FORMAT, METADATA, describe, to_json, weights_digest
-from herglotz.export.metadata import describe as _metadata
 from herglotz.export.module import ITERATIONS, InitModule, RolloutModule, StepModule
 from herglotz.models import ContactLagrangian
 
-__all__ = ["FORMAT", "METADATA", "_metadata", "export_pt2", "rollout_program", "weights_digest"]
+__all__ = ["FORMAT", "METADATA", "export_pt2", "rollout_program", "weights_digest"]
 
 EXAMPLE_STEPS = 13
 

@@ -52,7 +52,7 @@ class Friction(nn.Module):
         if self.dry:
             slow = x * (-self.log_stribeck).exp()
             f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (-self.log_smooth).exp()).tanh()
-        return f if u is None else f + self._applied(u)
+        return f if u is None else f + self.applied(u)
 
     def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
         """The force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet: what one iteration of a step needs."""
@@ -63,7 +63,7 @@ class Friction(nn.Module):
             grip = bump + self.coulomb
             f = f - grip * t
             slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x * (-self.log_stribeck).exp() * t
-        return f if u is None else f + self._applied(u), slope
+        return f if u is None else f + self.applied(u), slope
 
     def forward(self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None) -> Forces:
         """F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2."""
@@ -77,7 +77,7 @@ class Friction(nn.Module):
         zero = torch.zeros_like(minus)
         return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero)
 
-    def _applied(self, u: Tensor) -> Tensor:
+    def applied(self, u: Tensor) -> Tensor:
         """G u, (..., n)."""
         if not self.inputs or u.shape[-1:] != (self.inputs,):
             raise InputError(f"u needs shape (..., {self.inputs}), got {tuple(u.shape)}")

@@ -119,7 +119,7 @@ class Leapfrog:
         if u is None:
             return None
         assert self.model.friction is not None  # a model with inputs is a forced one
-        return self.model.friction._applied(u)
+        return self.model.friction.applied(u)
 
 
 def leapfrog(L_d: DiscreteLagrangian) -> Leapfrog | None:

@@ -22,18 +22,9 @@ from herglotz.stepping.state import (
     StepError,
     check_h,
     check_state,
-    failure_message,
     step_sizes,
     throw_failure,
 )
-
-_failure_message = failure_message  # the names that sibling steppers import
-
-
-def _checked(state: State, h: Tensor | float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    q, p, s = check_state(state)
-    return q, p, s, check_h(h, q)
-
 
 __all__ = ["Crossings", "Rollout", "State", "Step", "StepError", "Stepper", "step_sizes"]
 
