@@ -11,6 +11,8 @@ from torch import Tensor
 
 from herglotz.training.distributed import everywhere, of_first
 
+ROUNDING = 1e-11  # a change of the cost below this, relative, is the rounding of a long sum
+
 
 class LeastSquares(Protocol):
     """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, so that they may work in chunks."""
@@ -58,7 +60,8 @@ def levenberg_marquardt(
     max_iterations
         Bound on accepted and rejected steps together.
     rtol, patience
-        Stop after `patience` accepted steps in a row that each lower the cost by less than `rtol` relative.
+        Stop after `patience` accepted steps in a row that each lower the cost by less than `rtol` relative. A step
+        that changes it by rounding only is not taken and counts as one of them.
     callback
         Called with (iteration, cost, x) after each iteration.
 
@@ -73,12 +76,17 @@ def levenberg_marquardt(
         return OptimiserResult(x, best, "not_finite", 0)
     scale = A.diagonal().clone()
     damping, growth, quiet = 1e-3, 2.0, 0
+    rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     history, reason, iteration = [best], "max_iterations", 0
     for iteration in range(1, max_iterations + 1):
         step = _damped_step(A, b, damping * _floored(scale))
         new = of_first(problem.cost(x + step))[0] if step is not None else None
         predicted = 0.0 if step is None else float(-(b @ step) - 0.5 * step @ (A @ step))
-        if step is not None and new is not None and bool(torch.isfinite(new)) and float(new) < best and predicted > 0:
+        if new is not None and abs(best - float(new)) <= rounding * best:
+            # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
+            quiet += 1
+            damping, growth = damping * growth, growth * 2
+        elif step is not None and new is not None and bool(torch.isfinite(new)) and float(new) < best and predicted > 0:
             gain = (best - float(new)) / predicted
             quiet = quiet + 1 if best - float(new) <= rtol * best else 0
             x = x + step

@@ -31,7 +31,7 @@ with process_group():
         )
         run = fit(data, settings, progress=False)
         found[objective] = torch.nn.utils.parameters_to_vector(run.model.parameters()).detach()
-        found[objective + " cost"] = torch.tensor([row["cost"] for row in run.history])
+        found[objective + " cost"] = torch.tensor([row["cost"] for row in run.history], dtype=torch.float64)
     if is_first():
         torch.save(found, sys.argv[1])
 """
