@@ -22,6 +22,7 @@ from herglotz.training.run import Run
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
 BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
+MARGIN = 1.05  # an error lower by less than this factor is no reason for a richer level
 TIMED_STEPS = 20
 
 
@@ -115,8 +116,10 @@ def select(
 
     The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. A level
     is beaten if the best level's score is lower beyond the spread of either kind: the standard error over blocks of the
-    difference of their squared errors (median seed), and the best level's own range over seeds. The first level of the
-    ladder that is not beaten is chosen.
+    difference of their squared errors (median seed; the one-standard-error rule of Breiman et al. 1984), and the best
+    level's own range over seeds. An error lower by less than a twentieth beats nothing, however certain: a parameter
+    near zero changes every block a little. The first level of the ladder that is not beaten is
+    chosen.
 
     Parameters
     ----------
@@ -181,7 +184,7 @@ def _simplest(candidates: list[Candidate]) -> Candidate:
         raise InputError("no level predicts the held-out part: every free run failed; check the data and their step")
     own = best.errors[int(best.of_seeds.argsort()[(len(best.runs) - 1) // 2])]
     for candidate in candidates:
-        if candidate is best or candidate.error <= float(best.of_seeds.max()):
+        if candidate is best or candidate.error <= max(MARGIN * best.error, float(best.of_seeds.max())):
             return candidate
         theirs = candidate.errors[int(candidate.of_seeds.argsort()[(len(candidate.runs) - 1) // 2])]
         difference = theirs.square() - own.square()

@@ -33,6 +33,8 @@ def candidate(level, *seeds):
         ([candidate("linear", [9.0, 9.5, 9.1]), candidate("affine", [1.0, 1.1, 0.9])], "affine"),
         # fails if the best level's range over seeds does not count
         ([candidate("linear", [2.0] * 3), candidate("affine", [1.0] * 3, [2.1] * 3, [1.1] * 3)], "linear"),
+        # fails if a tiny advantage in every block counts as being beaten
+        ([candidate("linear", [1.002, 1.202, 0.902]), candidate("forced", [1.0, 1.2, 0.9])], "linear"),
         # fails if a level whose free run failed can be chosen, or spoils the comparison
         ([candidate("linear", [math.inf] * 3), candidate("affine", [1.0] * 3)], "affine"),
         ([candidate("linear", [1.0] * 3), candidate("affine", [math.inf] * 3)], "linear"),
