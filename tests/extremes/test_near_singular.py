@@ -10,6 +10,7 @@ from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.stepping import ContactSplitting, State, Status, Stepper, explain_step
 from herglotz.systems import scene
+from herglotz.tune import local_errors
 
 TINY = 1e-300  # stands for no damping in scenes whose s-derivative must exist
 
@@ -111,6 +112,24 @@ def test_kepler_at_e_099_needs_steps_that_follow_the_radius():
     equal, wrong, _ = kepler(e, torch.full((steps,), 2 * math.pi / steps, dtype=torch.float64))
     assert bool(equal.ok.all())
     assert wrong > 1e3 * energy
+
+
+def test_equal_steps_over_the_pericentre_are_found_by_half_steps():
+    # fails if a motion that is finite, converged and wrong by orders passes the one check there is for it
+    e, steps = 0.99, 800
+    planet = scene("kepler", gamma=TINY)
+    zero = torch.zeros(1, 2, dtype=torch.float64)
+    splitting = ContactSplitting(lambda q: planet.hamiltonian(q, zero, zero[:, 0]), 1.0, 0.0, force=_attraction)
+    found = {}
+    anomaly = torch.linspace(0, 2 * math.pi, steps + 1, dtype=torch.float64)
+    for name, h in {
+        "equal": torch.full((steps,), 2 * math.pi / steps, dtype=torch.float64),
+        "radius": (anomaly - e * torch.sin(anomaly)).diff(),
+    }.items():
+        out, _, _ = kepler(e, h)
+        found[name] = float(local_errors(splitting, out, h).max())
+    assert found["equal"] > 0.5
+    assert found["radius"] < 0.05
 
 
 def test_kepler_at_e_099_is_refused_by_the_reference_flow_in_one_step():

@@ -8,7 +8,9 @@ import torch
 
 from herglotz.cli import main
 from herglotz.data import simulate
+from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata
+from herglotz.export.c_wrapper import compiler
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
 from herglotz.training import FitConfig, fit, load_run, save_run
@@ -82,11 +84,34 @@ def test_command_writes_a_run_that_exports(pendulum_run, tmp_path, capsys):
     assert load_run(out).h == pytest.approx(0.1)
 
 
+def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
+    # fails if kicks are not among the settings, their header is not the chosen step, or the folder is no run
+    try:
+        compiler()
+    except InputError as error:
+        pytest.skip(str(error))
+    out = tmp_path / "fast"
+    options = ["--widths", "none", "--multiples", "1,4", "--starts", "59", "--json"]
+    command = ["tune", str(pendulum_run), "--out", str(out), *options]
+    assert main([*command, "--max-error", "1e-3", "--kicks", "3", "--iterations", "30"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    chosen = found["chosen"]
+    assert (chosen["kicks"], chosen["multiple"]) == (3, 4)
+    assert chosen["error_bound"] <= 1e-3
+    assert found["held_out"]["share_within"] >= 0.95
+    assert f"h = {chosen['h']!r}" in (out / "kicks.h").read_text()
+    assert load_run(out).h == pytest.approx(0.1)
+    # a choice without kicks leaves none behind
+    assert main([*command, "--kicks", "none", "--max-error", "1"]) == 0
+    assert not (out / "kicks.h").exists()
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
         ([], "either --max-error or --budget-us"),
         (["--max-error", "1e-3", "--widths", "8.5"], "--widths needs whole numbers"),
+        (["--max-error", "1e-3", "--kicks", "2.5"], "--kicks needs whole numbers"),
         (["--max-error", "1e-3", "--multiples", "a"], "--multiples needs numbers"),
         (["--max-error", "1e-3", "--starts", "9"], "take 59 or more"),
     ],

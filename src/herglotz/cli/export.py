@@ -15,8 +15,8 @@ Write the model of a run as one file; every format checks its own steps and repo
 
   pt2   graphs of PyTorch operations: one differentiable step, K steps, and a start from two positions. Any batch
         size, any step; torch.export.load(FILE).module() needs no herglotz
-  onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch
-  aoti  K steps compiled to machine code (needs g++ or clang++, about a minute): the fastest batches
+  onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch; a start from two positions in its metadata
+  aoti  K steps and a start compiled to machine code (needs g++ or clang++, one or two minutes): fast batches
   c     one C99 header that steps with <math.h> alone: the fastest single steps
 
 examples:

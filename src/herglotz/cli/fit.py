@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from herglotz.training import Run
 
 # Copies, so that help does not import PyTorch; a test compares them.
+SUPERVISION = ("q", "qs", "qps")
+ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
 OPTIMISERS = ("lm", "adam")
@@ -37,9 +39,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument(
-        "--level", choices=LEVELS, default="linear",
-        help="conservative: no damping. linear: one damping rate. affine: damping depends on position and velocity. "
-        "full: on s as well. forced: one rate, and friction of each joint (default %(default)s)",
+        "--level", choices=("auto", *LEVELS), default="auto",
+        help="auto: forced with dry friction where inputs u are recorded, else linear. conservative: no damping. "
+        "linear: one damping rate. affine: damping depends on position and velocity. full: on s as well. forced: one "
+        "rate, and friction of each joint (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",
@@ -53,6 +56,44 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--train-fraction", type=finite, default=0.667, metavar="F",
         help="part of every trajectory, in time, to train on, 0 < F <= 1 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--robust", choices=ROBUST, default="auto",
+        help="a loss that outliers cannot pull, and spikes left out. auto: where the data show outliers "
+        "(default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--supervision", choices=SUPERVISION, default="q",
+        help="what the one-step objective is fitted to: positions, s beside them, or momenta as well, where they are "
+        "recorded (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--restarts", type=count, default=1, metavar="R",
+        help="one-step fits from so many draws of the weights, the best kept (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--every", type=count, default=1, metavar="M",
+        help="use every M-th sample only; inputs are averaged over the steps (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--ignore-inputs", action="store_true", help="fit as if no input u were recorded")
+    parser.add_argument(
+        "--input-map", type=finite, nargs="+", default=(), metavar="G",
+        help="the map from inputs to forces, row by row, where it is known (default: learned); the first mass is 1",
+    )  # fmt: skip
+    parser.add_argument(
+        "--feature", action="append", default=[], metavar="TEXT",
+        help="what L may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2', or a list by name "
+        "(chain, sites, central, pendulums, harmonics); may be given again",
+    )  # fmt: skip
+    parser.add_argument(
+        "--known", action="append", default=[], metavar="TEXT",
+        help="what is known of L, with its numbers (the first mass is 1): '9.81 cos(q1)'; may be given again",
+    )  # fmt: skip
+    parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
+    parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
+    parser.add_argument(
+        "--order", type=int, choices=(2, 4), default=2,
+        help="of the rule; 4: from the features alone, without networks (default %(default)s)",
     )  # fmt: skip
     parser.add_argument("--seed", type=count, default=0, help="of the initial weights (default %(default)s)")
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
@@ -80,8 +121,12 @@ def run(arguments: argparse.Namespace) -> int:
     config = FitConfig(
         level=arguments.level, objective=arguments.objective, optimiser=arguments.optimiser,
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
+        robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts,
+        use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
+        features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
+        coupled=arguments.coupled, order=arguments.order,
     )  # fmt: skip
-    data = load(arguments.data, angles=parse_angles(arguments.angles))
+    data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)
     try:
         save_run(fit(data, config, out=out, resume=arguments.resume), out)

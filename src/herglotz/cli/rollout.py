@@ -5,13 +5,16 @@ from __future__ import annotations
 import argparse
 import time
 from dataclasses import dataclass
+from inspect import signature
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from herglotz.export import CompiledStepper, ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
 
@@ -21,6 +24,7 @@ trained on, or from --q0 and --p0. The model's mass is 1 (first coordinate), so 
 
 examples:
   herglotz rollout runs/pendulum --steps 200 --out future.csv
+  herglotz rollout runs/driven --steps 200 --inputs torque.csv --out motion.csv
   herglotz rollout pendulum.pt2 --steps 200 --h 0.05 --q0 1.2 --p0 0 --out motion.csv
 """
 
@@ -59,6 +63,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--trajectory", type=count, default=0, metavar="B",
         help="trajectory of the run whose last fitted state to start from, counted from 0 (default %(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--u", type=finite, nargs="+", metavar="U",
+        help="constant input of a driven model, one number an input (default: no input acts)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--inputs", type=Path, metavar="FILE",
+        help="recorded motion whose inputs u drive the model: its first K samples, at their own steps unless --h",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print a summary as JSON")
     parser.set_defaults(run=run)
 
@@ -77,14 +89,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     source = read_source(arguments.source, arguments.trajectory)
     start, t0 = _start(arguments, source)
-    h = source.h if arguments.h is None else arguments.h
+    u, h = _inputs(arguments, source, start.q.dtype)
     began = time.perf_counter()
     with torch.no_grad():
-        found = source.stepper.rollout(*start, h=h, steps=arguments.steps)
+        found = source.stepper.rollout(*start, h=h, steps=arguments.steps, **u)
     seconds = time.perf_counter() - began
+    h_all = h.double() if isinstance(h, torch.Tensor) else torch.full((arguments.steps,), h, dtype=torch.float64)
+    h = float(h_all.mean())
     _check(found, h)
     motion = Trajectories.of(
-        t0 + h * torch.arange(arguments.steps + 1, dtype=torch.float64), found.q.double(), names=source.names,
+        t0 + torch.cat([h_all.new_zeros(1), h_all.cumsum(0)]), found.q.double(), names=source.names,
         units=source.units, angles=source.angles, s=found.s.double(), p=found.p.double(), time_unit=source.time_unit,
         source=str(arguments.source),
     )  # fmt: skip
@@ -159,6 +173,33 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
     dtype = getattr(source.stepper, "dtype", None) or (torch.float64 if like is None else like.q.dtype)
     values = (arguments.q0, arguments.p0, arguments.s0 or 0.0)
     return State(*(torch.tensor(x, dtype=dtype) for x in values)), 0.0
+
+
+def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -> tuple[dict[str, Any], Any]:
+    """The keyword that hands the inputs to `rollout`, and the steps: one size, or the recorded ones, (K,)."""
+    import torch
+
+    from herglotz.data import load
+
+    h = source.h if arguments.h is None else arguments.h
+    if arguments.u is None and arguments.inputs is None:
+        return {}, h
+    if arguments.u is not None and arguments.inputs is not None:
+        raise InputError("--u and --inputs both give the inputs; leave one out")
+    steps = arguments.steps
+    recorded_at: Path | None = arguments.inputs
+    if recorded_at is None:
+        u = torch.tensor(arguments.u, dtype=dtype).expand(steps, -1)
+    else:
+        recorded = load(recorded_at)[0]
+        if recorded.u is None:
+            raise InputError(f"--inputs {arguments.inputs}: holds no inputs; name their columns u, u_* or torque")
+        if recorded.samples <= steps:
+            raise InputError(f"--inputs {arguments.inputs}: {steps} steps need more than {recorded.samples} samples")
+        u = recorded.u[:steps].to(dtype)
+        h = recorded.t.diff()[:steps].to(dtype) if arguments.h is None else h
+    name = "inputs" if "inputs" in signature(source.stepper.rollout).parameters else "u"
+    return {name: u}, h
 
 
 def _check(found: Rollout, h: float) -> None:

@@ -28,8 +28,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument(
         "--levels",
-        default=",".join(level for level in LEVELS if level != "full"),
-        help="levels to compare, with commas (default %(default)s)",
+        help=f"levels to compare, with commas, of {', '.join(LEVELS)} (default: all but full; with recorded inputs u: "
+        "forced)",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     parser.add_argument("--seed", type=count, default=0, help="the first of them (default %(default)s)")
@@ -60,7 +60,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     data = load(arguments.data, angles=parse_angles(arguments.angles))
     config = FitConfig(train_fraction=arguments.train_fraction, seed=arguments.seed)
-    levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
+    levels = None
+    if arguments.levels is not None:
+        levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
     found = select(data, levels, arguments.seeds, config, out=out, resume=arguments.resume)
     save_run(found.run, out)
     write_atomically(out / "selection.json", found.to_json().encode())

@@ -19,6 +19,7 @@ Draws bands.png in RUN.
 examples:
   herglotz trust runs/pendulum
   herglotz trust runs/pendulum --level 0.95 --json
+  herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 PHYSICAL = ("kinetic.", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag", "force")
@@ -28,6 +29,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("trust", help="how far to trust a run", description=DESCRIPTION)
     parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
+    parser.add_argument(
+        "--with", dest="others", type=Path, nargs="+", default=[], metavar="RUN",
+        help="fits of the same data from other seeds: bands of the ensemble instead of one run's",
+    )  # fmt: skip
     parser.add_argument("--level", type=finite, default=0.9, help="of the bands, in (0, 1) (default %(default)s)")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for bands.png (default: RUN)")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
@@ -36,7 +41,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, draw, report."""
-    from herglotz.training import laplace, load_run
+    from herglotz.training import ensemble_bands, laplace, load_run
 
     result = load_run(arguments.source)
     folder = arguments.out or arguments.source
@@ -46,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.plots.motion import trained_mask
 
     posterior = laplace(result)
-    bands = posterior.bands()
+    bands = ensemble_bands([result, *map(load_run, arguments.others)]) if arguments.others else posterior.bands()
     inside = bands.inside(result.data.unwrapped().q, arguments.level)
     held = ~trained_mask(result)
     numbers: dict[str, Any] = {

@@ -13,14 +13,18 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     from herglotz.tune import Tuning
 
+KICKS = "kicks.h"
+
 DESCRIPTION = """\
 Trade speed for accuracy: measure the error and the cost of stepping RUN at several steps, with its own model and with
-big-step corrections re-trained on motions of that model, in PyTorch and in C, in float64 and float32; then take the
-cheapest setting within an error, or the most accurate one within a budget.
+big-step corrections re-trained on motions of that model, in PyTorch and in C, in float64 and float32, and with large
+steps of a few learned kicks that solve nothing (one coordinate, one damping rate). Then take the cheapest setting
+within an error, or the most accurate one within a budget.
 
 The error is that of stepping: the largest departure of a position from the run's own motion over the horizon. 95 % of
 all starts keep the error quoted (with confidence 95 %); other starts than those that chose are counted to check it.
-FOLDER receives the tuned run (for `herglotz export`, `rollout`, ...), tuned.json and tuned.png.
+FOLDER receives the tuned run (for `herglotz export`, `rollout`, ...), tuned.json and tuned.png; where kicks win, their
+C header kicks.h and the run as it was.
 
 examples:
   herglotz tune runs/pendulum --max-error 1e-3
@@ -49,6 +53,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="hidden units of the re-trained corrections, with commas, or none (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
+        "--kicks", default="5,7", metavar="K",
+        help="kicks in a large step that solves nothing, with commas, or none; tried in C where the model has one "
+        "coordinate and one damping rate (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
         "--reference", choices=("own", "limit"), default="own",
         help="measure against the model at its own step, or as h goes to 0 (default %(default)s)",
     )  # fmt: skip
@@ -65,9 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.max_error is None) == (arguments.budget_us is None):
         raise InputError("say what you need: either --max-error or --budget-us")
     multiples = _numbers("--multiples", arguments.multiples)
-    widths = () if arguments.widths.strip() == "none" else _numbers("--widths", arguments.widths)
-    if any(not w.is_integer() for w in widths):
-        raise InputError(f"--widths needs whole numbers, got {arguments.widths}")
+    widths, kicks = _whole("--widths", arguments.widths), _whole("--kicks", arguments.kicks)
     out: Path = arguments.out or arguments.source / "tuned"
     check_output_folder(out)
     if (out / "model.pt").exists() and not (out / "tuned.json").exists():
@@ -77,11 +84,12 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.plots import save_figure
     from herglotz.plots.tuning import plot_tuning
     from herglotz.training import load_run, save_run
-    from herglotz.tune import TuneConfig, tune
+    from herglotz.tune import TuneConfig, export_kicks_c, tune
 
     config = TuneConfig(
         multiples=multiples,
-        widths=tuple(int(w) for w in widths),
+        widths=widths,
+        kicks=kicks,
         artefacts=("eager",) if arguments.no_c else ("eager", "c"),
         reference=arguments.reference,
         starts=arguments.starts,
@@ -93,6 +101,10 @@ def run(arguments: argparse.Namespace) -> int:
         horizon=arguments.horizon, config=config,
     )  # fmt: skip
     save_run(found.tuned_run(), out)
+    if found.chosen.kicks is not None:
+        export_kicks_c(found.chosen.kicks, out / KICKS, found.chosen.setting.dtype)
+    else:
+        (out / KICKS).unlink(missing_ok=True)
     write_atomically(out / "tuned.json", (json.dumps(found.to_dict(), indent=2) + "\n").encode())
     save_figure(plot_tuning(found), out / "tuned.png")
     if arguments.json:
@@ -107,6 +119,15 @@ def _numbers(name: str, text: str) -> tuple[float, ...]:
         return tuple(float(x) for x in text.split(","))
     except ValueError:
         raise InputError(f"{name} needs numbers with commas between them, got {text!r}") from None
+
+
+def _whole(name: str, text: str) -> tuple[int, ...]:
+    if text.strip() == "none":
+        return ()
+    numbers = _numbers(name, text)
+    if any(not x.is_integer() for x in numbers):
+        raise InputError(f"{name} needs whole numbers, got {text}")
+    return tuple(int(x) for x in numbers)
 
 
 def _report(found: Tuning, out: Path) -> None:
@@ -128,5 +149,10 @@ def _report(found: Tuning, out: Path) -> None:
     for note in found.notes:
         print(f"  {note}")
     print(f"Figure: {out / 'tuned.png'}")
+    if c.kicks is not None:
+        print(
+            f"Next: include {out / KICKS}, the step of {c.setting.kicks} kicks; {out} holds the model it was made from"
+        )
+        return
     form = "c" if c.setting.artefact == "c" else "pt2"
     print(f"Next: herglotz export {out} --format {form} --out stepper{'.h' if form == 'c' else '.pt2'}")

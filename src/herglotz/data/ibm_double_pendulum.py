@@ -11,7 +11,8 @@ from herglotz.data.rows import number
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-MARKERS = ("x_red", "y_red", "x_green", "y_green", "x_blue", "y_blue")  # pivot, elbow, tip; y points down
+# Pivot, elbow, tip. The first number of a pair grows downwards: the upper arm comes to rest along it in every run.
+MARKERS = ("x_red", "y_red", "x_green", "y_green", "x_blue", "y_blue")
 RATE = 400.0  # frames per second
 
 
@@ -21,8 +22,8 @@ def read_ibm_double_pendulum(path: PathLike, *, rate: float = RATE) -> Trajector
     Returns
     -------
     Trajectories
-        The absolute angles `theta1` (pivot to elbow) and `theta2` (elbow to tip), rad, 0 when hanging down, positive
-        towards +x, continuous from frame to frame; time in s.
+        The absolute angles `theta1` (pivot to elbow) and `theta2` (elbow to tip), rad, 0 when hanging down (along +x),
+        positive towards +y, continuous from frame to frame; time in s.
 
     Raises
     ------
@@ -53,7 +54,7 @@ def read_ibm_double_pendulum(path: PathLike, *, rate: float = RATE) -> Trajector
         raise InputError(f"{path}, row {at}: two markers lie on one point, so an arm has no angle; delete the row")
     return Trajectories.of(
         torch.arange(len(rows), dtype=torch.float64) / rate,
-        torch.atan2(arms[..., 0], arms[..., 1]),
+        torch.atan2(arms[..., 1], arms[..., 0]),
         names=("theta1", "theta2"),
         angles=(True, True),
         time_unit="s",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -60,6 +60,9 @@ def simulate(
 ) -> Trajectories:
     """Sample motions of a scene from uniform random initial positions and velocities and s = 0.
 
+    A scene with inputs is driven by its own, u(t) in the middle of a step held over that step, and they are stored;
+    beside a gap the mean of those that act in it.
+
     Everything is drawn and computed in float64 from one `torch.Generator`; `dtype` only converts the result.
 
     Raises
@@ -77,7 +80,10 @@ def simulate(
     shape = (trajectories, scene.dof)
     q0 = _uniform("q_range", scene.q_range if q_range is None else q_range, shape, generator)
     v0 = _uniform("v_range", scene.v_range if v_range is None else v_range, shape, generator)
-    q, p, s = _roll(scene, q0, v0, steps, h)
+    drive = getattr(scene, "drive", None)
+    middles = h * (torch.arange(steps + 1, dtype=torch.float64) + 0.5)
+    u = None if drive is None else drive(middles)  # (steps + 1, m)
+    q, p, s = _roll(scene, q0, v0, steps, h, u)
     q = q + noise * torch.randn(q.shape, generator=generator, dtype=q.dtype)
     keep = torch.stack([_kept(steps + 1, gaps, generator) for _ in range(trajectories)])  # (B, steps + 1) bool
     t = (h * torch.arange(steps + 1, dtype=torch.float64)).expand(trajectories, -1)
@@ -91,17 +97,20 @@ def simulate(
         time_unit=getattr(scene, "time_unit", "s"),
         source=f"simulate({scene.name}, h={h:g}, seed={seed})",
     )
+    if u is not None:
+        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]))
     return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
 
 
-def _roll(scene: Scene, q: Tensor, v: Tensor, steps: int, h: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Apply the flow `steps` times; return q, p (B, steps + 1, n) and s (B, steps + 1)."""
+def _roll(scene: Any, q: Tensor, v: Tensor, steps: int, h: float, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
+    """Apply the flow at each step's inputs (steps + 1, m); return q, p (B, steps + 1, n) and s (B, steps + 1)."""
     s = torch.zeros(len(q), dtype=q.dtype)
     p, step = scene.momentum(q, v, s), torch.tensor(h, dtype=q.dtype)
     states = [(q, p, s)]
     with torch.no_grad():
         for k in range(steps):
-            q, p, s = scene.flow(q, p, s, step)
+            now = scene if u is None else scene.at(u[k])
+            q, p, s = now.flow(q, p, s, step)
             bad = ~(torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s))
             if bad.any():
                 raise InputError(
@@ -111,6 +120,14 @@ def _roll(scene: Scene, q: Tensor, v: Tensor, steps: int, h: float) -> tuple[Ten
             states.append((q, p, s))
     qs, ps, ss = zip(*states, strict=True)
     return torch.stack(qs, 1), torch.stack(ps, 1), torch.stack(ss, 1)
+
+
+def _mean_inputs(u: Tensor, keep: Tensor) -> Tensor:
+    """The inputs (steps + 1, m) from each kept sample to the next, averaged; that of the last sample as it is."""
+    at = keep.nonzero()[:, 0]
+    total = torch.cat([torch.zeros_like(u[:1]), u.cumsum(0)])
+    means = (total[at[1:]] - total[at[:-1]]) / (at[1:] - at[:-1])[:, None]
+    return torch.cat([means, u[at[-1:]]])
 
 
 def _kept(samples: int, gaps: int, generator: torch.Generator) -> Tensor:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, check
 from herglotz.data.splits import check_alike, time_split, trajectory_split
+from herglotz.data.thinning import thinned
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
 
@@ -153,6 +154,10 @@ class Trajectories:
         """Draw `round(fraction * B)` whole trajectories for training; the others test."""
         train, test = trajectory_split(len(self), fraction, generator, self.source)
         return self.select(train), self.select(test)
+
+    def thinned(self, every: int) -> Trajectories:
+        """Return every `every`-th sample of each trajectory, with inputs averaged over the steps they then span."""
+        return thinned(self, every)
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""

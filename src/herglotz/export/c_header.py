@@ -113,6 +113,7 @@ def export_c(
     name: str = "herglotz_stepper",
     dtype: str = "float64",
     h_range: tuple[float, float] | None = None,
+    tolerance: float | None = None,
     metadata: Mapping[str, Any] | None = None,
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
@@ -138,6 +139,9 @@ def export_c(
         "float64" (C double) or "float32" (C float).
     h_range
         Smallest and largest step the model was fitted for: steps outside are flagged in the status. Default: any h > 0.
+    tolerance
+        Of Newton, relative to the size of q: where the model is no more exact than this, fewer iterations serve as
+        well. Default: 16 machine epsilons.
     metadata
         Further JSON-ready entries for the comment at the top.
 
@@ -152,7 +156,7 @@ def export_c(
         If an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
-    entries = _entries(model, h, box, units, name, dtype, h_range, metadata or {})
+    entries = _entries(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
     write_atomically(path, c_source(model, entries, path.name).encode())
     return path
 
@@ -230,6 +234,7 @@ def _entries(
     name: str,
     dtype: str,
     h_range: tuple[float, float] | None,
+    tolerance: float | None,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
@@ -242,7 +247,10 @@ def _entries(
     bad = [key for key, value in model.state_dict().items() if not bool(torch.isfinite(value.to(torch_dtype)).all())]
     if bad:
         raise InputError(f"{', '.join(bad)} hold values that are not finite in {dtype}; train the model again")
-    entries |= {"name": name, "dtype": dtype, "newton_tolerance": TOLERANCE * torch.finfo(torch_dtype).eps}
+    least = TOLERANCE * torch.finfo(torch_dtype).eps
+    if tolerance is not None and not least <= tolerance < 1:
+        raise InputError(f"tolerance must be at least {least:.2g} in {dtype} and below 1, got {tolerance:g}")
+    entries |= {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
     return entries
 
 

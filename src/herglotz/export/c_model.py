@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.export.c_action import ACTION, ACTION_LEGENDRE_PLUS
 from herglotz.export.c_equation import CONSTANT_MASS, EVALUATION, LEGENDRE_PLUS, POSITION_MASS, TYPES
+from herglotz.export.c_features import check_terms, feature_lines
 from herglotz.export.c_jet import JETS, KINETIC
 from herglotz.export.c_network import network, weights
 from herglotz.export.c_solver import LEAPFROG
@@ -121,6 +122,7 @@ static inline void NAME_chain(const NAME_phase *f, real h, int order, const real
 
 def flags_of(model: ContactLagrangian) -> dict[str, bool]:
     """Which parts of the templates a model needs."""
+    check_terms(model)
     damping, friction = model.damping, model.friction
     affine, full = isinstance(damping, AffineDamping), model.action is not None
     damping_network = isinstance(damping, AffineDamping) and damping.network is not None
@@ -198,6 +200,7 @@ def _constants(model: ContactLagrangian, dtype: str) -> str:
     owner = [i for i, angle in enumerate(config.angles) for _ in range(2 if angle else 1)]
     angle = [float(config.angles[i]) for i in owner]
     kinetic = model.kinetic if isinstance(model.kinetic, Kinetic) else model.kinetic.constant
+    assert isinstance(kinetic, Kinetic)
     mass = kinetic.mass().detach().cpu().double()
     rate = 0.0 if damping is None else float(damping.rate)
     lines = [
@@ -268,8 +271,11 @@ def _friction_constants(friction: Friction) -> dict[str, Tensor]:
     vectors: dict[str, Tensor] = {"viscous": friction.viscous}
     if friction.dry:
         vectors |= {"coulomb": friction.coulomb, "breakaway": friction.breakaway}
-        vectors |= {"per_smooth": (-friction.log_smooth).exp(), "per_stribeck": (-friction.log_stribeck).exp()}
-    return {**vectors, "input_map": friction.input_map} if friction.inputs else vectors
+        smooth, stribeck = friction.widths
+        vectors |= {"per_smooth": 1 / smooth, "per_stribeck": 1 / stribeck}
+    if friction.inputs:
+        vectors |= {"input_map": friction.input_map, "input_offset": friction.offset()}
+    return vectors
 
 
 def _position_features(model: ContactLagrangian, dtype: str) -> str:
@@ -301,6 +307,8 @@ def _baseline(model: ContactLagrangian, dtype: str) -> str:
             lines.append(f"V->value += ({k} * q[{i}] / R(2.0) + {b}) * q[{i}];")
             lines.append(f"V->slope[{i}] = {k} * q[{i}] + {b};")
         f += 2 if angle else 1
+    if model.potential.features is not None:
+        lines += feature_lines(model.potential.features, dtype)
     return _indented(lines).rstrip("\n")
 
 

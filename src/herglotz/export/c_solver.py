@@ -231,11 +231,13 @@ static inline void NAME_track_start(const NAME_state *state, NAME_track *track) 
 }
 
 {%if inputs}
-/* G u; no inputs where u is null. */
+/* G (u - u0); no inputs where u is null. */
 static inline void NAME_push(const real *u, real push[NAME_N]) {
   int i, j;
-  for (i = 0; i < NAME_N; i++)
-    for (push[i] = R(0.0), j = 0; u && j < NAME_M; j++) push[i] += NAME_input_map[i * NAME_M + j] * u[j];
+  for (i = 0; i < NAME_N; i++) {
+    push[i] = u ? NAME_input_offset[i] : R(0.0);
+    for (j = 0; u && j < NAME_M; j++) push[i] += NAME_input_map[i * NAME_M + j] * u[j];
+  }
 }
 {%end}
 

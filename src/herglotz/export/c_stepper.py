@@ -253,6 +253,7 @@ def compile_c(
     box: Mapping[str, Sequence[float]] | None = None,
     units: Sequence[str] = (),
     dtype: str | None = None,
+    tolerance: float | None = None,
 ) -> CompiledStepper:
     """Compile a header that `export_c` wrote, or a model directly, and load it.
 
@@ -263,7 +264,7 @@ def compile_c(
     ----------
     source
         A header, or a model.
-    h, box, units, dtype
+    h, box, units, dtype, tolerance
         As in `export_c`, for a model only; dtype defaults to the model's.
 
     Returns
@@ -280,5 +281,5 @@ def compile_c(
         return load_c(source)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
     with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        path = export_c(source, Path(folder, "stepper.h"), h=h, box=box, units=units, dtype=dtype)
+        path = export_c(source, Path(folder, "stepper.h"), h=h, box=box, units=units, dtype=dtype, tolerance=tolerance)
         return CompiledStepper(path.read_text(), "compiled model")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from inspect import signature
 from typing import Any
 
 import torch
@@ -27,7 +28,8 @@ def compare(
 ) -> dict[str, Any]:
     """Largest difference between two rollouts from the same starts, relative to the largest eager value.
 
-    Each rollout feeds its own states back, so that a difference grows as it would in use.
+    Each rollout feeds its own states back, so that a difference grows as it would in use. A model with inputs is driven
+    by uniform random ones in [−1, 1].
 
     Parameters
     ----------
@@ -55,6 +57,8 @@ def compare(
         raise InputError(f"batches must be sizes >= 1, got {list(batches)}")
     size_of_step = float(exported.h) if h is None else h
     make = torch.Generator().manual_seed(seed)
+    inputs = getattr(stepper.L_d, "inputs", 0)
+    name = "inputs" if "inputs" in signature(exported.rollout).parameters else "u"
     per_batch = {}
     for size in batches:
         few = min(size, DISTINCT)
@@ -63,8 +67,13 @@ def compare(
         if size > few:
             order = torch.cat([order, torch.randint(few, (size - few,), generator=make)])
         with torch.no_grad():
-            ours = exported.rollout(*(x[order] for x in start), h=size_of_step, steps=steps)
-            eager = stepper.rollout(*start, h=size_of_step, steps=steps)
+            driven: dict[str, Any] = {}
+            driven_eager: dict[str, Any] = {}
+            if inputs:
+                u = 2 * torch.rand(few, steps, inputs, generator=make, dtype=torch.float64).to(start[0]) - 1
+                driven, driven_eager = {name: u[order]}, {"inputs": u}
+            ours = exported.rollout(*(x[order] for x in start), h=size_of_step, steps=steps, **driven)
+            eager = stepper.rollout(*start, h=size_of_step, steps=steps, **driven_eager)
         per_batch[int(size)] = _difference(ours, eager, order)
     worst: dict[str, Any] = {key: max(one[key] for one in per_batch.values()) for key in ("q", "p", "s", "c")}
     totals = {key: sum(one[key] for one in per_batch.values()) for key in ("status", "failed")}

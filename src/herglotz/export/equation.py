@@ -1,4 +1,4 @@
-"""The step equation of a model and its first derivatives as plain functions of tensors, for tracing."""
+"""The step equation of a model as plain functions of tensors, for tracing: nothing in them differentiates."""
 
 from __future__ import annotations
 
@@ -12,32 +12,70 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.export.trace import Graph, example_batch, traced
-from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
+from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
+from herglotz.stepping.field import Field, FieldOf
 
-LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs; the others are slopes
+LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs
+# Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
+# u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
+
+
+class Terms:
+    """The step equation at (q0, p0, s0, h): by terms where `model_equation` knows the model, else by jets."""
+
+    def __init__(self, model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, more: tuple[Tensor, ...]):
+        maker = model_equation(model, fold=False)
+        here, u = (more[:2], more[2:]) if maker is not None else ((), more)
+        self.equation: StepOfModel | PartialsEquation
+        if maker is None:
+            L_d: Any = model.at(*u) if u else model
+            self.equation = PartialsEquation(L_d, q, p, s, h, 1, increments=True)
+        else:
+            self.equation = maker.at(q, p, s, h, u[0] if u else None, True, Field(*here))
+
+    @property
+    def whole(self) -> bool:
+        """Whether what a step gains is known at evaluated points only."""
+        return isinstance(self.equation, PartialsEquation)
+
+    def __call__(self, x: Tensor, second: bool) -> Point:
+        """F, and J if `second`, at Δ = x."""
+        return self.equation(x, second)
+
+    def gained(self, x: Tensor, point: Point) -> End:
+        """p1, L and c at Δ = x, without what the potential at q1 adds to them; `point` may be beside it by very little.
+
+        The kinetic term, which changes fastest, is taken at x.
+        """
+        form = self.equation
+        return form.end(x, point) if isinstance(form, PartialsEquation) else form.end_without_field(form.at(x, point))
+
+    def leap(self, q: Tensor) -> Tensor:
+        """A first guess of Δ."""
+        return torch.zeros_like(q) if isinstance(self.equation, PartialsEquation) else self.equation.leap()
+
+    def kinetic(self, x: Tensor) -> Tensor:
+        """J⁻¹ x with the kinetic part of J alone."""
+        assert isinstance(self.equation, StepOfModel)
+        return self.equation.over_kinetic(x)
 
 
 class StepEquation(nn.Module):
-    """F(Δ) = D1 L_d + c p0 at a trial increment Δ = q1 − q0, with a Newton step; nothing in it differentiates.
-
-    Parameters
-    ----------
-    model
-        The discrete Lagrangian; not copied.
-    """
+    """One iteration: a Newton step from a trial Δ, and what the step gains there."""
 
     def __init__(self, model: ContactLagrangian):
         super().__init__()
         self.model = model
 
-    def forward(self, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> tuple[Tensor, ...]:
-        """−J⁻¹F (B, n), |J⁻¹cp0| and |F| (B,), p1 (B, n), L_d, c (B,), then J, ∂p1/∂q1 (B, n, n), ∂c/∂q1 (B, n)."""
-        P = _partials(self.model, q0, delta, s0, h, u, 2)
-        F, J = momentum_residual(P, p0), momentum_jacobian(P, p0)
-        move, size = eliminate(J, torch.stack([F, P.c[..., None] * p0], -1)).unbind(-1)
-        slopes = (J, P.D22 if P.force is None else P.D22 + P.force.plus_2, P.D23)
-        return tuple(dense(x) for x in (-move, length(size), length(F), momentum_plus(P), P.L, P.c, *slopes))
+    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
+        """−J⁻¹F (B, n), |J⁻¹cp0| and |F| (B,), p1 (B, n), L, c (B,), then J (B, n, n)."""
+        terms = Terms(self.model, q, p, s, h, more)
+        point = terms(delta, True)
+        assert point.J is not None
+        move, size = eliminate(point.J, torch.stack([point.F, terms.equation.push(point)], -1)).unbind(-1)
+        gained = terms.gained(delta, point)
+        return tuple(dense(x) for x in (-move, length(size), length(point.F), *gained[:3], point.J))
 
 
 class FirstOrder(nn.Module):
@@ -47,10 +85,24 @@ class FirstOrder(nn.Module):
         super().__init__()
         self.model = model
 
-    def forward(self, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> tuple[Tensor, ...]:
-        """F (B, n), p1 (B, n), L_d (B,), c (B,), D2 L_d (B, n)."""
-        P = _partials(self.model, q0, delta, s0, h, u, 1)
-        return tuple(dense(x) for x in (momentum_residual(P, p0), momentum_plus(P), P.L, P.c, P.D2))
+    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
+        """F, p1 (B, n), L, c (B,)."""
+        terms = Terms(self.model, q, p, s, h, more)
+        point = terms(delta, False)
+        return tuple(dense(x) for x in (point.F, *terms.gained(delta, point)[:3]))
+
+
+class FieldAt(nn.Module):
+    """V and V′ at a position."""
+
+    def __init__(self, model: ContactLagrangian):
+        super().__init__()
+        self.model = model
+
+    def forward(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """V (B,) and V′ (B, n)."""
+        V, slope = FieldOf(self.model.potential)(q)
+        return dense(V), dense(slope)
 
 
 @dataclass(frozen=True)
@@ -65,8 +117,15 @@ class Equations:
         return model if isinstance(model, Equations) else cls(copy.deepcopy(model).eval().requires_grad_(False))
 
     @cached_property
+    def field(self) -> Graph | None:
+        """`FieldAt`, where steps hand the potential on."""
+        if model_equation(self.model) is None:
+            return None
+        return traced(FieldAt(self.model), example(self.model, 0.1)[:1])
+
+    @cached_property
     def newton(self) -> Graph:
-        """`StepEquation` without slopes."""
+        """`StepEquation` without J."""
         return self.slopes.first(LEAN)
 
     @cached_property
@@ -81,7 +140,15 @@ class Equations:
 
     def _traced(self, module: nn.Module) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)
-        return traced(module, (q, p, s, h, 0.1 * p, *u))
+        return traced(module, (q, p, s, h, 0.1 * p, *self._here(q), *u))
+
+    def _here(self, q: Tensor) -> tuple[Tensor, ...]:
+        return () if model_equation(self.model) is None else _field_like(q)
+
+
+def _field_like(q: Tensor) -> tuple[Tensor, Tensor]:
+    """Stand-ins for V and V′ at q."""
+    return 0.3 * q.sum(-1), 0.3 * q
 
 
 def input_count(model: ContactLagrangian) -> int:
@@ -89,12 +156,16 @@ def input_count(model: ContactLagrangian) -> int:
     return int(getattr(model.config, "inputs", 0) or 0)
 
 
-def _partials(
-    model: ContactLagrangian, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, u: tuple[Tensor, ...], order: int
-) -> Partials:
-    """The closed-form partials, at the input u where the model takes one."""
-    at: Any = model.at(*u) if u else model
-    return at.partials_increment(q0, delta, s0, h, order=order)
+def inverse(J: Tensor) -> Tensor:
+    """J⁻¹ by Gauss and Jordan without row exchanges: a few whole-matrix operations for each of the n pivots."""
+    n = J.shape[-1]
+    eye = torch.eye(n, dtype=J.dtype, device=J.device)
+    for k in range(n):
+        column = J[..., k]
+        cleared = J * (1 - eye[k]) + eye[k][:, None] * eye[k]  # column k becomes that of the unit matrix
+        row = cleared[..., k, :] / column[..., k : k + 1]
+        J = cleared - (column - eye[k])[..., :, None] * row[..., None, :]
+    return J
 
 
 def eliminate(A: Tensor, b: Tensor) -> Tensor:

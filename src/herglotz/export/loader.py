@@ -13,9 +13,9 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
+from herglotz.export.box import Box
 from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
 from herglotz.export.metadata import METADATA, from_json
-from herglotz.export.module import Box
 from herglotz.export.pt2 import quiet
 from herglotz.stepping import Rollout, State, Step, step_sizes
 
@@ -249,13 +249,13 @@ def _is_compiled(content: bytes) -> bool:
 
 
 def _load_aoti(path: PathLike) -> ExportedStepper:
-    import torch._inductor
+    from torch._inductor.package.package import load_package
 
-    from herglotz.export.aoti import KEY
+    from herglotz.export.aoti import INIT, KEY, ROLLOUT
 
-    package = torch._inductor.aoti_load_package(str(path))
+    package, init = (load_package(str(path), name) for name in (ROLLOUT, INIT))
     metadata = from_json(package.loader.get_metadata().get(KEY), path)  # pyright: ignore[reportAttributeAccessIssue]
-    return ExportedStepper({"rollout": package}, metadata, str(path), "aoti")
+    return ExportedStepper({"rollout": package, "init": init}, metadata, str(path), "aoti")
 
 
 def _plain(x: Tensor) -> Tensor:

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -32,57 +31,89 @@ SIMPLE = {
     aten.where.ScalarOther: "Where", aten.where.Scalar: "Where", aten.pow.Tensor_Scalar: "Pow",
 }  # fmt: skip
 SAME = (aten.clone.default, aten.detach.default, aten.alias.default)
-SEVERAL = (aten.unbind.int, aten.broadcast_tensors.default)  # written where one of their outputs is taken
+SEVERAL = (
+    aten.unbind.int,
+    aten.broadcast_tensors.default,
+    aten.split_with_sizes.default,
+)  # written where one of their outputs is taken
+
+
+class Constants:
+    """The constants of a file, each stored once: inner graphs see those of the outermost."""
+
+    def __init__(self):
+        self.tensors: list[Any] = []
+        self._names: dict[Any, str] = {}
+
+    def name(self, array: np.ndarray) -> str:
+        """The name of one with these values."""
+        from onnx import numpy_helper
+
+        key = (array.dtype.str, array.shape, array.tobytes())
+        if key not in self._names:
+            self._names[key] = f"c{len(self.tensors)}"
+            self.tensors.append(numpy_helper.from_array(array, self._names[key]))
+        return self._names[key]
 
 
 class Writer:
-    """Nodes and constants of one graph; a value is known by its name, a size by a tensor of one number.
+    """Nodes of one graph; a value is known by its name, a size by a tensor of one number.
 
     Parameters
     ----------
-    prefix
-        Of every name, so that several graphs go into one file.
+    constants
+        Where the file keeps them.
     real
         dtype of plain numbers where no tensor says otherwise.
+    prefix
+        Of every name, for one writer a graph.
     """
 
-    def __init__(self, prefix: str, real: torch.dtype):
-        self.prefix, self.real = prefix, real
+    def __init__(self, constants: Constants, real: torch.dtype, prefix: str):
+        self.constants, self.real, self.prefix = constants, real, prefix
         self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+        self._count = 0
         self._names: dict[Any, str] = {}
-        self._shared: dict[Any, str] = {}
+        self._parts: dict[Any, list[str]] = {}  # of operations with several outputs
 
-    def write(self, graph: Graph, inputs: Sequence[str], outputs: Sequence[str]) -> None:
-        """The whole graph, its inputs and outputs called as told."""
+    def write(self, graph: Graph, inputs: Sequence[str]) -> list[str]:
+        """Evaluate a graph at inputs; the names of its outputs."""
         places = [x for x in graph.code.graph.nodes if x.op == "placeholder"]
-        self._names = dict(zip(places, inputs, strict=False))
+        self._names, self._parts = dict(zip(places, inputs, strict=False)), {}
         self._values = dict(zip(places[len(inputs) :], graph.constants, strict=True))
+        outputs: list[str] = []
         for node in graph.code.graph.nodes:
-            if node.op == "call_function" and node.target not in SEVERAL:
+            if node.op == "call_function" and node.target not in SEVERAL and not _within(node):
                 self._names[node] = self._translate(node)
             elif node.op == "output":
-                for x, name in zip(node.args[0], outputs, strict=True):
-                    self.emit("Identity", self.name(x), to=name)
+                outputs = [self.name(x) for x in node.args[0]]
+        return outputs
 
     def emit(self, kind: str, *inputs: str, to: str | None = None, **attributes: Any) -> str:
         """One node; its output's name."""
         from onnx import helper
 
-        to = to or f"{self.prefix}{len(self.nodes)}"
+        to = to or self.fresh()
+        attributes = {key.removesuffix("_"): value for key, value in attributes.items()}
         self.nodes.append(helper.make_node(kind, list(inputs), [to], **attributes))
         return to
 
-    def constant(self, value: Any, dtype: Any) -> str:
-        """A constant of numpy's dtype; equal ones are shared."""
-        from onnx import numpy_helper
+    def several(self, kind: str, inputs: Sequence[str], count: int, **attributes: Any) -> list[str]:
+        """One node with several outputs; their names."""
+        from onnx import helper
 
-        array = np.array(value, dtype=dtype)
-        key = (array.dtype.str, array.shape, array.tobytes())
-        if key not in self._shared:
-            self._shared[key] = f"{self.prefix}c{len(self.constants)}"
-            self.constants.append(numpy_helper.from_array(array, self._shared[key]))
-        return self._shared[key]
+        to = [self.fresh() for _ in range(count)]
+        self.nodes.append(helper.make_node(kind, list(inputs), to, **attributes))
+        return to
+
+    def fresh(self) -> str:
+        """A name that no other value has."""
+        self._count += 1
+        return f"{self.prefix}{self._count}"
+
+    def constant(self, value: Any, dtype: Any) -> str:
+        """A constant of numpy's dtype."""
+        return self.constants.name(np.array(value, dtype=dtype))
 
     def integers(self, *values: int) -> str:
         """Axes, indices, a shape."""
@@ -121,7 +152,12 @@ class Writer:
             return self.name(node.args[0])
         if target in SIMPLE:
             dtype = _common(node)
-            return self.emit(SIMPLE[target], *(self.name(x, dtype) for x in _in_order(node)))
+            names = [self.name(x, dtype) for x in node.args]
+            if (scale := node.kwargs.get("alpha", 1)) != 1:
+                names[1] = self.emit("Mul", names[1], self.name(scale, dtype))
+            return self.emit(SIMPLE[target], *names)
+        from herglotz.export.onnx_table import TABLE  # its functions write with this class
+
         if target not in TABLE:
             raise InputError(f"ONNX export does not know the operation {target}; export to --format pt2 or c")
         return TABLE[target](self, node)
@@ -135,11 +171,6 @@ def _axis(axis: int, x: Any) -> int:
     return axis % len(_of(x).shape)
 
 
-def _in_order(node: Any) -> tuple[Any, ...]:
-    assert not node.kwargs.get("alpha"), "a scaled sum is not translated"
-    return node.args
-
-
 def _common(node: Any) -> torch.dtype | None:
     """The dtype of plain numbers beside tensors: that of the last tensor (the first of `where` is its mask)."""
     tensors = [x for x in node.args if isinstance(x, fx.Node)]
@@ -149,184 +180,16 @@ def _common(node: Any) -> torch.dtype | None:
     return _of(node).dtype if _of(node).dtype != torch.bool else None
 
 
-def _slice(w: Writer, node: Any) -> str:
-    x, axis, start, end, *step = node.args
-    limits = [w.integers(k) for k in (start or 0, end, axis, *step)]
-    return w.emit("Slice", w.name(x), *limits)
+def kind_of(dtype: torch.dtype) -> int:
+    """ONNX's number of a dtype."""
+    from onnx import TensorProto
 
-
-def _select(w: Writer, node: Any) -> str:
-    x, axis, index = node.args
-    return w.emit("Gather", w.name(x), w.constant(index, np.int64), axis=_axis(axis, x))
-
-
-def _item(w: Writer, node: Any) -> str:
-    """One output of an operation that has several."""
-    source: Any = node.args[0]
-    index: Any = node.args[1]
-    if source.target == aten.unbind.int:
-        x, axis = source.args[0], (source.args[1] if len(source.args) > 1 else 0)
-        return w.emit("Gather", w.name(x), w.constant(index, np.int64), axis=_axis(axis, x))
-    assert source.target == aten.broadcast_tensors.default
-    x, others = source.args[0][index], source.args[0]
-    if _of(x).shape == _of(node).shape:
-        return w.name(x)
-    whole = next(y for y in others if _of(y).shape == _of(node).shape)
-    return w.emit("Expand", w.name(x), w.emit("Shape", w.name(whole)))
-
-
-def _moved(w: Writer, node: Any) -> str:
-    x, source, target = node.args
-    dims = len(_of(x).shape)
-    order = torch.empty(list(range(1, dims + 1)), device="meta").movedim(source, target).shape
-    return w.emit("Transpose", w.name(x), perm=[size - 1 for size in order])
-
-
-def _unflatten(w: Writer, node: Any) -> str:
-    x, axis, shape = node.args
-    axis = _axis(axis, x)
-    assert axis == 0
-    tail = w.emit("Shape", w.name(x), start=1)
-    return w.emit("Reshape", w.name(x), w.emit("Concat", w.integers(*shape), tail, axis=0))
-
-
-def _linear(w: Writer, node: Any) -> str:
-    x, weight, *bias = node.args
-    known = w._values.get(weight)
-    turned = (
-        w.emit("Transpose", w.name(weight), perm=[1, 0]) if known is None
-        else w.constant(known.t().contiguous().numpy(), NUMPY[known.dtype])
-    )  # fmt: skip
-    product = w.emit("MatMul", w.name(x), turned)
-    return w.emit("Add", product, w.name(bias[0])) if bias and bias[0] is not None else product
-
-
-def _stack(w: Writer, node: Any) -> str:
-    parts: Any = node.args[0]
-    axis: Any = node.args[1] if len(node.args) > 1 else 0
-    axis = axis % (len(_of(parts[0]).shape) + 1)
-    return w.emit("Concat", *(w.emit("Unsqueeze", w.name(x), w.integers(axis)) for x in parts), axis=axis)
-
-
-def _cat(w: Writer, node: Any) -> str:
-    parts: Any = node.args[0]
-    return w.emit("Concat", *map(w.name, parts), axis=node.args[1] if len(node.args) > 1 else 0)
-
-
-def _reduced(kind: str) -> Callable[[Writer, Any], str]:
-    def write(w: Writer, node: Any) -> str:
-        axes: Any = node.args[1]
-        keep = int(bool(node.args[2])) if len(node.args) > 2 else 0
-        axes = [axes] if isinstance(axes, int) else axes
-        return w.emit(kind, w.name(node.args[0]), w.integers(*axes), keepdims=keep)
-
-    return write
-
-
-def _all(w: Writer, node: Any) -> str:
-    axes = [w.integers(node.args[1])] if len(node.args) > 1 else []
-    number = _cast(w, w.name(node.args[0]), torch.int32)
-    return _cast(w, w.emit("ReduceMin", number, *axes, keepdims=0), torch.bool)
-
-
-def _cast(w: Writer, name: str, dtype: torch.dtype) -> str:
-    from onnx import TensorProto, helper
-
-    kinds = {
+    return {
         torch.float64: TensorProto.DOUBLE, torch.float32: TensorProto.FLOAT, torch.int64: TensorProto.INT64,
         torch.int32: TensorProto.INT32, torch.bool: TensorProto.BOOL, torch.uint8: TensorProto.UINT8,
-    }  # fmt: skip
-    to = f"{w.prefix}{len(w.nodes)}"
-    w.nodes.append(helper.make_node("Cast", [name], [to], to=kinds[dtype]))
-    return to
+    }[dtype]  # fmt: skip
 
 
-def _index(w: Writer, node: Any) -> str:
-    x, places = node.args
-    ((axis, place),) = [(i, y) for i, y in enumerate(places) if y is not None]
-    return w.emit("Gather", w.name(x), w.name(place), axis=axis)
-
-
-def _expm1(w: Writer, node: Any) -> str:
-    """e^x − 1 = 2t/(1 − t), t = tanh(x/2), where x is small: ONNX has no expm1."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
-    one, two = w.name(1.0, dtype), w.name(2.0, dtype)
-    t = w.emit("Tanh", w.emit("Div", x, two))
-    small = w.emit("Div", w.emit("Mul", two, t), w.emit("Sub", one, t))
-    near = w.emit("Less", w.emit("Abs", x), w.name(0.5, dtype))
-    return w.emit("Where", near, small, w.emit("Sub", w.emit("Exp", x), one))
-
-
-def _log1p(w: Writer, x: str, dtype: torch.dtype) -> str:
-    """log(1 + x) = x log(u)/(u − 1) with u = 1 + x rounded (Kahan), x where u = 1."""
-    one = w.name(1.0, dtype)
-    u = w.emit("Add", one, x)
-    same = w.emit("Equal", u, one)
-    below = w.emit("Where", same, one, w.emit("Sub", u, one))
-    return w.emit("Where", same, x, w.emit("Div", w.emit("Mul", x, w.emit("Log", u)), below))
-
-
-def _atanh(w: Writer, node: Any) -> str:
-    """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has it in float32 only."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
-    ratio = w.emit("Div", w.emit("Mul", w.name(2.0, dtype), x), w.emit("Sub", w.name(1.0, dtype), x))
-    return w.emit("Mul", w.name(0.5, dtype), _log1p(w, ratio, dtype))
-
-
-def _log_sigmoid(w: Writer, node: Any) -> str:
-    """Log σ(x) = min(x, 0) − log(1 + e^{−|x|})."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
-    decay = w.emit("Exp", w.emit("Neg", w.emit("Abs", x)))
-    return w.emit("Sub", w.emit("Min", x, w.name(0.0, dtype)), _log1p(w, decay, dtype))
-
-
-def _nan_to_num(w: Writer, node: Any) -> str:
-    x, nan, large = node.args
-    assert nan == large
-    return w.emit("Where", w.finite(x), w.name(x), w.name(nan, _of(node).dtype))
-
-
-def _diagonal(w: Writer, node: Any) -> str:
-    x: Any = node.args[0]
-    eye = w.constant(np.eye(_of(x).shape[-1]), NUMPY[_of(x).dtype])
-    return w.emit("Mul", w.emit("Unsqueeze", w.name(x), w.integers(-1)), eye)
-
-
-TABLE: dict[Any, Callable[[Writer, Any], str]] = {
-    aten.slice.Tensor: _slice,
-    aten.select.int: _select,
-    operator.getitem: _item,
-    aten.unsqueeze.default: lambda w, n: w.emit("Unsqueeze", w.name(n.args[0]), w.integers(n.args[1])),
-    aten.index_select.default: lambda w, n: w.emit("Gather", w.name(n.args[0]), w.name(n.args[2]), axis=n.args[1]),
-    aten.index.Tensor: _index,
-    aten.cat.default: _cat,
-    aten.stack.default: _stack,
-    aten.linear.default: _linear,
-    aten.movedim.int: _moved,
-    aten.movedim.intlist: _moved,
-    aten.unflatten.int: _unflatten,
-    aten.reshape.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
-    aten.view.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
-    aten.expand.default: lambda w, n: w.emit(
-        "Expand", w.name(n.args[0]), w.sizes([1 if x == -1 else x for x in n.args[1]])
-    ),
-    aten.sym_size.int: lambda w, n: w.emit("Shape", w.name(n.args[0]), start=n.args[1], end=n.args[1] + 1),
-    operator.mul: lambda w, n: w.emit("Mul", w.name(n.args[0]), w.integers(n.args[1])),
-    aten.rsub.Scalar: lambda w, n: w.emit("Sub", w.name(n.args[1], _of(n).dtype), w.name(n.args[0])),
-    aten.ne.Scalar: lambda w, n: w.emit("Not", w.emit("Equal", w.name(n.args[0]), w.name(n.args[1], _common(n)))),
-    aten.amax.default: _reduced("ReduceMax"),
-    aten.sum.dim_IntList: _reduced("ReduceSum"),
-    aten.all.dim: _all,
-    aten.all.default: _all,
-    aten.to.dtype: lambda w, n: _cast(w, w.name(n.args[0]), n.args[1]),
-    aten.zeros_like.default: lambda w, n: w.like(n, 0),
-    aten.ones_like.default: lambda w, n: w.like(n, 1),
-    aten.full_like.default: lambda w, n: w.like(n, n.args[1]),
-    aten.new_zeros.default: lambda w, n: w.emit("Expand", w.name(0.0, _of(n).dtype), w.sizes(n.args[1])),
-    aten.isfinite.default: lambda w, n: w.finite(n.args[0]),
-    aten.nan_to_num.default: _nan_to_num,
-    aten.expm1.default: _expm1,
-    aten.atanh.default: _atanh,
-    aten.log_sigmoid.default: _log_sigmoid,
-    aten.diag_embed.default: _diagonal,
-}
+def _within(node: Any) -> bool:
+    """Whether this is |x| on its way into sums, which ONNX has as one operation."""
+    return node.target == aten.abs.default and all(x.target == aten.sum.dim_IntList for x in node.users)

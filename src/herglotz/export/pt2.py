@@ -15,10 +15,12 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.export.attempt import best_plan
 from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import FORMAT, METADATA, describe, to_json, weights_digest
-from herglotz.export.module import ITERATIONS, InitModule, RolloutModule, StepModule
+from herglotz.export.module import InitModule, RolloutModule, StepModule
+from herglotz.export.newton import ITERATIONS
 from herglotz.models import ContactLagrangian
 
 __all__ = ["FORMAT", "METADATA", "export_pt2", "rollout_program", "weights_digest"]
@@ -79,7 +81,7 @@ def export_pt2(
         programs = {
             "model": _program(StepModule(equations, newton_iterations, entries["box"]), arguments),
             "rollout": rollout_program(equations, entries),
-            "init": _program(InitModule(equations), arguments),
+            "init": init_program(equations, entries),
         }
         from torch.export.pt2_archive._package import package_pt2  # what torch.export.save calls for a single program
 
@@ -94,8 +96,15 @@ def rollout_program(model: ContactLagrangian | Equations, entries: Mapping[str, 
     equations = Equations.of(model)
     arguments = example(equations.model, entries["h"])
     stacked = (x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in arguments[3:])
-    module = RolloutModule(equations, entries["newton_iterations"], entries["box"])
+    plan = best_plan(equations.model, entries["h"], entries["box"])
+    module = RolloutModule(equations, entries["newton_iterations"], entries["box"], plan)
     return _program(module, (*arguments[:3], *stacked), stacked=3)
+
+
+def init_program(model: ContactLagrangian | Equations, entries: Mapping[str, Any]) -> ExportedProgram:
+    """`InitModule` as an exported program."""
+    equations = Equations.of(model)
+    return _program(InitModule(equations), example(equations.model, entries["h"]))
 
 
 @contextmanager

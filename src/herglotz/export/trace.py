@@ -62,7 +62,7 @@ class Graph(nn.Module):
         outputs: Any = graph.graph_copy(self.code.graph, {})
         graph.output(outputs[:count])
         graph.eliminate_dead_code()
-        return Graph(*_without_unused(graph, self.constants), self.batch)
+        return Graph(*without_unused(graph, self.constants), self.batch)
 
 
 def example_batch(sizes: set[int]) -> int:
@@ -159,7 +159,8 @@ def _lean(found: fx.GraphModule, values: dict[str, Any], batch: int) -> Graph:
             fixed.add(node)
             continue
         if node.op == "output":
-            graph.output(tuple(moved(x) for x in node.args[0]))
+            found_out: Any = node.args[0]
+            graph.output(tuple(moved(x) for x in (found_out if isinstance(found_out, (tuple, list)) else [found_out])))
             continue
         if _changes_nothing(node, values):
             new[node] = moved(node.args[0])
@@ -174,7 +175,7 @@ def _lean(found: fx.GraphModule, values: dict[str, Any], batch: int) -> Graph:
     order = [node for node in graph.nodes if node.op == "placeholder"]
     kept = {place.name: value for place, value in constants.values()}
     _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
-    return Graph(*_without_unused(graph, [kept[x.name] for x in order if x.name in kept]), batch)
+    return Graph(*without_unused(graph, [kept[x.name] for x in order if x.name in kept]), batch)
 
 
 def _unreached(node: fx.Node, fixed: set[fx.Node], batch: int) -> bool:
@@ -230,7 +231,7 @@ def _inputs_first(graph: fx.Graph, inputs: list[fx.Node], constants: list[fx.Nod
             first = node
 
 
-def _without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
+def without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
     """Constants that nobody reads are dropped; they are the last placeholders."""
     places = [node for node in graph.nodes if node.op == "placeholder"]
     places = places[len(places) - len(constants) :]

@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from herglotz.errors import InputError
+from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.settings import from_plain
 
@@ -20,7 +21,12 @@ class ModelConfig:
     baseline.
     A width of 0 leaves that network out; `mass_width` > 0 makes the mass depend on position, `action_width` counts the
     units of the full level, `coulomb` adds dry friction to the forced level's viscous one, and its `inputs` act through
-    a learned matrix or through `input_map` (n · m numbers, row by row).
+    a learned matrix or through `input_map` (n · m numbers, row by row), measured from 0 or, with `input_zero`, from a
+    learned zero of each.
+    `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
+    coordinates have one mass, and their potential is made of features alone; `coupled` friction (forced level) may
+    brake differences of speeds. `order` 4 adds what the rule lacks of the exact L_d, from the features
+    (`herglotz.models.fourth`); forces stay of order 2.
     Without a `baseline` the correction is the whole of A: no kinetic term, no
     potential; it is there to show why a baseline is needed (trap 2).
     """
@@ -46,6 +52,12 @@ class ModelConfig:
     coulomb: bool = False
     inputs: int = 0
     input_map: tuple[float, ...] = ()
+    input_zero: bool = False
+    features: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+    alike: bool = False
+    coupled: bool = False
+    order: int = 2
 
     def __post_init__(self):
         if self.level not in LEVELS:
@@ -64,11 +76,36 @@ class ModelConfig:
             raise InputError(f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'")
         if self.level != "forced" and (self.coulomb or self.inputs or self.input_map):
             raise InputError(f"coulomb and inputs are forces; set level='forced', not '{self.level}'")
+        if self.level != "forced" and self.coupled:
+            raise InputError(f"coupled is friction between joints; set level='forced', not '{self.level}'")
+        if self.order not in (2, 4):
+            raise InputError(f"order must be 2 or 4, got {self.order}")
+        networks = self.potential_width or self.mass_width or self.correction_width or not self.baseline
+        if self.order == 4 and (networks or self.level in ("affine", "full")):
+            raise InputError("order 4 is for features, without networks, at the levels conservative, linear and forced")
+        if not self.baseline and (self.features or self.known or self.alike):
+            raise InputError("a model without a baseline has no features; leave features, known and alike out")
+        self._check_features()
+        if self.input_zero and not self.inputs:
+            raise InputError("input_zero is the zero of inputs; set inputs to their number")
         if self.inputs < 0:
             raise InputError(f"inputs counts the motors and cannot be negative, got {self.inputs}")
         if self.input_map and len(self.input_map) != self.dof * self.inputs:
             wanted = self.dof * self.inputs
             raise InputError(f"input_map needs n · inputs = {wanted} numbers, row by row; got {len(self.input_map)}")
+
+    def _check_features(self) -> None:
+        products = {text: parse(text, self.angles) for text in expand((*self.features, *self.known), self.angles)}
+        for text, feature in products.items():
+            constant = not any(p.power or any(p.form) or p.velocities for p in feature)
+            if constant and self.level not in ("affine", "full"):
+                raise InputError(
+                    f"feature '{text}': a constant moves nothing at the level '{self.level}'; leave it out"
+                )
+            if self.order == 4 and max(len(p.velocities) for p in feature) > 2:
+                raise InputError(f"feature '{text}': order 4 takes at most two velocities a product; set order=2")
+        if self.order == 4 and self.alike and all(feature[0].velocities for feature in products.values()):
+            raise InputError("order 4 with alike needs features of the position; name chain or sites, say")
 
     @property
     def dof(self) -> int:

@@ -10,17 +10,19 @@ from herglotz.mechanics import Forces
 from herglotz.models.config import ModelConfig
 from herglotz.models.jet import Jet
 
-SMOOTH, STRIBECK = 0.05, 0.2  # starting widths of dry friction, in typical speeds
+SMOOTH, STRIBECK = 0.02, 0.2  # starting widths of dry friction, in typical speeds
+SHARPEST = 0.001  # neither width falls below so many typical speeds: sticking would make a step stiff without limit
 
 
 class Friction(nn.Module):
-    """f = −b v − (τ + ε e^{−(v/v_st)²}) tanh(v/v_s) + G u for each joint, F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
+    """f = −b v − (τ + ε e^{−(v/v_st)²}) tanh(v/v_s) + G (u − u₀) for each joint, F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
 
     b is viscous, τ the Coulomb force and τ + ε the breakaway force of Stribeck's curve; all three are plain parameters
     of either sign that start at 0 (a logarithm collapses on short horizons and never comes back), so positive friction
-    is found, not forced. Only the widths v_s and v_st, which cannot be 0, are logarithms. f is taken at the velocity of
+    is found, not forced. Only the widths v_s and v_st, which cannot be 0, are logarithms (above a
+    floor). f is taken at the velocity of
     the step in both forces, so the step stays order 2, and linear in q1 where friction is viscous alone.
-    The map G is learned from 0, or given.
+    The map G is learned from 0, or given; u₀ is 0, or learned: the zero of the sensors that recorded u.
     """
 
     def __init__(self, config: ModelConfig):
@@ -31,14 +33,22 @@ class Friction(nn.Module):
         self.viscous = nn.Parameter(zeros(n))
         if self.dry:
             speed = torch.tensor(config.speed, dtype=torch.float64)
+            self.register_buffer("sharpest", SHARPEST * speed, persistent=False)
             self.coulomb, self.breakaway = nn.Parameter(zeros(n)), nn.Parameter(zeros(n))
             self.log_smooth = nn.Parameter((SMOOTH * speed).log())
             self.log_stribeck = nn.Parameter((STRIBECK * speed).log())
+        self.sharpest: Tensor
         self.input_map: Tensor
         if config.input_map:
             self.register_buffer("input_map", torch.tensor(config.input_map, dtype=torch.float64).reshape(n, m))
         elif m:
             self.input_map = nn.Parameter(zeros(n, m))
+        self.input_zero = nn.Parameter(zeros(m)) if config.input_zero else None
+
+    @property
+    def widths(self) -> tuple[Tensor, Tensor]:
+        """v_s and v_st, (n,) each, where friction is dry."""
+        return self.sharpest + self.log_smooth.exp(), self.sharpest + self.log_stribeck.exp()
 
     @property
     def linear(self) -> bool:
@@ -50,19 +60,21 @@ class Friction(nn.Module):
         x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
         f = x * -self.viscous
         if self.dry:
-            slow = x * (-self.log_stribeck).exp()
-            f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (-self.log_smooth).exp()).tanh()
+            smooth, stribeck = self.widths
+            slow = x * (1 / stribeck)
+            f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (1 / smooth)).tanh()
         return f if u is None else f + self.applied(u)
 
     def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
         """The force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet: what one iteration of a step needs."""
         f, slope = -self.viscous * v, -self.viscous
         if self.dry:
-            x, rate = v * (-self.log_stribeck).exp(), (-self.log_smooth).exp()
+            smooth, stribeck = self.widths
+            x, rate = v / stribeck, 1 / smooth
             t, bump = (v * rate).tanh(), (-(x * x)).exp() * self.breakaway
             grip = bump + self.coulomb
             f = f - grip * t
-            slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x * (-self.log_stribeck).exp() * t
+            slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x / stribeck * t
         return f if u is None else f + self.applied(u), slope
 
     def forward(self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None) -> Forces:
@@ -78,7 +90,11 @@ class Friction(nn.Module):
         return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero)
 
     def applied(self, u: Tensor) -> Tensor:
-        """G u, (..., n)."""
+        """G (u − u₀), (..., n)."""
         if not self.inputs or u.shape[-1:] != (self.inputs,):
             raise InputError(f"u needs shape (..., {self.inputs}), got {tuple(u.shape)}")
-        return u @ self.input_map.T
+        return (u if self.input_zero is None else u - self.input_zero) @ self.input_map.T
+
+    def offset(self) -> Tensor:
+        """The force of inputs that are recorded as 0, −G u₀, (n,)."""
+        return self.applied(self.input_map.new_zeros(self.inputs))

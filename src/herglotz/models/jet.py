@@ -178,6 +178,16 @@ class Jet:
         return Jet(rows[index], size, self.order)
 
 
+def of_mean(jet: Jet) -> Jet:
+    """A function of q̄ = (q0 + q1)/2 as one of (q0, q1): from a jet over n components to one over 2n."""
+    n, half = jet.tangents, jet.gradient / 2
+    rows = [jet.value[None], half, half]
+    if jet.order == 2:
+        i, j = pairs(2 * n, jet.data.device)
+        rows.append(jet.hessian()[i % n, j % n] / 4)
+    return Jet(torch.cat(rows), 2 * n, jet.order)
+
+
 def coordinates(q: Tensor, order: int) -> Jet:
     """The identity q ↦ q as a vector-valued jet over its own n components; q is (..., n)."""
     n = q.shape[-1]

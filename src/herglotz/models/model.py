@@ -12,6 +12,10 @@ from herglotz.mechanics import Forces, Partials
 from herglotz.models.action import ActionFlow
 from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.config import ModelConfig
+from herglotz.models.coupling import CoupledFriction
+from herglotz.models.feature_kinetic import FeatureKinetic
+from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
+from herglotz.models.fourth import Bend, missing
 from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
@@ -57,8 +61,18 @@ class ContactLagrangian(nn.Module):
         make = torch.Generator().manual_seed(config.seed)
         c = config
         sizes, act = (c.angles, c.scale, c.speed), c.activation
-        self.kinetic: Kinetic | PositionKinetic = Kinetic(c.dof)
-        self.potential = Potential(*sizes, c.stiffness, c.tilt, c.potential_width, c.potential_depth, make, act)
+        own, values = baseline_features(c.angles, c.stiffness, c.tilt) if c.order == 4 and not c.alike else ([], [])
+        still, moving = sorted_features((*own, *(x for x in c.features if x not in own)), c.angles)
+        known_still, known_moving = sorted_features(c.known, c.angles)
+        fixed, zero = c.alike or c.order == 4, (0.0,) * c.dof
+        stiffness, tilt = (zero, zero) if c.order == 4 else (c.stiffness, c.tilt)
+        self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike)
+        self.potential = Potential(
+            *sizes, stiffness, tilt, c.potential_width, c.potential_depth, make, act,
+            FeaturePotential(still, known_still, c.dof) if still or known_still else None, fixed,
+        )  # fmt: skip
+        if values and self.potential.features is not None:
+            self.potential.features.sum.coefficient.data[: len(values)] = torch.tensor(values, dtype=torch.float64)
         self.damping: LinearDamping | AffineDamping | None = None
         if c.level in ("linear", "forced"):
             self.damping = LinearDamping(c.rate)
@@ -70,8 +84,11 @@ class ContactLagrangian(nn.Module):
             self.correction = Correction(*sizes, c.correction_width, c.correction_depth, make, not c.baseline, act)
         if c.mass_width:
             self.kinetic = PositionKinetic(c, make)
+        if moving or known_moving:
+            self.kinetic = FeatureKinetic(self.kinetic, moving, known_moving, c.dof)
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
+        self.coupling = CoupledFriction(c.dof) if c.coupled and c.dof > 1 else None
 
     @property
     def dof(self) -> int:
@@ -91,7 +108,9 @@ class ContactLagrangian(nn.Module):
     @property
     def linear_in_q1(self) -> bool:
         """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
-        if self.s_enters_motion or self.correction is not None or isinstance(self.kinetic, PositionKinetic):
+        if self.config.order == 4:
+            return False
+        if self.s_enters_motion or self.correction is not None or not isinstance(self.kinetic, Kinetic):
             return False
         return self.friction is None or self.friction.linear
 
@@ -110,6 +129,8 @@ class ContactLagrangian(nn.Module):
         m = self.kinetic
         K = m(q0, q1, h, order, delta) if isinstance(m, Kinetic) else m(phase)
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
+        if self.config.order == 4:
+            N = self._missing(phase, V0, V1)
         return Terms(g, K, V0, V1, N, b)
 
     def partials(
@@ -198,6 +219,15 @@ class ContactLagrangian(nn.Module):
         gained = gained if V1 is None else gained - h / 2 * V1
         return gained if N is None else gained + N
 
+    def _missing(self, phase: Phase, V0: Jet, V1: Jet) -> Jet:
+        """What the rule of order 2 lacks to order 4."""
+        features, kinetic, damping = self.potential.features, self.kinetic, self.damping
+        assert features is not None  # the baseline at least
+        assert not isinstance(kinetic, PositionKinetic)
+        assert not isinstance(damping, AffineDamping)
+        rate = phase.q0.new_zeros(()) if damping is None else damping.rate
+        return missing(Bend(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
+
     def _forces(
         self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None
     ) -> Forces | None:
@@ -205,7 +235,9 @@ class ContactLagrangian(nn.Module):
             return None
         assert isinstance(self.damping, LinearDamping)
         v = (q1 - q0 if delta is None else delta) / h[..., None]
-        return self.friction(v, self.damping(q0, q1, h, order).exp(), h, order, u)
+        c = self.damping(q0, q1, h, order).exp()
+        forces = self.friction(v, c, h, order, u)
+        return forces if self.coupling is None else self.coupling(v, c, h, forces)
 
 
 @dataclass(frozen=True)

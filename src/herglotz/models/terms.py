@@ -11,6 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.jet import Jet, coordinates, pairs
 from herglotz.models.network import Network, feature_count, position_features
 from herglotz.models.phase import Phase
@@ -19,14 +20,18 @@ from herglotz.models.phase import Phase
 class Kinetic(nn.Module):
     """K = Δᵀ m Δ / 2h with Δ = q1 − q0 and a constant mass matrix m = C Cᵀ, C₁₁ = 1.
 
-    Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1.
+    Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1. `alike`: m = 1,
+    with no parameter.
     """
 
-    def __init__(self, dof: int):
+    def __init__(self, dof: int, alike: bool = False):
         super().__init__()
         self.dof = dof
-        self.log_diagonal = nn.Parameter(torch.zeros(dof - 1, dtype=torch.float64))
-        self.off_diagonal = nn.Parameter(torch.zeros(dof * (dof - 1) // 2, dtype=torch.float64))
+        for name, size in (("log_diagonal", dof - 1), ("off_diagonal", dof * (dof - 1) // 2)):
+            zero = torch.zeros(size, dtype=torch.float64)
+            setattr(self, name, nn.Parameter(zero)) if not alike else self.register_buffer(name, zero, persistent=False)
+        self.log_diagonal: Tensor
+        self.off_diagonal: Tensor
 
     def factor(self) -> Tensor:
         """C, lower triangular with C₁₁ = 1, shape (n, n)."""
@@ -62,7 +67,8 @@ class Potential(nn.Module):
     """V(q) = Σ kᵢ (1 − cos qᵢ) + bᵢ sin qᵢ (angles) or Σ kᵢ qᵢ²/2 + bᵢ qᵢ (others), plus a zero-initialised network.
 
     The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
-    network is multiplied by the energy scale Σ speed², so that its weights are of order one.
+    network is multiplied by the energy scale Σ speed², so that its weights are of order one. `features` joins V as it
+    is; `alike` fixes k and b, one set for all coordinates being a feature's business.
     """
 
     def __init__(
@@ -76,13 +82,19 @@ class Potential(nn.Module):
         depth: int,
         generator: torch.Generator,
         activation: str = "tanh",
+        features: FeaturePotential | None = None,
+        alike: bool = False,
     ):
         super().__init__()
         self.angles = angles
         self.scale = scale
         self.energy = sum(v * v for v in speed)
-        self.stiffness = nn.Parameter(torch.tensor(stiffness, dtype=torch.float64))
-        self.tilt = nn.Parameter(torch.tensor(tilt, dtype=torch.float64))
+        for name, numbers in (("stiffness", stiffness), ("tilt", tilt)):
+            value = torch.tensor(numbers, dtype=torch.float64)
+            setattr(self, name, nn.Parameter(value)) if not alike else self.register_buffer(name, value)
+        self.stiffness: Tensor
+        self.tilt: Tensor
+        self.features = features
         self.network: Network | None = None
         if width:
             self.network = Network(feature_count(angles), width, depth, 1.0, generator, activation=activation)
@@ -107,7 +119,8 @@ class Potential(nn.Module):
         x = coordinates(q, order)
         V = self.baseline(x)
         departure = self.departure(x)
-        return V if departure is None else V + departure
+        V = V if departure is None else V + departure
+        return V if self.features is None else V + self.features(q, order)
 
 
 class LinearDamping(nn.Module):

@@ -57,7 +57,7 @@ class Engine:
         else:
             new, low = State(move.q1, move.p1, s0 + move.L), None
         with torch.no_grad():
-            status = explicit_status(*new, move.c, frog.constants(h).regular)
+            status = explicit_status(*new, move.c, frog.regular(h))
         good = status is None
         if self._fine is None or self._fine[1].shape != s0.shape:
             zero = torch.zeros_like(s0)
@@ -88,8 +88,8 @@ class Engine:
             assert found.point.J is not None
             x, end = _attach(L_d, state, h, found.x, found.point.J, increments)
         if increments:
-            new, low = _compensated(state, State(x, end.p1 - p0, end.L), low)
-            new = new._replace(p=end.p1)
+            new, low = _compensated(state, State(x, end.p1 - p0 if end.dp is None else end.dp, end.L), low)
+            new = new._replace(p=end.p1) if end.dp is None else new
         else:
             new = State(x, end.p1, s0 + end.L)
         step = _report(new, end.c, status, found.residual, found.iterations, good)

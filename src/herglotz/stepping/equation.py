@@ -12,83 +12,21 @@ are the networks of (q̄, v), by sweeps of n tangents.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from herglotz.mechanics import (
     DiscreteLagrangian,
-    Partials,
-    momentum_jacobian,
-    momentum_plus,
-    momentum_residual,
-    partials,
 )
 from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
+from herglotz.stepping.partials_equation import End, Equation, PartialsEquation, Point
 
-
-class Point(NamedTuple):
-    """The step equation at one trial."""
-
-    F: Tensor  # (..., n)
-    J: Tensor | None  # (..., n, n) ∂F/∂q1, where it was asked for
-    rest: Any  # what `end` and `push` go on with
-
-
-class End(NamedTuple):
-    """What a solved step hands on."""
-
-    p1: Tensor  # (..., n)
-    L: Tensor  # (...) s1 − s0
-    c: Tensor  # (...)
-
-
-class Equation(Protocol):
-    """The step equation in the unknown x: q1 or, in increments, Δ = q1 − q0."""
-
-    def __call__(self, x: Tensor, second: bool) -> Point:
-        """F, and J if `second`."""
-        ...
-
-    def push(self, point: Point) -> Tensor:
-        """The momentum c p0, (..., n)."""
-        ...
-
-    def end(self, x: Tensor, point: Point) -> End:
-        """p1 = D2 + F⁺, L and c at a solution."""
-        ...
-
-
-class PartialsEquation:
-    """The step equation of any L_d; `rest` holds its partials."""
-
-    def __init__(
-        self, L_d: DiscreteLagrangian, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, order: int, increments: bool
-    ):
-        self.L_d, self.q0, self.p0, self.s0, self.h = L_d, q0, p0, s0, h
-        self.order, self.increments = order, increments
-
-    def __call__(self, x: Tensor, second: bool) -> Point:
-        """See `Equation`."""
-        order = 2 if second else self.order
-        if self.increments:
-            form: Any = self.L_d  # `solve_step` checked
-            P: Partials = form.partials_increment(self.q0, x, self.s0, self.h, order)
-        else:
-            P = partials(self.L_d, self.q0, x, self.s0, self.h, order)
-        return Point(momentum_residual(P, self.p0), momentum_jacobian(P, self.p0) if order == 2 else None, P)
-
-    def push(self, point: Point) -> Tensor:
-        """See `Equation`."""
-        return point.rest.c[..., None] * self.p0
-
-    def end(self, x: Tensor, point: Point) -> End:  # noqa: ARG002  one signature for all
-        """See `Equation`."""
-        return End(momentum_plus(point.rest), point.rest.L, point.rest.c)
+__all__ = ["End", "Equation", "ModelEquation", "PartialsEquation", "Point", "StepOfModel", "model_equation"]
 
 
 class _Frame(NamedTuple):
@@ -132,14 +70,23 @@ class _Constants(NamedTuple):
     J: Tensor  # (..., n, n) −m/h, times √c where that is constant
     N: Sweep | None  # times h
     G: Sweep | None  # times −h
+    times: Tensor | None  # (...) h where it is not folded into the networks
 
 
 class ModelEquation:
-    """Makes the step equations of one model at its present parameters; keeps what they share."""
+    """Makes the step equations of one model at its present parameters; keeps what they share.
 
-    def __init__(self, model: ContactLagrangian):
+    Parameters
+    ----------
+    model
+        As `model_equation` accepts it.
+    fold
+        Fold h into the networks' last layers: fewer operations where h is one number for all samples.
+    """
+
+    def __init__(self, model: ContactLagrangian, fold: bool = True):
         assert isinstance(model.kinetic, Kinetic)  # `model_equation` checked
-        self.model = model
+        self.model, self.fold = model, fold
         self.config = model.config
         self.field = FieldOf(model.potential)
         self.mass = model.kinetic.mass()
@@ -173,11 +120,13 @@ class ModelEquation:
         J = -(rate if self.affine is not None else root * rate)[..., None] * self.mass
         more = (self.config.angles, self.config.scale, self.config.speed)
         N, G = self.model.correction, None if self.affine is None else self.affine.network
+        times: Tensor | float = h if self.fold else 1.0
         constants = _Constants(
             h, (h / 2)[..., None], rate, (-2 * rate).expand(q0.shape), 1.0 + c_minus_1, c_minus_1, -root,
             J.expand(*q0.shape, q0.shape[-1]),
-            None if N is None else Sweep(N.network, *more, h * N.energy),
-            None if G is None else Sweep(G, *more, -h),
+            None if N is None else Sweep(N.network, *more, times * N.energy),
+            None if G is None else Sweep(G, *more, -times),
+            None if self.fold else h,
         )  # fmt: skip
         self._key, self._constants = (h, q0.shape), constants
         return constants
@@ -234,19 +183,52 @@ class StepOfModel:
 
     def end(self, x: Tensor, point: Point) -> End:
         """See `Equation`."""
+        there = self.there = self.maker.field(self.q0 + x if self.increments else x)
+        p1, L, c, _ = self.end_without_field(point)
+        half = self.constants.half
+        p1, L = torch.addcmul(p1, half, there.slope, value=-1), torch.addcmul(L, half[..., 0], there.V, value=-1)
+        return End(p1, L, c, self._gained(point, there) if self.increments else None)
+
+    def _gained(self, point: Point, there: Field) -> Tensor | None:
+        """(c − 1) p0 + (D1 + D2) L_d + F⁻ + F⁺, p1 − p0 as F = 0: large terms of D1 and D2 have cancelled."""
+        k, (_, _, N, damping, force) = self.constants, point.rest
+        if damping is not None:
+            return None
+        c = k.c[..., None]
+        dp = k.c_minus_1[..., None] * self.p0 - k.half * (c * self.here.slope + there.slope)
+        if N is not None:
+            dp = dp + N.weighted @ (self.maker.frame.to_q0 + self.maker.frame.to_q1)
+        return dp if force is None else dp + (k.half * (1.0 + c)) * force
+
+    def leap(self) -> Tensor:
+        """Δ without networks of (q̄, v), forces and drag, (..., n): near the solution where they are weak."""
+        a = self.a if self.maker.affine is None else self.a * -self.constants.minus_root
+        return -self.over_kinetic(a)
+
+    def over_kinetic(self, x: Tensor) -> Tensor:
+        """J⁻¹ x with the kinetic part of J alone, −√c m/h; c of the constant damping."""
+        k = self.constants
+        return (x @ torch.linalg.inv_ex(self.maker.mass)[0]) * (k.h[..., None] / k.minus_root)
+
+    def at(self, x: Tensor, point: Point) -> Point:
+        """The point with velocity and momentum those of x, the rest as it is."""
+        v = (x if self.increments else x - self.q0) * self.constants.rate
+        mv = v if v.shape[-1] == 1 else v @ self.maker.mass
+        return Point(point.F, point.J, (v, mv, *point.rest[2:]))
+
+    def end_without_field(self, point: Point) -> End:
+        """What `end` gives, without −h/2 V′(q1) in p1 and −h/2 V(q1) in L."""
         k, maker = self.constants, self.maker
         v, mv, N, damping, force = point.rest
-        there = self.there = maker.field(self.q0 + x if self.increments else x)
         half = k.half[..., 0]
         if damping is None:
-            c, L, impulse = k.c.expand(self.s0.shape), k.c_minus_1 * self.A, -k.minus_root * mv
+            c, L, p1 = k.c.expand(self.s0.shape), k.c_minus_1 * self.A, -k.minus_root * mv
             K = (mv * v).sum(-1) * -(k.minus_root[..., 0] * half)  # √c h/2 v·mv
         else:
             c, c_minus_1, root, alpha, D2g = damping
-            L, impulse = c_minus_1 * self.A, torch.addcmul(alpha[..., None] * D2g(), root, mv)
+            L, p1 = c_minus_1 * self.A, torch.addcmul(alpha[..., None] * D2g(), root, mv)
             K = (mv * v).sum(-1) * (root[..., 0] * half)
-        L = L + K - half * (self.here.V + there.V)
-        p1 = torch.addcmul(impulse, k.half, there.slope, value=-1)
+        L = L + torch.addcmul(K, half, self.here.V, value=-1)
         if N is not None:
             L, p1 = L + N.value, p1 + N.weighted @ maker.frame.to_q1
         if force is not None:
@@ -262,9 +244,12 @@ class StepOfModel:
 
     def _slopes(self, sweep: Sweep, y: Tensor, w: Tensor, second: bool) -> _Slopes:
         frame = self.maker.frame
+        times = self.constants.times
         if not second:
             value, g, _ = sweep(y)
             weighted = g * w
+            if times is not None:
+                value, weighted = value * times, weighted * times[..., None]
             return _Slopes(value, weighted @ frame.to_q0, weighted, None)
         n = self.q0.shape[-1]
         lift = (n, *(1,) * (y.ndim - 1))
@@ -272,6 +257,8 @@ class StepOfModel:
         assert dg is not None
         weighted = g * w
         rows = torch.addcmul((dg * w) @ frame.to_q0, (g * y) @ frame.bend, frame.eye.reshape(*lift, n))
+        if times is not None:
+            value, weighted, rows = value * times, weighted * times[..., None], rows * times[..., None]
         return _Slopes(value, weighted @ frame.to_q0, weighted, rows.movedim(0, -1))
 
     def _affine(
@@ -307,10 +294,12 @@ class StepOfModel:
         return F, J, (c, c_minus_1, root, alpha, to_q1)
 
 
-def model_equation(L_d: DiscreteLagrangian) -> ModelEquation | None:
-    """The step equations of L_d by terms, or None where only its partials know them."""
+def model_equation(L_d: DiscreteLagrangian, fold: bool = True) -> ModelEquation | None:
+    """The step equations of L_d by terms, or None where only its partials know them; `fold` as in `ModelEquation`."""
     if type(L_d) is not ContactLagrangian or L_d.action is not None or not L_d.config.baseline:
+        return None
+    if L_d.coupling is not None or L_d.config.order == 4:
         return None
     if type(L_d.kinetic) is not Kinetic or type(L_d.damping) not in (LinearDamping, AffineDamping, type(None)):
         return None
-    return ModelEquation(L_d)
+    return ModelEquation(L_d, fold)

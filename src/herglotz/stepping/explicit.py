@@ -13,6 +13,7 @@ difference of positions, so nothing cancels when h is small.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import isfinite
 from typing import NamedTuple
 
@@ -47,21 +48,38 @@ class _Constants(NamedTuple):
     c_1: Tensor  # (..., 1)
     half_c: Tensor  # (...) c/2
     c_minus_1: Tensor  # (...)
-    inverse: Tensor  # (n, n) or (..., n, n) of (m + √c h/2 b) / (h √c)
-    regular: bool  # c ≠ 0 in every sample
+    inverse: Tensor  # (n, n) or (..., n, n) of m + √c h/2 b, and times h √c where h is one number
+    stretch: Tensor | None  # (..., 1) h √c where h is not
 
 
 class Leapfrog:
-    """The explicit step of one model at its present parameters; differentiable by plain autograd."""
+    """The explicit step of one model at its present parameters; differentiable by plain autograd.
 
-    def __init__(self, model: ContactLagrangian):
+    Parameters
+    ----------
+    model
+        As `has_leapfrog` accepts it.
+    invert
+        Inverse of a batch of matrices, for where `torch.linalg` cannot go.
+    field
+        V and V′, in the place of `FieldOf`.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        invert: Callable[[Tensor], Tensor] | None = None,
+        field: Callable[[Tensor], Field] | None = None,
+    ):
         assert isinstance(model.kinetic, Kinetic)  # `leapfrog` checked
         self.model = model
-        self.field = FieldOf(model.potential)
+        self.field = FieldOf(model.potential) if field is None else field
         self.mass = model.kinetic.mass()
         self.friction = None if model.friction is None else model.friction.viscous
+        self.invert = invert or (lambda matrix: torch.linalg.inv_ex(matrix)[0])
         self._constants: _Constants | None = None
         self._h: Tensor | None = None
+        self._regular: bool | None = None
 
     def __call__(
         self,
@@ -79,7 +97,8 @@ class Leapfrog:
         w = self._applied(u)
         push0 = slope0 if w is None else slope0 - w
         r = torch.addcmul(p0, k.half, push0, value=-1)
-        delta = r @ k.inverse if k.inverse.ndim == 2 else (k.inverse @ r[..., None])[..., 0]
+        delta = r @ k.inverse if k.inverse.ndim == 2 else (k.inverse * r[..., None, :]).sum(-1)
+        delta = delta if k.stretch is None else delta * k.stretch
         q1 = q0 + delta
         there = self.field(q1)
         push1 = there.slope if w is None else there.slope - w
@@ -107,12 +126,20 @@ class Leapfrog:
         matrix, stretch, c, half = self.mass, h * root, 1.0 + c_minus_1, h / 2
         if self.friction is not None:
             matrix = matrix + torch.diag_embed((stretch / 2)[..., None] * self.friction)
-        inverse = torch.linalg.inv_ex(matrix)[0] * stretch[..., None, None]
+        inverse = self.invert(matrix)
+        if h.ndim == 0:
+            inverse = inverse * stretch
         constants = _Constants(
-            half[..., None], half, c, c[..., None], c / 2, c_minus_1, inverse, bool((c != 0).all())
+            half[..., None], half, c, c[..., None], c / 2, c_minus_1, inverse, stretch[..., None] if h.ndim else None
         )  # fmt: skip
-        self._h, self._constants = h, constants
+        self._h, self._constants, self._regular = h, constants, None
         return constants
+
+    def regular(self, h: Tensor) -> bool:
+        """Whether c ≠ 0 in every sample, for the step h of the last call."""
+        if self._regular is None or self._h is not h:
+            self._regular = bool((self.constants(h).c != 0).all())
+        return self._regular
 
     def _applied(self, u: Tensor | None) -> Tensor | None:
         """G u, (..., n)."""
@@ -130,6 +157,8 @@ def leapfrog(L_d: DiscreteLagrangian) -> Leapfrog | None:
 def has_leapfrog(L_d: DiscreteLagrangian) -> bool:
     """Whether `leapfrog` knows a step of L_d."""
     if type(L_d) is not ContactLagrangian or not (L_d.linear_in_q1 and L_d.config.baseline):
+        return False
+    if L_d.coupling is not None:
         return False
     return type(L_d.kinetic) is Kinetic and type(L_d.damping) in (LinearDamping, type(None))
 

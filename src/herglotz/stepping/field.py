@@ -28,6 +28,7 @@ class FieldOf:
         self.stiffness, self.tilt = potential.stiffness, potential.tilt
         self.angles, self.all_angles = potential.angles, all(potential.angles)
         network = potential.network
+        self.features = potential.features
         self.sweep = None
         if network is not None:
             self.sweep = Sweep(network, potential.angles, potential.scale, None, potential.energy)
@@ -41,6 +42,9 @@ class FieldOf:
             rise = torch.where(torch.tensor(self.angles, device=q.device), rise, q * q / 2)
         V = rise @ k + x.s @ b
         slope = torch.addcmul(x.s * k, x.ds, b)
+        if self.features is not None:
+            more, bend = self.features.value_and_slope(q)
+            V, slope = V + more, slope + bend
         if self.sweep is None:
             return Field(V, slope)
         value, g, _ = self.sweep(torch.cat([x.s, x.c], -1))

@@ -1,6 +1,8 @@
 """Scenes with known answers, the rules that discretise them, and the reference flow they are measured against."""
 
+from herglotz.systems.chain import chain
 from herglotz.systems.double_pendulum import double_pendulum
+from herglotz.systems.driven_pendulum import DrivenRule, driven_pendulum
 from herglotz.systems.exact import NumericallyExact, Reason, exact_discrete_lagrangian
 from herglotz.systems.galerkin import GalerkinLobatto, lobatto4, lobatto6
 from herglotz.systems.kepler import kepler
@@ -15,6 +17,7 @@ from herglotz.systems.printed_parachute import PrintedParachute
 from herglotz.systems.quadratic_drag import quadratic_drag
 from herglotz.systems.reference import ReferenceSolution, reference_flow, reference_solve
 from herglotz.systems.registry import scene, scene_names
+from herglotz.systems.rigid_body import rigid_body
 from herglotz.systems.rules import (
     ORDERS,
     adjoint,
@@ -33,6 +36,7 @@ from herglotz.systems.scene import Scene
 
 __all__ = [
     "ORDERS",
+    "DrivenRule",
     "ExactLinearDrag",
     "ExactOscillator",
     "ExactParachute",
@@ -45,9 +49,11 @@ __all__ = [
     "Scene",
     "adjoint",
     "all_rules",
+    "chain",
     "damped_oscillator",
     "damped_pendulum",
     "double_pendulum",
+    "driven_pendulum",
     "exact_discrete_lagrangian",
     "hamiltonian_motion",
     "herglotz_motion",
@@ -67,6 +73,7 @@ __all__ = [
     "reference_flow",
     "reference_solve",
     "right",
+    "rigid_body",
     "scene",
     "scene_names",
     "strang",

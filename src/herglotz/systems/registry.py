@@ -7,7 +7,9 @@ import math
 from collections.abc import Callable
 
 from herglotz.errors import InputError
+from herglotz.systems.chain import chain
 from herglotz.systems.double_pendulum import double_pendulum
+from herglotz.systems.driven_pendulum import driven_pendulum
 from herglotz.systems.kepler import kepler
 from herglotz.systems.linear_drag import linear_drag
 from herglotz.systems.nonlinear_action import nonlinear_action
@@ -15,19 +17,23 @@ from herglotz.systems.oscillator import damped_oscillator
 from herglotz.systems.parachute import parachute
 from herglotz.systems.pendulum import damped_pendulum
 from herglotz.systems.quadratic_drag import quadratic_drag
+from herglotz.systems.rigid_body import rigid_body
 from herglotz.systems.scene import Scene
 
 SCENES: dict[str, Callable[..., Scene]] = {
     make.__name__: make
     for make in (
+        chain,
         damped_oscillator,
         damped_pendulum,
         double_pendulum,
+        driven_pendulum,
         kepler,
         linear_drag,
         nonlinear_action,
         parachute,
         quadratic_drag,
+        rigid_body,
     )
 }
 

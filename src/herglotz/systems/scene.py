@@ -44,6 +44,8 @@ class Scene:
         The exact L_d computed by shooting (`herglotz.systems.exact`), for a scene without a closed form.
     examples
         Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
+    at, drive
+        Of a scene with inputs: the scene at the inputs u, (..., m), held constant, and the given inputs, t (...) ↦ u.
     """
 
     name: str
@@ -69,6 +71,8 @@ class Scene:
     H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
     numerical: DiscreteLagrangian | None = None
     examples: tuple[Mapping[str, float], ...] = ()
+    at: Callable[[Tensor], Scene] | None = None
+    drive: Callable[[Tensor], Tensor] | None = None
 
     @property
     def L_d_exact(self) -> DiscreteLagrangian | None:

@@ -9,7 +9,9 @@ from herglotz.training.residual import ResidualProblem
 from herglotz.training.run import Run, load_run, save_run
 from herglotz.training.selection import Selection, select
 from herglotz.training.shooting import ShootingProblem
-from herglotz.training.uncertainty import Bands, Laplace, laplace
+from herglotz.training.smoothing import Smoothed, smooth
+from herglotz.training.supervision import SupervisedProblem
+from herglotz.training.uncertainty import Bands, Laplace, ensemble_bands, laplace
 
 __all__ = [
     "Bands",
@@ -21,11 +23,15 @@ __all__ = [
     "Run",
     "Selection",
     "ShootingProblem",
+    "Smoothed",
+    "SupervisedProblem",
     "adam",
+    "ensemble_bands",
     "fit",
     "laplace",
     "levenberg_marquardt",
     "load_run",
     "save_run",
     "select",
+    "smooth",
 ]

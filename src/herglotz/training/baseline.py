@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -10,6 +11,10 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
+from herglotz.training.robust import FREEDOM, root_weights, scale_of
+
+ROUNDS = 10  # of re-weighting
+GROSS = 30.0  # robust standard deviations of an acceleration that no smooth motion misses the baseline by
 
 
 @dataclass(frozen=True)
@@ -25,12 +30,19 @@ class Baseline:
     max_step: float  # longest model step
     low: Tensor  # (n,) lowest position
     high: Tensor  # (n,) highest
+    input_map: tuple[float, ...] = ()  # (n · m) accelerations per unit of each input, row by row
+
+    @property
+    def inputs(self) -> int:
+        """Number of recorded inputs m."""
+        return len(self.input_map) // len(self.angles)
 
 
-def estimate_baseline(data: Trajectories) -> Baseline:
-    """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ to finite differences.
+def estimate_baseline(data: Trajectories, *, outliers: bool = False) -> Baseline:
+    """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ + (G u)ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ + (G u)ᵢ to finite differences.
 
-    Noise biases second differences, so these numbers only start a fit.
+    Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
+    Student's t takes the place of least squares (`herglotz.training.robust`), and rows that miss grossly set no size.
 
     Raises
     ------
@@ -45,13 +57,22 @@ def estimate_baseline(data: Trajectories) -> Baseline:
     v = (t.q2 - t.q0) / (h0 + h1)
     a = 2 * ((t.q2 - t.q1) / h1 - (t.q1 - t.q0) / h0) / (h0 + h1)
     n = data.dof
-    columns = a.new_zeros(len(t), n, 2 * n + 1)
+    m = 0 if data.u is None else data.u.shape[1]
+    columns = a.new_zeros(len(t), n, 2 * n + 1 + n * m)
     for i, angle in enumerate(data.angles):
         columns[:, i, 2 * i] = -(t.q1[:, i].sin() if angle else t.q1[:, i])
         columns[:, i, 2 * i + 1] = -(t.q1[:, i].cos() if angle else torch.ones_like(t.q1[:, i]))
         columns[:, i, 2 * n] = -v[:, i]
-    x = torch.linalg.lstsq(columns.reshape(-1, 2 * n + 1).cpu(), a.reshape(-1, 1).cpu()).solution[:, 0].tolist()
-    scale = data.q.abs().amax(0).tolist()
+        if data.u is not None:
+            columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (data.u[t.index] + data.u[t.index + 1]) / 2
+    q = data.q
+    if outliers:
+        x, good = _robust(columns.cpu(), a.cpu())
+        q, v = t.q1[good.to(q.device)], v[good.to(q.device)]
+    else:
+        x = torch.linalg.lstsq(columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()).solution[:, 0].tolist()
+    # An angle that turns over and over is no larger than half a turn.
+    scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
     for name, moved in zip(data.names, speed, strict=True):
         if moved == 0:
@@ -67,6 +88,19 @@ def estimate_baseline(data: Trajectories) -> Baseline:
         tilt=tuple(x[1 : 2 * n : 2]),
         rate=rate,
         max_step=max_step,
-        low=data.q.amin(0),
-        high=data.q.amax(0),
+        low=q.amin(0),
+        high=q.amax(0),
+        input_map=tuple(x[2 * n + 1 :]),
     )
+
+
+def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:
+    """Solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which of the T rows it believes, (T,) bool."""
+    rows, right = A.reshape(-1, A.shape[-1]), a.reshape(-1, 1)
+    x = torch.linalg.lstsq(rows, right).solution
+    for _ in range(ROUNDS):
+        r = rows @ x - right
+        by = root_weights(r / max(scale_of(r), torch.finfo(r.dtype).tiny), FREEDOM)
+        x = torch.linalg.lstsq(by * rows, by * right).solution
+    r = rows @ x - right
+    return x[:, 0].tolist(), r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
 
+from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
@@ -14,6 +15,8 @@ from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
 OPTIMISERS = ("lm", "adam")
+SUPERVISION = ("q", "qs", "qps")
+ROBUST = ("auto", "on", "off")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
 
 
@@ -26,7 +29,7 @@ class FitConfig:
     level
         "conservative" (no damping), "linear" (one damping rate), "affine" (damping depends on position and velocity),
         "full" (on s as well; s at the start is unknown, so fit several seeds) or "forced" (one rate, and friction of
-        each joint).
+        each joint). "auto": "forced" with dry friction where inputs u are recorded, else "linear".
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
         "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
@@ -42,6 +45,8 @@ class FitConfig:
     iterations
         Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
         fitting takes 40 at the most.
+    restarts
+        Fits of the one-step objective from so many draws of the initial weights; the least cost is kept.
     departures
         Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
         value fixes it.
@@ -58,9 +63,34 @@ class FitConfig:
         Units of the full level's map of s.
     coulomb
         Dry friction beside the viscous one at the forced level.
+    robust
+        Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
+        squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
+        training data are left out beforehand, unless "off".
+    supervision
+        What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
+        where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
+    use_inputs
+        Drive the model with the recorded inputs u (forced level); False leaves them out of the fit.
+    input_map
+        The map G from inputs to forces, n · m numbers row by row, where it is known; empty: learned. Forces are in
+        units in which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
+    features
+        What L may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, `"(q2 - q1)^4 + (q3 - q2)^4"`, or one
+        of the names chain, sites, central, pendulums, harmonics. Each has one coefficient, learned. See
+        `herglotz.models.features`.
+    known
+        What is known of L, the same way, with its numbers (the first mass is 1); nothing of it is learned.
+    alike
+        All coordinates have one mass, and their potential is made of features alone: chains.
+    coupled
+        Viscous friction of differences of speeds at the forced level: links with hinges between them.
+    order
+        4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
+        motion, and hold at other steps.
     """
 
-    level: str = "linear"
+    level: str = "auto"
     objective: str = "auto"
     optimiser: str = "lm"
     train_fraction: float = 0.667
@@ -77,17 +107,38 @@ class FitConfig:
     mass_width: int = 0
     action_width: int = 4
     coulomb: bool = False
+    robust: str = "auto"
+    supervision: str = "q"
+    restarts: int = 1
+    use_inputs: bool = True
+    input_map: tuple[float, ...] = ()
+    features: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
+    alike: bool = False
+    coupled: bool = False
+    order: int = 2
 
     def __post_init__(self):
-        _choice("level", self.level, LEVELS)
+        _choice("level", self.level, ("auto", *LEVELS))
         _choice("objective", self.objective, OBJECTIVES)
         _choice("optimiser", self.optimiser, OPTIMISERS)
+        _choice("robust", self.robust, ROBUST)
+        _choice("supervision", self.supervision, SUPERVISION)
+        if self.supervision != "q" and self.objective not in ("auto", "residual"):
+            raise InputError(
+                f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', "
+                f"not '{self.objective}'"
+            )
         _choice("dtype", self.dtype, tuple(DTYPES))
         _choice("activation", self.activation, ACTIVATIONS)
-        if self.coulomb and self.level != "forced":
-            raise InputError(f"coulomb is friction of the joints; set level='forced', not '{self.level}'")
+        if (self.coulomb or self.input_map) and self.level not in ("forced", "auto"):
+            raise InputError(f"coulomb and input_map are forces; set level='forced', not '{self.level}'")
+        if self.input_map and not self.use_inputs:
+            raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
             raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
+        if self.restarts < 1:
+            raise InputError(f"restarts must be >= 1, got {self.restarts}")
         if self.iterations < 1:
             raise InputError(f"iterations must be >= 1, got {self.iterations}")
         if not self.departures or min(self.departures) <= 0:
@@ -100,6 +151,31 @@ class FitConfig:
             raise InputError(f"unknown device '{self.device}'; use cpu or cuda") from None
         if device.type == "cuda" and not torch.cuda.is_available():
             raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
+
+    def resolved(self, data: Trajectories) -> FitConfig:
+        """The settings of a fit to these data, with the level decided.
+
+        Raises
+        ------
+        InputError
+            If the data hold inputs that the level cannot take, or the map of the inputs has not their size.
+        """
+        where, driven = data.source or "data", self.use_inputs and data.u is not None
+        config = self
+        if self.level == "auto":
+            level = "forced" if driven or self.coulomb else "linear"
+            config = replace(self, level=level, coulomb=self.coulomb or driven)
+        if driven and config.level != "forced":
+            raise InputError(
+                f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "
+                "or use_inputs=False to leave them out"
+            )
+        inputs = data.u.shape[1] if driven and data.u is not None else 0
+        if self.input_map and len(self.input_map) != data.dof * inputs:
+            raise InputError(
+                f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {len(self.input_map)}"
+            )
+        return config
 
     @property
     def torch_dtype(self) -> torch.dtype:

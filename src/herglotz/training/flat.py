@@ -35,13 +35,15 @@ class FlatModel:
         parts = theta.split(self.sizes)
         return {n: p.reshape(shape) for n, p, shape in zip(self.names, parts, self.shapes, strict=True)}
 
-    def partials(self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
-        """`herglotz.mechanics.partials` of the model with parameters theta."""
-        return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order)))
+    def partials(
+        self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int, u: Tensor | None = None
+    ) -> Partials:
+        """`herglotz.mechanics.partials` of the model with parameters theta, at the inputs u (..., m) of its steps."""
+        return cast(Partials, functional_call(self.model, self.unflatten(theta), (q0, q1, s0, h, order, u)))
 
-    def at(self, theta: Tensor) -> FixedModel:
-        """The discrete Lagrangian with parameters theta."""
-        return FixedModel(self, theta)
+    def at(self, theta: Tensor, u: Tensor | None = None) -> FixedModel:
+        """The discrete Lagrangian with parameters theta, of steps whose inputs are u."""
+        return FixedModel(self, theta, u)
 
     def index(self, prefix: str) -> Tensor:
         """Positions in the flat vector of the parameters whose name starts with `prefix`."""
@@ -52,10 +54,14 @@ class FlatModel:
 
 
 class FixedModel:
-    """A discrete Lagrangian with closed-form partials: the model at one parameter vector."""
+    """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u)."""
 
-    def __init__(self, flat: FlatModel, theta: Tensor):
-        self.flat, self.theta = flat, theta
+    def __init__(self, flat: FlatModel, theta: Tensor, u: Tensor | None = None):
+        self.flat, self.theta, self.u = flat, theta, u
+
+    def at(self, u: Tensor) -> FixedModel:
+        """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
+        return FixedModel(self.flat, self.theta, u)
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """L_d, shape (...)."""
@@ -63,4 +69,4 @@ class FixedModel:
 
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
         """See `herglotz.mechanics.partials`."""
-        return self.flat.partials(self.theta, q0, q1, s0, h, order)
+        return self.flat.partials(self.theta, q0, q1, s0, h, order, self.u)

@@ -26,11 +26,17 @@ class SegmentGrid:
     start_sample: Tensor  # (S,) row of the data at the start of each segment
     joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
     end: Tensor  # (S,) last node of each segment
+    row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
 
     @property
     def segments(self) -> int:
         """Number of segments S."""
         return self.h.shape[0]
+
+    @property
+    def longest(self) -> int:
+        """Model steps of the longest segment."""
+        return self.h.shape[1]
 
 
 def substeps(h: float, max_step: float) -> int:
@@ -45,6 +51,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     is the first of the next; it is observed once, by the earlier segment.
     """
     steps: list[list[float]] = []
+    rows: list[list[int]] = []
     nodes: list[list[tuple[int, int]]] = []  # (k, sample) of the observed nodes
     starts: list[int] = []
     joined: list[int] = []
@@ -55,15 +62,18 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         for i, (a, b) in enumerate(pairwise(bounds)):
             joined.append(-1 if i == 0 else len(starts) - 1)
             starts.append(a)
-            line, seen = [], [(0, a)] if i == 0 else []
+            line, from_row, seen = [], [], [(0, a)] if i == 0 else []
             for j in range(a, b):
                 m = substeps(times[j + 1] - times[j], max_step)
                 line += [(times[j + 1] - times[j]) / m] * m
+                from_row += [j] * m
                 seen.append((len(line), j + 1))
             steps.append(line)
+            rows.append(from_row)
             nodes.append(seen)
     K = max(len(line) for line in steps)
     padded = [line + [line[-1]] * (K - len(line)) for line in steps]
+    padded_rows = [line + [line[-1]] * (K - len(line)) for line in rows]
     device = data.t.device
     return SegmentGrid(
         h=torch.tensor(padded, dtype=data.t.dtype, device=device),
@@ -72,4 +82,5 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         start_sample=torch.tensor(starts, device=device),
         joined_to=torch.tensor(joined, device=device),
         end=torch.tensor([len(line) for line in steps], device=device),
+        row=torch.tensor(padded_rows, device=device),
     )

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.mechanics import momentum_plus, step_derivative
 from herglotz.stepping import Status, solve_step
-from herglotz.training.flat import FlatModel
+from herglotz.training.flat import FixedModel, FlatModel
 
 
 @dataclass(frozen=True)
@@ -34,12 +34,13 @@ def solve_path(
     guess: Tensor,  # (S, K+1, 2n+1)
     tol: float,
     sweeps: int = 12,
+    u: Tensor | None = None,  # (S, K, m) input of every step
 ) -> Path | None:
     """The trajectories from `start`, or None where the sweeps do not converge."""
     x = torch.cat([start[:, None], guess[:, 1:]], 1)
     previous = float("inf")
     for _ in range(sweeps):
-        stepped = _all_steps(flat, theta, x, h)
+        stepped = all_steps(flat.at(theta, u), x, h)
         if stepped is None:
             return None
         y, A = stepped
@@ -57,12 +58,12 @@ def solve_path(
     return None
 
 
-def _all_steps(flat: FlatModel, theta: Tensor, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
     """Φ̃ at every state but the last, and its derivative; None if any step fails."""
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]
     tol = 64 * torch.finfo(x.dtype).eps
-    solution = solve_step(flat.at(theta), q0, p0, s0, h, x[:, 1:, :n], tol)
+    solution = solve_step(L_d, q0, p0, s0, h, x[:, 1:, :n], tol)
     if not bool((solution.status == Status.CONVERGED).all()):
         return None
     P = solution.P

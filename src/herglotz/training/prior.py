@@ -13,7 +13,9 @@ from herglotz.training.flat import FlatModel
 
 # Parameters of order one, by the beginning of their names.
 NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.network", "action.log_slope",
-            "action.weight", "action.bias", "friction.log")  # fmt: skip
+            "action.weight", "action.bias")  # fmt: skip
+WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
+BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
 class Prior:
@@ -25,7 +27,8 @@ class Prior:
     * Every network weight is N(its start, `weight`²): weak, it only keeps unseen directions from drifting. (Centred
       at 0 it would switch the network off: behind a zero-initialised last layer nothing else holds the first one.)
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
-      friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²).
+      friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
+      its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
     """
 
     def __init__(
@@ -44,7 +47,9 @@ class Prior:
         self.departure = departure
         self.weight_index = self._index(*NETWORKS)
         self.rate_index = self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous")
-        self.force_index = self._index("friction.coulomb", "friction.breakaway")
+        self.width_index = self._index("friction.log")
+        self.force_index = self._index("friction.coulomb")
+        self.breakaway_index = self._index("friction.breakaway")
         self.start, self.rate_spread, self.weight = theta, rate_spread, weight
         unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
         speed = low.new_tensor(model.config.speed)
@@ -60,6 +65,8 @@ class Prior:
         parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
         if len(self.force_index):
             parts.append(moved[self.force_index] / (self.rate_spread * max(self.flat.model.config.speed)))
+            parts.append(moved[self.breakaway_index] / (BREAKAWAY * self.force))
+            parts.append(moved[self.width_index] / WIDTH)
         if self.departure is not None:
             parts += [x / (self.departure * x.numel() ** 0.5) for x in self._departures(theta)]
         return torch.cat(parts)

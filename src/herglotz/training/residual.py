@@ -18,9 +18,12 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
 from herglotz.training.distributed import add_over_processes, own_share, world
 from herglotz.training.flat import FlatModel
+from herglotz.training.inputs import step_inputs
 from herglotz.training.prior import Prior
+from herglotz.training.robust import loss, root_weights
 
 OBJECTIVES = ("position", "raw")
+MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost more than all the rest
 
 
 class ResidualProblem:
@@ -40,6 +43,8 @@ class ResidualProblem:
         Scale of r: a standard deviation, in units of q.
     prior
         Penalty on the parameters.
+    freedom
+        Degrees of freedom ν of Student's t for r/σ (`robust`); None: least squares.
     chunk
         Triples whose Jacobian is held in memory at once.
     """
@@ -53,13 +58,17 @@ class ResidualProblem:
         max_step: float | None = None,
         sigma: float = 1.0,
         prior: Prior | None = None,
+        freedom: float | None = None,
         chunk: int = 4096,
     ):
         self.flat = FlatModel(model)
         self.data, self.metric, self.sigma, self.prior, self.chunk = data, metric, sigma, prior, chunk
+        self.freedom = freedom
         self.triples: Triples = data.triples(max_step)
         self.coupled = model.s_enters_motion
+        self.u = step_inputs(model, data)  # (N, m)
         self.latents = len(data) if self.coupled else 0
+        self.many = data.dof >= MANY and not self.coupled and metric == "position"
 
     def start(self) -> Tensor:
         """The flat unknowns: parameters, then the latents (zero)."""
@@ -71,11 +80,12 @@ class ResidualProblem:
         theta, latent = self._split(x)
         t = self.triples
         with torch.no_grad():
-            return self._local(theta, t.q0, t.q1, t.q2, self._action(theta, latent)[t.index], t.h0, t.h1)
+            s0 = self._action(theta, latent)[t.index]
+            return self._local(theta, t.q0, t.q1, t.q2, s0, t.h0, t.h1, *self._inputs(t.index))
 
     def cost(self, x: Tensor) -> Tensor:
         """½ Σ |r|²/σ² + prior."""
-        cost = self.residuals(x).square().sum() / (2 * self.sigma**2)
+        cost = loss(self.residuals(x) / self.sigma, self.freedom)
         return cost if self.prior is None else cost + self.prior.cost(self._split(x)[0])
 
     def cost_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -86,8 +96,9 @@ class ResidualProblem:
         t, (rank, processes) = self.triples, world()
         own = slice(rank, None, processes)
         theta = x.detach().requires_grad_()
-        r = self._local(theta, t.q0[own], t.q1[own], t.q2[own], torch.zeros_like(t.h0[own]), t.h0[own], t.h1[own])
-        cost = r.square().sum() / (2 * self.sigma**2)
+        inputs, zero = self._inputs(t.index[own]), torch.zeros_like(t.h0[own])
+        r = self._local(theta, t.q0[own], t.q1[own], t.q2[own], zero, t.h0[own], t.h1[own], *inputs)
+        cost = loss(r / self.sigma, self.freedom)
         if self.prior is not None and rank == 0:
             cost = cost + self.prior.cost(theta)
         (gradient,) = torch.autograd.grad(cost, theta)
@@ -102,22 +113,29 @@ class ResidualProblem:
         ds = self._action_derivative(theta, s) if self.coupled else None
         A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         cost = x.new_zeros(())
-        t = self.triples
+        t, axes = self.triples, (0,) * 6 + ((None, None) if self.u is None else (0, 0))
         _, processes = world()
         chunk = min(self.chunk, -(-len(t.q0) // processes))
         for part in own_share(torch.arange(len(t.q0), device=x.device).split(chunk)):
             arguments = (t.q0[part], t.q1[part], t.q2[part], s[t.index[part]], t.h0[part], t.h1[part])
+            arguments += self._inputs(t.index[part])
             r = self._local(theta, *arguments)
-            J = vmap(jacrev(self._local), (None, 0, 0, 0, 0, 0, 0))(theta, *arguments)
+            if self.many:
+                J = self._many(theta, *arguments)
+            else:
+                J = vmap(jacrev(self._local), (None, *axes))(theta, *arguments)
             if ds is not None:
-                r_s = vmap(jacrev(self._local, 4), (None, 0, 0, 0, 0, 0, 0))(theta, *arguments)
+                r_s = vmap(jacrev(self._local, 4), (None, *axes))(theta, *arguments)
                 J = torch.cat([J, torch.zeros_like(J[..., :1]).expand(*J.shape[:-1], self.latents)], -1)
                 J = J + r_s[..., None] * ds[t.index[part]][:, None, :]
             J = J.reshape(-1, len(x)) / self.sigma
             r = r.reshape(-1) / self.sigma
+            cost += loss(r, self.freedom)
+            if self.freedom is not None:
+                by = root_weights(r, self.freedom)
+                J, r = by[:, None] * J, by * r
             A += J.T @ J
             b += J.T @ r
-            cost += r.square().sum() / 2
         add_over_processes(A, b, cost)
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
@@ -131,13 +149,46 @@ class ResidualProblem:
         P = len(x) - self.latents
         return x[:P], x[P:]
 
-    def _local(self, theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, s0: Tensor, h0: Tensor, h1: Tensor) -> Tensor:
+    def _inputs(self, rows: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Inputs of the two steps of the triples that start at these rows; None, None for a model without inputs."""
+        return (None, None) if self.u is None else (self.u[rows], self.u[rows + 1])
+
+    def _local(
+        self,
+        theta: Tensor,
+        q0: Tensor,
+        q1: Tensor,
+        q2: Tensor,
+        s0: Tensor,
+        h0: Tensor,
+        h1: Tensor,
+        u0: Tensor | None,
+        u1: Tensor | None,
+    ) -> Tensor:
         """J⁻¹R (or R) of one triple or of a batch of them."""
-        before = self.flat.partials(theta, q0, q1, s0, h0, 1)
-        after = self.flat.partials(theta, q1, q2, s0 + before.L, h1, 2)
+        before = self.flat.partials(theta, q0, q1, s0, h0, 1, u0)
+        after = self.flat.partials(theta, q1, q2, s0 + before.L, h1, 2, u1)
         p = momentum_plus(before)
         R = momentum_residual(after, p)
-        return R if self.metric == "raw" else solve(momentum_jacobian(after, p), R)
+        if self.metric == "raw":
+            return R
+        return solve(momentum_jacobian(after, p), R)
+
+    def _many(self, theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, s0: Tensor, h0: Tensor, h1: Tensor,
+              u0: Tensor | None, u1: Tensor | None) -> Tensor:  # fmt: skip
+        """J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
+
+        def residual(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor, *u: Tensor) -> Tensor:
+            before = self.flat.partials(theta, q0, q1, torch.zeros_like(h0), h0, 1, *u[:1])
+            after = self.flat.partials(theta, q1, q2, torch.zeros_like(h1), h1, 1, *u[1:])
+            return momentum_residual(after, momentum_plus(before))
+
+        inputs = () if u0 is None or u1 is None else (u0, u1)
+        R = vmap(jacrev(residual), (None, *(0,) * (5 + len(inputs))))(theta, q0, q1, q2, h0, h1, *inputs)
+        with torch.no_grad():
+            p = momentum_plus(self.flat.partials(theta, q0, q1, s0, h0, 1, u0))
+            J = momentum_jacobian(self.flat.partials(theta, q1, q2, s0, h1, 2, u1), p)
+        return torch.linalg.solve_ex(J, R)[0]
 
     def _action(self, theta: Tensor, latent: Tensor) -> Tensor:
         """S at every sample, (N,): integrated along the recorded positions; zero where it does not matter."""

@@ -104,7 +104,7 @@ class Selection:
 
 def select(
     data: Trajectories,
-    levels: Sequence[str] = CANDIDATES,
+    levels: Sequence[str] | None = None,
     seeds: int = 3,
     config: FitConfig | None = None,
     *,
@@ -126,7 +126,8 @@ def select(
     data
         Trajectories of positions.
     levels
-        Which levels, of `herglotz.models.LEVELS`; tried and preferred in the ladder's order.
+        Which levels, of `herglotz.models.LEVELS`; tried and preferred in the ladder's order. None: all but the full one
+        or, where inputs are recorded and used, those that can take them.
     seeds
         Fits a level, with seeds config.seed, config.seed + 1, …
     config
@@ -142,6 +143,8 @@ def select(
         If a level is unknown or nothing is held out, or no level has a finite held-out error.
     """
     config = config or FitConfig()
+    if levels is None:
+        levels = ("forced",) if data.u is not None and config.use_inputs else CANDIDATES
     unknown = [level for level in levels if level not in LEVELS]
     if unknown or not levels:
         raise InputError(f"unknown level {unknown or 'list'}; choose some of {', '.join(LEVELS)}")

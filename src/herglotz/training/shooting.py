@@ -4,7 +4,7 @@ Unknowns are the parameters and the state (q, p[, s]) at the start of every segm
 
     (q_model − q_data) / σ     at every sample,
     (end of a segment − start of the next) / weight     between segments,
-    s / (speed · size)                                  at the start of a trajectory, where the motion depends on s,
+    (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
 
 and the prior. Derivatives run through every implicit step by the implicit-function theorem: with
 F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ. Segments grow until each trajectory is one.
@@ -23,8 +23,10 @@ from herglotz.stepping import Stepper
 from herglotz.training.distributed import add_over_processes, everywhere, own_share, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.grid import SegmentGrid
+from herglotz.training.inputs import step_inputs
 from herglotz.training.lifted import Path, solve_path
 from herglotz.training.prior import Prior
+from herglotz.training.robust import loss, root_weights
 
 
 class ShootingProblem:
@@ -35,13 +37,17 @@ class ShootingProblem:
     model
         Its current parameters are not changed.
     data
-        Trajectories of positions.
+        Trajectories of positions, and of inputs where the model takes them.
     grid
         The segments.
     sigma
         Standard deviation of the noise on q.
     prior
         Penalty on the parameters.
+    freedom
+        Degrees of freedom ν of Student's t for the residuals of data and joints (`robust`); None: least squares.
+    s
+        (N,) s at every sample in the model's unit, where it is known: trajectories start from it, not from about 0.
     chunk
         Steps whose parameter Jacobian is held in memory at once.
     """
@@ -54,11 +60,16 @@ class ShootingProblem:
         *,
         sigma: float,
         prior: Prior | None = None,
+        freedom: float | None = None,
+        s: Tensor | None = None,
         chunk: int = 4096,
     ):
+        self.freedom = freedom
         self.flat, self.grid, self.data = FlatModel(model), grid, data
         self.sigma, self.prior, self.chunk = sigma, prior, chunk
         self.n = data.dof
+        u = step_inputs(model, data)
+        self.u = None if u is None else u[grid.row]  # (S, K, m)
         # s is an unknown only where the positions depend on it.
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
         self.P = len(self.flat.get())
@@ -68,7 +79,9 @@ class ShootingProblem:
         relative = sigma / scale
         self.action = float((speed * scale).sum())  # natural size of s
         action = (speed * scale * relative)[: self.d - 2 * self.n]
+        self.s = s
         self.joint_weight = torch.cat([scale * relative, speed * relative, action])
+        self._solved: tuple[Tensor, Path | None] | None = None
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
 
     def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
@@ -86,15 +99,18 @@ class ShootingProblem:
 
     def solve(self, x: Tensor) -> Path | None:
         """The trajectories of all segments at x, or None where a step has no solution."""
+        if self._solved is not None and torch.equal(self._solved[0], x):
+            return self._solved[1]  # an accepted step has been solved for its cost
         theta, states = self.unpack(x)
         start = torch.cat([states, states.new_zeros(len(states), 2 * self.n + 1 - self.d)], -1)
         tol = 1e3 * torch.finfo(x.dtype).eps
         with torch.no_grad():
             path = None
             if self.path is not None:
-                path = solve_path(self.flat, theta, start, self.grid.h, self.path.x, tol)
+                path = solve_path(self.flat, theta, start, self.grid.h, self.path.x, tol, u=self.u)
             if path is None:
                 path = self._step_through(theta, start, tol)
+        self._solved = x.clone(), path
         return path
 
     def cost(self, x: Tensor) -> Tensor:
@@ -103,8 +119,8 @@ class ShootingProblem:
         if path is None:
             return x.new_full((), torch.inf)
         fit, joints = self._residuals(path.x)
-        anchor = x[self._anchored()] / self.action
-        cost = (fit.square().sum() + joints.square().sum() + anchor.square().sum()) / 2
+        anchor = self._anchor(x)
+        cost = loss(fit, self.freedom) + loss(joints, self.freedom) + anchor.square().sum() / 2
         return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -117,10 +133,13 @@ class ShootingProblem:
         grid, n, d, P = self.grid, self.n, self.d, self.P
         Z = self.sensitivities(theta, path)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
+        cost = loss(fit, self.freedom) + loss(joints, self.freedom)
+        by_fit, by_joint = root_weights(fit, self.freedom), root_weights(joints, self.freedom)
+        fit, joints = by_fit * fit, by_joint * joints
         S = grid.segments
         A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         segment = grid.node // (grid.h.shape[1] + 1)
-        rows = Z.flatten(0, 1)[grid.node][:, :n] / self.sigma  # (N', n, P + d)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.sigma)[..., None]  # (N', n, P + d)
         for k in range(S):
             own = segment == k
             self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, x))
@@ -128,12 +147,12 @@ class ShootingProblem:
             before = int(grid.joined_to[k])
             J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
             columns = torch.cat([self._columns(before, x), self._columns(k, x)[P:]])
-            self._add(A, b, J / self.joint_weight[:, None], joints[k], columns)
+            self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
         anchored = self._anchored()
-        A[anchored, anchored] += 1 / self.action**2
-        b[anchored] += x[anchored] / self.action**2
-        anchor = x[anchored] / self.action
-        cost = (fit.square().sum() + joints.square().sum() + anchor.square().sum()) / 2
+        anchor = self._anchor(x)
+        A[anchored, anchored] += 1 / self._anchor_weight**2
+        b[anchored] += anchor / self._anchor_weight
+        cost = cost + anchor.square().sum() / 2
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
             A[:P, :P] += prior_A
@@ -152,15 +171,20 @@ class ShootingProblem:
         return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
 
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples."""
-        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] / self.sigma
+        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
+
+        With a robust loss both carry the square roots of the weights.
+        """
+        r = self.misfit(path) / self.sigma
+        by = root_weights(r, self.freedom)
+        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] * (by / self.sigma)[..., None]
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
         J[..., : self.P] = Z[..., : self.P]
         for i in range(self.d):
             J[torch.arange(len(order)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
-        return (self.misfit(path) / self.sigma)[order].flatten(), J[order].flatten(0, 1)
+        return (by * r)[order].flatten(), J[order].flatten(0, 1)
 
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
@@ -169,6 +193,18 @@ class ShootingProblem:
         ends = x[before, self.grid.end[before], : self.d]
         joints = (ends - x[:, 0, : self.d]) / self.joint_weight
         return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+
+    @property
+    def _anchor_weight(self) -> float:
+        """Standard deviation of the first s of a trajectory: its natural size or, where s is known, as a joint's."""
+        return self.action if self.s is None else float(self.joint_weight[-1])
+
+    def _anchor(self, x: Tensor) -> Tensor:
+        """Residuals of the first s of each trajectory."""
+        first = x[self._anchored()]
+        if self.s is not None and len(first):
+            first = first - self.s[self.grid.start_sample[self.grid.joined_to < 0]]
+        return first / self._anchor_weight
 
     def _anchored(self) -> Tensor:
         """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
@@ -188,11 +224,12 @@ class ShootingProblem:
     def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
         """Solve by stepping, when there is no nearby trajectory to start from."""
         n = self.n
-        out = Stepper(self.flat.at(theta)).rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h)
+        stepper = Stepper(self.flat.at(theta))
+        out = stepper.rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h, inputs=self.u)
         if not bool(out.ok.all()):
             return None
         guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
-        return solve_path(self.flat, theta, start, self.grid.h, guess, tol)
+        return solve_path(self.flat, theta, start, self.grid.h, guess, tol, u=self.u)
 
     def sensitivities(self, theta: Tensor, path: Path) -> Tensor:
         """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
@@ -213,18 +250,23 @@ class ShootingProblem:
         q0, p0, s0 = (x[:, :-1, :n].flatten(0, 1), x[:, :-1, n : 2 * n].flatten(0, 1), x[:, :-1, 2 * n].flatten())
         q1, h = x[:, 1:, :n].flatten(0, 1), self.grid.h.flatten()
 
-        def step_functions(theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-            P = self.flat.partials(theta, q0, q1, s0, h, 1)
+        u = None if self.u is None else self.u.flatten(0, 1)
+
+        def step_functions(
+            theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
+        ) -> Tensor:
+            P = self.flat.partials(theta, q0, q1, s0, h, 1, u)
             return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
 
-        per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0))
+        per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
         out = x.new_zeros(S * K, 2 * n + 1, self.P)
         chunk = min(self.chunk, -(-S * K // world()[1]))
         for part in own_share(torch.arange(S * K, device=x.device).split(chunk)):
             here = q0[part], q1[part], p0[part], s0[part], h[part]
-            G = per_step(theta, *here)  # (chunk, 2n+1, P)
+            inputs = None if u is None else u[part]
+            G = per_step(theta, *here, inputs)  # (chunk, 2n+1, P)
             with torch.no_grad():
-                P = partials(self.flat.at(theta), here[0], here[1], here[3], here[4], order=2)
+                P = partials(self.flat.at(theta, inputs), here[0], here[1], here[3], here[4], order=2)
                 J = momentum_jacobian(P, here[2])
                 dq1 = -torch.linalg.solve_ex(J, G[:, :n])[0]
                 p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2

@@ -13,14 +13,18 @@ from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.flat import FlatModel
 from herglotz.training.grid import segment_grid
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.lifted import Path
 from herglotz.training.prior import Prior
+from herglotz.training.robust import FREEDOM, MAD, heavy_tailed, root_weights, scale_of
 from herglotz.training.shooting import ShootingProblem
 from herglotz.training.stages import Stages
 
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
+START = 8  # samples that a robust start state is read from
+LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,26 @@ class TrajectoryFit:
     departure: float | None  # prior strength, where the model has a potential network
     held_out: dict[float, Tensor]  # error of every fold, for every strength tried
     result: OptimiserResult
+
+
+@dataclass(frozen=True)
+class _Stage:
+    """A fit at one length of the segments."""
+
+    theta: Tensor  # (P,)
+    problem: ShootingProblem
+    path: Path
+    result: OptimiserResult
+
+    @property
+    def misfit(self) -> Tensor:
+        """Residuals of the data, (N', n), in units of q."""
+        return self.problem.misfit(self.path)
+
+    @property
+    def noise(self) -> float:
+        """Their scale."""
+        return _noise(self.problem, self.path)
 
 
 class StatesOnly:
@@ -84,10 +108,14 @@ def fit_trajectories(
     stages: Stages,
     *,
     frozen: bool = False,
+    robust: str = "auto",
+    s: Tensor | None = None,
 ) -> TrajectoryFit | None:
     """Fit parameters and states to positions (or, `frozen`, the states alone).
 
-    Segments grow from 20 steps to whole trajectories, each stage started from the states of the one before. Then every
+    Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
+    the states of the one before. With `robust` "auto" the first stage is fitted with Student's t as well, and where
+    that leaves outliers it is the loss of all further stages (`herglotz.training.robust`). Then every
     prior strength is fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted
     with. The strongest prior whose held-out error is not beaten beyond its spread wins.
 
@@ -98,23 +126,41 @@ def fit_trajectories(
     """
     if model.potential.network is None or frozen:
         departures = departures[:1]
-    theta = ShootingProblem(model, data, segment_grid(data, FIRST_SEGMENT, base.max_step), sigma=sigma).flat.get()
-    last: tuple[ShootingProblem, Path, OptimiserResult] | None = None
-    for length in segment_lengths(data):
+    theta, exact = FlatModel(model).get(), 1e-6 * max(base.scale)
+
+    def stage(length: int, sigma: float, freedom: float | None, before: _Stage | None) -> _Stage | None:
         grid = segment_grid(data, length, base.max_step)
-        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=make_prior(model, base, departures[0]))
-        states = _first_states(problem, theta) if last is None else last[0].states_at(last[1], grid.start_sample)
-        result, theta_new = _optimise(problem, theta, states, f"segments of {length}", iterations, stages, frozen)
-        path = problem.solve(problem.pack(theta_new, result.x[-states.numel() :].reshape(states.shape)))
-        if path is None or not math.isfinite(result.cost):
-            break
-        theta, last = theta_new, (problem, path, result)
+        prior = make_prior(model, base, departures[0])
+        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, s=s)
+        if before is None:
+            start, states = theta, _first_states(problem, theta)
+        else:
+            start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
+        name = f"segments of {length}" + (", robust" if freedom else "")
+        result, found = _optimise(problem, start, states, name, iterations, stages, frozen)
+        path = problem.solve(problem.pack(found, result.x[-states.numel() :].reshape(states.shape)))
+        return None if path is None or not math.isfinite(result.cost) else _Stage(found, problem, path, result)
+
+    freedom = FREEDOM if robust == "on" else None
+    lengths = segment_lengths(data)
+    last = stage(lengths[0], sigma, freedom, None)
     if last is None:
         return None
+    if robust == "auto" and not frozen:  # outliers stand out best where segments are short
+        trial = stage(lengths[0], max(scale_of(last.misfit), 1e-3 * exact), FREEDOM, None)
+        if trial is not None and heavy_tailed(trial.misfit):
+            last, freedom = trial, FREEDOM
+    best = last.noise
+    for length in lengths[1:]:
+        if not frozen:
+            sigma = last.noise if freedom else max(sigma, last.noise)
+        longer = stage(length, sigma, freedom, last)
+        if longer is None or (not frozen and longer.noise > LOST * max(best, exact)):
+            break  # no parameters follow the data for so long: chaos, or forces that the model does not know
+        last, best = longer, min(best, longer.noise)
     if frozen:
-        problem, path, result = last
-        return TrajectoryFit(theta, problem, path, sigma, None, {}, result)
-    return _choose_departure(model, data, base, departures, iterations, stages, theta, last)
+        return TrajectoryFit(last.theta, last.problem, last.path, sigma, None, {}, last.result)
+    return _choose_departure(model, data, base, departures, iterations, stages, last)
 
 
 def _choose_departure(
@@ -124,12 +170,10 @@ def _choose_departure(
     departures: tuple[float, ...],
     iterations: int,
     stages: Stages,
-    theta: Tensor,
-    last: tuple[ShootingProblem, Path, OptimiserResult],
+    last: _Stage,
 ) -> TrajectoryFit:
-    problem, path, result = last
-    grid = problem.grid
-    first = TrajectoryFit(theta, problem, path, _noise(problem, path), departures[0], {}, result)
+    grid = last.problem.grid
+    first = TrajectoryFit(last.theta, last.problem, last.path, last.noise, departures[0], {}, last.result)
     fits: list[TrajectoryFit] = []
     held_out: dict[float, Tensor] = {}
     previous = first
@@ -137,7 +181,8 @@ def _choose_departure(
     weakest = max(departures)
     for number, departure in enumerate([weakest, *sorted(departures, reverse=True)]):
         sigma = _noise(previous.problem, previous.path) if number <= 1 else previous.sigma
-        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=make_prior(model, base, departure))
+        prior = make_prior(model, base, departure)
+        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=last.problem.freedom)
         problem.path = previous.path
         states = problem.states_at(previous.path, grid.start_sample)
         name = f"prior {departure:g}" if number else "noise"
@@ -179,14 +224,42 @@ def _optimise(
 
 
 def _first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
-    """Segment states from the first two samples of each, p by FL⁻."""
+    """Segment states from the first two samples of each, p by FL⁻; from a robust cubic where one may be an outlier."""
     i, data = problem.grid.start_sample, problem.data
+    q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
     with torch.no_grad():
-        zero = torch.zeros_like(data.t[i])
-        q, p, _ = legendre_minus(problem.flat.at(theta), data.q[i], data.q[i + 1], zero, data.t[i + 1] - data.t[i])
-    return problem.states(q, p)
+        s = torch.zeros_like(data.t[i]) if problem.s is None else problem.s[i]
+        u = None if problem.u is None else problem.u[:, 0]
+        L_d = problem.flat.at(theta, u)
+        q, p, _ = legendre_minus(L_d, q0, q1, s, data.t[i + 1] - data.t[i])
+    return problem.states(q, p, s)
+
+
+def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions at `rows` and at the samples after, (S, n) each, on cubics through eight samples by Student's t."""
+    first, second = data.q[rows].clone(), data.q[rows + 1].clone()
+    fits = rows + START < data.samples
+    inside = data.trajectory[(rows + START - 1).clamp_max(data.samples - 1)] == data.trajectory[rows]
+    here = (fits & inside).nonzero()[:, 0]
+    if not len(here):
+        return first, second
+    near = rows[here, None] + torch.arange(START, device=rows.device)
+    x = data.t[near] - data.t[rows[here]][:, None]
+    A = torch.stack([x**k for k in range(4)], -1)[:, None]  # (S, 1, START, 4)
+    q = data.q[near].mT[..., None]  # (S, n, START, 1)
+    c = torch.linalg.lstsq(A.expand(*q.shape[:2], -1, -1), q).solution
+    for _ in range(10):
+        r = A @ c - q
+        scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(q.dtype).tiny)
+        by = root_weights(r / scale, FREEDOM)
+        c = torch.linalg.lstsq(by * A, by * q).solution
+    values = (A @ c)[..., 0]
+    first[here], second[here] = values[..., 0], values[..., 1]
+    return first, second
 
 
 def _noise(problem: ShootingProblem, path: Path) -> float:
-    """RMS of the residuals, in units of q."""
-    return float(problem.misfit(path).square().mean().sqrt())
+    """Scale of the residuals, in units of q: their RMS, weighted where the loss is robust."""
+    misfit = problem.misfit(path)
+    weighted = misfit * root_weights(misfit / problem.sigma, problem.freedom)
+    return float(weighted.square().mean().sqrt())

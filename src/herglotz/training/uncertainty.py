@@ -8,6 +8,7 @@ residuals.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import NormalDist
 
@@ -15,11 +16,13 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.spikes import spikes, without
 from herglotz.errors import InputError
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.grid import segment_grid
 from herglotz.training.lifted import Path
+from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run
 from herglotz.training.shooting import ShootingProblem
 from herglotz.training.trajectory_fit import make_prior
@@ -73,7 +76,11 @@ class Laplace:
         self.run = run
         data = run.data.unwrapped()
         train = _first(data, run.train_lengths)
-        self.base = estimate_baseline(train)
+        if run.config.robust != "off":
+            train = without(train, spikes(train))
+        self.freedom = FREEDOM if run.metrics.get("robust") else None
+        found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
+        self.base = estimate_baseline(train, outliers=found)
         self.sigma = float(run.metrics["sigma"])
         departure = run.metrics.get("departure") or run.config.departures[-1]
         self.prior = make_prior(run.model, self.base, departure)
@@ -141,7 +148,7 @@ class Laplace:
     def _solved(self, data: Trajectories, start: Tensor) -> tuple[ShootingProblem, Path]:
         """Each trajectory as one segment, solved from its start state (B, 2n+1)."""
         grid = segment_grid(data, max(data.lengths), self.base.max_step)
-        problem = ShootingProblem(self.run.model, data, grid, sigma=self.sigma, prior=self.prior)
+        problem = ShootingProblem(self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom)
         theta = problem.flat.get()
         path = problem.solve(problem.pack(theta, start[:, : problem.d]))
         if path is None:
@@ -154,10 +161,32 @@ def laplace(run: Run) -> Laplace:
     return Laplace(run)
 
 
+def ensemble_bands(runs: Sequence[Run]) -> Bands:
+    """The mean prediction of fits from several seeds to the same data, with their spread.
+
+    By the law of total variance the variance of the position is the mean of the fits' Laplace variances plus the
+    variance of their predictions: what one posterior sees around its own minimum, and how far apart the minima are.
+
+    Raises
+    ------
+    InputError
+        If there are fewer than two runs, or they were fitted to different data.
+    """
+    if len(runs) < 2:
+        raise InputError(f"an ensemble needs two runs or more, got {len(runs)}; fit other seeds")
+    if len({(run.data.digest(), run.train_lengths) for run in runs}) > 1:
+        raise InputError("the runs of an ensemble must be fits to the same data; only their seeds may differ")
+    bands = [laplace(run).bands() for run in runs]
+    q, std = torch.stack([b.q for b in bands]), torch.stack([b.std for b in bands])
+    sigma = (sum(b.sigma**2 for b in bands) / len(bands)) ** 0.5
+    return Bands(q.mean(0), (std.square().mean(0) + q.var(0)).sqrt(), sigma)
+
+
 def _first(data: Trajectories, lengths: tuple[int, ...]) -> Trajectories:
     """The leading samples of each trajectory."""
     index = torch.cat([torch.arange(f, f + k) for f, k in zip(data.offsets, lengths, strict=True)])
-    return replace(data, t=data.t[index], q=data.q[index], s=None, p=None, u=None, lengths=lengths)
+    u = None if data.u is None else data.u[index]
+    return replace(data, t=data.t[index], q=data.q[index], s=None, p=None, u=u, lengths=lengths)
 
 
 def _starts(run: Run) -> Tensor:

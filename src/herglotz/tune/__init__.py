@@ -2,7 +2,23 @@
 
 from herglotz.tune.config import TuneConfig
 from herglotz.tune.distil import distil
+from herglotz.tune.kicks import KickStepper, fit_kicks
+from herglotz.tune.kicks_c import CompiledKicks, export_kicks_c
+from herglotz.tune.local_error import local_errors
 from herglotz.tune.result import Candidate, Setting, Tuning, pareto
 from herglotz.tune.search import tune
 
-__all__ = ["Candidate", "Setting", "TuneConfig", "Tuning", "distil", "pareto", "tune"]
+__all__ = [
+    "Candidate",
+    "CompiledKicks",
+    "KickStepper",
+    "Setting",
+    "TuneConfig",
+    "Tuning",
+    "distil",
+    "export_kicks_c",
+    "fit_kicks",
+    "local_errors",
+    "pareto",
+    "tune",
+]

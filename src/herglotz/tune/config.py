@@ -22,6 +22,9 @@ class TuneConfig:
         Steps to try, in steps of the run: whole numbers, and multiples of 1/4 where the reference is the limit.
     widths
         Hidden units of the distilled corrections; none: nothing is re-trained.
+    kicks
+        Numbers of kicks of the large steps that solve nothing (`KickStepper`), tried at every step of the run or more
+        where the model has one coordinate and a constant c, in C; none: not tried.
     artefacts
         "eager" (PyTorch), "c" (compiled C, in float64 and float32).
     tolerances
@@ -42,6 +45,7 @@ class TuneConfig:
 
     multiples: tuple[float, ...] = (1, 2, 4, 8)
     widths: tuple[int, ...] = (8, 16)
+    kicks: tuple[int, ...] = ()
     artefacts: tuple[str, ...] = ARTEFACTS
     tolerances: tuple[float | None, ...] = (None, 1e-7)
     reference: str = "own"
@@ -68,6 +72,8 @@ class TuneConfig:
             raise InputError("multiples is empty; give at least one, such as 1")
         if any(w < 1 for w in self.widths):
             raise InputError(f"widths must be >= 1, got {self.widths}; leave them all out for no distillation")
+        if any(k < 1 for k in self.kicks):
+            raise InputError(f"kicks must be >= 1, got {self.kicks}; leave them all out for none")
         for name in ("quantile", "confidence"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(f"{name} must be in (0, 1), got {getattr(self, name):g}")

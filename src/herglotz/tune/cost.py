@@ -15,6 +15,7 @@ import torch
 
 from herglotz.export import CompiledStepper
 from herglotz.stepping import State
+from herglotz.tune.kicks_c import CompiledKicks
 
 EAGER_STEPS, EAGER_STARTS = 48, 2  # each enough to make the call around them small
 C_STARTS, C_STEPS = 16, 4096  # motions, and steps of them all in one timing, at least
@@ -58,6 +59,15 @@ def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
         repeats = max(1, C_STEPS // (count * steps))
         run, idle = (_native(stepper, starts, count, h, k, repeats) for k in (steps, 0))
         return Timed(run, count * steps * repeats, idle)
+    if isinstance(stepper, CompiledKicks):
+        count = min(C_STARTS, len(starts.s))
+        repeats = max(1, C_STEPS // (count * steps))
+        few = State(*(x[:count] for x in starts))
+        calls = []
+        for k in (steps, 0):
+            outputs = [torch.empty(count, k + 1, dtype=stepper.dtype) for _ in range(3)]
+            calls.append(_repeated(stepper.call(few, k, outputs), repeats))
+        return Timed(calls[0], count * steps * repeats, calls[1])
     steps, count = min(steps, EAGER_STEPS), min(EAGER_STARTS, len(starts.s))
     single = [State(*(x[i : i + 1] for x in starts)) for i in range(count)]
 
@@ -67,6 +77,14 @@ def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
                 stepper.rollout(*start, h=h, steps=steps)
 
     return Timed(run, count * steps)
+
+
+def _repeated(call: Callable[[], None], times: int) -> Callable[[], None]:
+    def run() -> None:
+        for _ in range(times):
+            call()
+
+    return run
 
 
 def _native(

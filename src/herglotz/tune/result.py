@@ -15,6 +15,7 @@ from herglotz.stepping import State
 from herglotz.training import Run
 from herglotz.tune.config import TuneConfig
 from herglotz.tune.cost import Cost
+from herglotz.tune.kicks import KickStepper
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,13 @@ class Setting:
     artefact: str
     dtype: str
     tol: float | None  # of the eager Newton iteration
+    kicks: int | None = None  # of a step that solves nothing, in place of a model
 
     @property
     def name(self) -> str:
         """For tables."""
+        if self.kicks is not None:
+            return f"h {self.h:.4g}, {self.kicks} kicks, C {self.dtype}"
         net = "own model" if self.width is None else f"distilled {self.width}"
         tol = "" if self.tol is None else f", tol {self.tol:g}"
         return f"h {self.h:.4g}, {net}, {'C' if self.artefact == 'c' else self.artefact} {self.dtype}{tol}"
@@ -46,6 +50,7 @@ class Candidate:
     worst: float
     cost: Cost
     model: ContactLagrangian = field(repr=False)
+    kicks: KickStepper | None = field(default=None, repr=False)  # what steps in place of the model
 
     @property
     def us(self) -> float:
@@ -60,12 +65,14 @@ class Candidate:
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
         s, e = self.setting, [self.median, self.bound, self.worst]
+        parameters = sum(p.numel() for p in self.model.parameters())
         median, bound, worst = (x if math.isfinite(x) else None for x in e)  # JSON has no infinity: a step failed
         return {
             "h": s.h, "multiple": s.multiple, "width": s.width, "artefact": s.artefact, "dtype": s.dtype, "tol": s.tol,
+            "kicks": s.kicks,
             "error_median": median, "error_bound": bound, "error_worst": worst,
             "step_us": self.cost.step_us, "us_per_time": self.us, "us_per_time_spread": self.spread,
-            "parameters": sum(p.numel() for p in self.model.parameters()),
+            "parameters": parameters if self.kicks is None else self.kicks.parameters,
         }  # fmt: skip
 
 
@@ -119,8 +126,11 @@ class Tuning:
     def tuned_run(self) -> Run:
         """The chosen model as a run with its own step, on motions of the reference: `save_run` it, then export it.
 
-        States (q, p, s) of the old run are states of this one.
+        States (q, p, s) of the old run are states of this one. Where kicks were chosen, which are no model, it is the
+        old run's model at its own step: `export_kicks_c(tuning.chosen.kicks, …)` writes the kicks.
         """
+        if self.chosen.kicks is not None:
+            return self.run
         s = self.chosen.setting
         dtype = getattr(torch, s.dtype)
         states = State(*(x.flatten(0, 1).to(dtype) for x in self.motions))

@@ -19,6 +19,8 @@ from herglotz.training import Run
 from herglotz.tune.config import TuneConfig, allowed_failures
 from herglotz.tune.cost import Cost, measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
+from herglotz.tune.kicks import KickStepper, can_kick, fit_kicks
+from herglotz.tune.kicks_c import CompiledKicks
 from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
 from herglotz.tune.result import Candidate, Setting, Tuning
 
@@ -32,6 +34,7 @@ class _Tried:
     model: ContactLagrangian
     stepper: Any
     errors: Tensor  # (B,) of the choosing starts
+    kicks: KickStepper | None = None
 
 
 def tune(
@@ -83,6 +86,7 @@ def tune(
         for key, model in _models(run, config, training, choosing, max_error, notes, bar):
             tried += _forms(key, model, key[0] * run.h, config, choosing, notes)
             bar.update(1)
+        tried += _kicks(run, config, training, choosing, notes, bar)
     costs = _costs(tried, choosing, config.rounds)
     candidates = [_candidate(t, cost, config) for t, cost in zip(tried, costs, strict=True)]
     chosen = choose(candidates, asked)
@@ -177,6 +181,29 @@ def _forms(
             notes.append(f"no C: {error}")
 
 
+def _kicks(
+    run: Run, config: TuneConfig, training: Motions, choosing: Motions, notes: list[str], bar: tqdm
+) -> Iterator[_Tried]:
+    """Steps of a few kicks and drifts, fitted to the reference's motions, in C."""
+    own = frozen_double(run)
+    if not config.kicks or "c" not in config.artefacts or not can_kick(own):
+        return
+    for m in sorted(m for m in config.multiples if m >= 1):
+        h = m * run.h
+        before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
+        for count in config.kicks:
+            bar.set_postfix_str(f"{count} kicks, h {h:.3g}")
+            found = fit_kicks(own, before, after, h, kicks=count, iterations=2 * config.iterations)
+            try:
+                for dtype in ("float64", "float32"):
+                    stepper = CompiledKicks(found, dtype)
+                    setting = Setting(m, h, None, "c", dtype, None, count)
+                    yield _Tried(setting, own, stepper, _errors(stepper, h, choosing), found)
+            except InputError as error:
+                notes.append(f"no C: {error}")
+                return
+
+
 def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
     """Largest |q − reference| of each motion, (B,), in float64; infinite where a step fails."""
     reference = motions.every(round(h / motions.base))
@@ -205,7 +232,7 @@ def _costs(tried: list[_Tried], choosing: Motions, rounds: int) -> list[Cost]:
 
 def _candidate(t: _Tried, cost: Cost, config: TuneConfig) -> Candidate:
     e = t.errors
-    return Candidate(t.setting, float(e.median()), bound_of(e, config), float(e.max()), cost, t.model)
+    return Candidate(t.setting, float(e.median()), bound_of(e, config), float(e.max()), cost, t.model, t.kicks)
 
 
 def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:

@@ -17,7 +17,7 @@ from herglotz.data import load
 from herglotz.models import LEVELS
 from herglotz.systems import scene_names
 from herglotz.training import load_run
-from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS
+from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 
 
 def run_json(capsys, *arguments: object) -> tuple[int, dict]:
@@ -61,6 +61,7 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit = herglotz.cli.fit
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, fit.DTYPES)
+    assert (ROBUST, SUPERVISION) == (fit.ROBUST, fit.SUPERVISION)
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
 

@@ -14,18 +14,18 @@ MEASURED = Path(__file__).resolve().parents[4] / "shared" / "data" / "ibm_double
 
 
 def write(path, angles, arms=(590.0, 455.0)):
-    """Markers of a pendulum at the given angles, y pointing down."""
+    """Markers of a pendulum at the given angles, x pointing down."""
     lines = []
     for a, b in angles:
-        x, y = 1200 + arms[0] * math.sin(a), 1100 + arms[0] * math.cos(a)
-        tip = x + arms[1] * math.sin(b), y + arms[1] * math.cos(b)
+        x, y = 1200 + arms[0] * math.cos(a), 1100 + arms[0] * math.sin(a)
+        tip = x + arms[1] * math.cos(b), y + arms[1] * math.sin(b)
         lines.append(",".join(str(round(v)) for v in (1200, 1100, x, y, *tip)))
     path.write_text("\n".join(lines) + "\n")
     return path
 
 
 def test_angles_are_absolute_from_hanging_down(tmp_path):
-    # fails if x and y are swapped, y points up, or the second angle is relative to the first arm
+    # fails if x and y are swapped, x points up, or the second angle is relative to the first arm
     angles = [(0.0, 0.0), (0.3, -0.2), (0.6, -0.4), (1.5, -2.0)]
     data = load(write(tmp_path / "7.csv", angles))
     torch.testing.assert_close(data.q, torch.tensor(angles, dtype=torch.float64), rtol=0, atol=3e-3)
@@ -59,8 +59,10 @@ def test_a_bad_row_is_named(tmp_path, rows, message):
 @pytest.mark.skipif(not MEASURED.is_dir(), reason="the measured double pendulum is not on this machine")
 @pytest.mark.parametrize("name", ["2.csv", "3.csv", "4.csv"])
 def test_the_measured_runs(name):
-    # fails if the published files are not read, or frames jump
+    # fails if the published files are not read, frames jump, or the arm comes to rest elsewhere than hanging down
     data = load(MEASURED / name)
     assert 17_000 < data.samples < 18_100
     assert float(data.q.diff(dim=0).abs().max()) < 0.4
     assert float(data.q[-2000:, 0].std()) < 0.1 * float(data.q[:2000, 0].std())  # free decay
+    assert abs(float(data.q[-2000:, 0].sin().mean())) < 0.1
+    assert float(data.q[-2000:, 0].cos().mean()) > 0.8  # it still swings by half a radian

@@ -65,5 +65,10 @@ def test_a_file_matches_the_eager_stepper(level, dtype, tmp_path):
     assert max(result[key] for key in ("q", "p", "s", "c")) <= (1e-12 if dtype == torch.float64 else 1e-5), result
     assert result["status"] == result["failed"] == 0
     q, p, s = states_of(1, 3, dtype)
+    ours = exported.init(q, q + 0.1 * p, s, 0.1)
+    with torch.no_grad():
+        eager = beside(model).init(q, q + 0.1 * p, s, 0.1)
+    for a, b in zip(ours, eager, strict=True):
+        torch.testing.assert_close(a, b)
     outside = exported.programs["rollout"](q + 100, p, s, torch.full((1, 3), 0.1).to(q))
     assert outside[6].tolist() == exported.outside_box(State(q + 100, p, s))[None].to(torch.uint8).tolist()

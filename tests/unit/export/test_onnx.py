@@ -115,7 +115,11 @@ def test_the_file_is_small_and_says_what_it_is(written):
     # fails if weights are stored twice, local paths are shipped, or the metadata is lost
     model, path, exported = written
     content = path.read_bytes()
-    assert len(content) < 100_000
+    proto = onnx.load(path)
+    constants = sum(len(x.raw_data) for x in proto.graph.initializer)
+    assert constants < 8 * sum(x.numel() * x.element_size() for x in model.parameters())
+    assert not any(node.op_type == "Constant" for node in proto.graph.node)
+    assert len(content) < 250_000  # eight steps written out, and one behind them
     assert b"site-packages" not in content
     assert b"src/herglotz" not in content
     known = exported.metadata
@@ -148,8 +152,61 @@ def test_wrong_states_are_refused(written):
         exported.step(State(q.requires_grad_(), p, s), 0.1)
     with pytest.raises(InputError, match="h must be finite and > 0"):
         exported.step(State(q.detach(), p, s), -0.1)
-    with pytest.raises(InputError, match=r"use a \.pt2 file for init"):
-        exported.init(q.detach(), p, s, 0.1)
+    with pytest.raises(InputError, match="q0 must be finite"):
+        exported.init(q.detach() * torch.nan, p, s, 0.1)
+    with pytest.raises(InputError, match="takes no inputs"):
+        exported.init(q.detach(), p, s, 0.1, u=p)
+
+
+def test_a_file_starts_from_positions(written):
+    # fails if init returns the momentum of FL⁻, or s0 in place of s1, or is not in the file
+    import base64
+
+    import onnxruntime as ort
+
+    model, _, exported = written
+    q0, delta, s0 = states_of(2, 5)
+    ours = exported.init(q0, q0 + 0.1 * delta, s0, 0.1)
+    with torch.no_grad():
+        eager = Stepper(model).init(q0, q0 + 0.1 * delta, s0, 0.1)
+    for a, b in zip(ours, eager, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+    found = ort.InferenceSession(str(written[1]), providers=["CPUExecutionProvider"]).get_modelmeta()
+    second = base64.b64decode(found.custom_metadata_map["herglotz_init"])
+    session = ort.InferenceSession(second, providers=["CPUExecutionProvider"])
+    names = [x.name for x in session.get_inputs()]
+    assert names == ["q0", "q1", "s0", "h"]
+    h = torch.full((5,), 0.1, dtype=torch.float64)
+    p, _ = session.run(None, {k: x.numpy() for k, x in zip(names, (q0, q0 + 0.1 * delta, s0, h), strict=True)})
+    torch.testing.assert_close(torch.as_tensor(p), eager.p, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("correction", [0, 4], ids=["explicit", "newton"])
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+def test_attempts_and_what_stands_behind_them_agree_with_eager(correction, dtype, tmp_path):
+    # fails if a step that an attempt has solved, a block taken again or the steps behind the last block differ, or if
+    # one h for each sample is read as one for all
+    model = model_of(2, "linear", correction, dtype)
+    exported = load_onnx(export_onnx(model, tmp_path / "linear.onnx", h=0.1))
+    q, p, s = (0.5 * x for x in states_of(2, 6, dtype))
+    single = dtype == torch.float32
+    tol = 1e-4 if single else 1e-11
+    own = torch.linspace(0.05, 0.15, 6, dtype=dtype)[:, None].expand(6, 35)
+    for h in (torch.full((35,), 0.1, dtype=dtype), own, torch.linspace(0.05, 0.15, 35, dtype=dtype)):
+        with torch.no_grad():
+            ours, eager = exported.rollout(q, p, s, h=h), Stepper(model).rollout(q, p, s, h=h)
+        for name in ("q", "p", "s", "sigma"):
+            torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=tol, atol=tol)
+        assert not ours.status.any()
+        assert float(ours.residual.max()) <= (1e-6 if single else 1e-14)
+    p[2] = torch.finfo(dtype).max / 4
+    with torch.no_grad():
+        lost, alone = exported.rollout(q, p, s, h=0.1, steps=35), exported.rollout(q[:2], p[:2], s[:2], h=0.1, steps=35)
+    assert lost.ok.tolist() == [True, True, False, True, True, True]
+    first = int((lost.status[2] != 0).int().argmax())
+    assert torch.isnan(lost.q[2, first + 1 :]).all()
+    assert (lost.status[2, first:] != 0).all()
+    torch.testing.assert_close(lost.q[:2], alone.q, rtol=tol, atol=tol)
 
 
 def test_strided_states_step_like_others(written):

@@ -14,7 +14,8 @@ from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compare, export_pt2, load_pt2, weights_digest
 from herglotz.export.equation import Equations, eliminate
 from herglotz.export.metadata import FORMAT
-from herglotz.export.module import Newton, RolloutModule, StepModule, status_of
+from herglotz.export.module import RolloutModule, StepModule
+from herglotz.export.newton import Newton, status_of
 from herglotz.mechanics import flow_derivative, partials, step_derivative
 from herglotz.models import LEVELS, ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
@@ -146,6 +147,28 @@ def test_the_graphs_of_every_level_step_like_the_model(level):
     torch.testing.assert_close(one[1], eager.p[:, 1], rtol=1e-12, atol=1e-12)
 
 
+def test_a_saved_file_takes_inputs(tmp_path):
+    # fails if u is lost in the file, or reaches another sample or step than its own
+    model = damped("forced", torch.float64, inputs=2)
+    exported = load_pt2(export_pt2(model, tmp_path / "driven.pt2", h=0.1))
+    q, p, s = states_of(1, 3)
+    u = torch.linspace(-1, 1, 3 * 4 * 2, dtype=torch.float64).reshape(3, 4, 2)
+    with torch.no_grad():
+        ours, eager = exported.rollout(q, p, s, h=0.1, steps=4, u=u), beside(model).rollout(q, p, s, h=0.1, inputs=u)
+        one, first = exported.step(State(q, p, s), 0.1, u[:, 0]), beside(model).step(State(q, p, s), 0.1, u=u[:, 0])
+        start, other = (
+            exported.init(q, q + 0.1 * p, s, 0.1, u[:, 0]),
+            beside(model).init(q, q + 0.1 * p, s, 0.1, u[:, 0]),
+        )
+    for name in ("q", "p", "s"):
+        torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(getattr(one.state, name), getattr(first.state, name), rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(getattr(start, name), getattr(other, name), rtol=1e-12, atol=1e-12)
+    for bad in (None, u[..., :1], u.float(), u * torch.nan):
+        with pytest.raises(InputError, match=r"input|finite"):
+            exported.rollout(q, p, s, h=0.1, steps=4, u=bad)
+
+
 def test_the_derivative_of_a_file_is_that_of_the_implicit_function_theorem(written):
     # fails if the solve is detached without the move −J⁻¹dF, or p1, s1 or c do not follow that move
     model, _, exported = written
@@ -257,12 +280,13 @@ def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone(written):
 
 def newton(model, iterations, q, p, s, h):
     """The loop of the exported graphs, turned by hand."""
-    solver = Newton(Equations.of(model).newton, iterations)
-    carry, problem = solver.start(q, s, torch.zeros_like(q)), (q, p, s, torch.full_like(s, h))
+    equations, h = Equations.of(model), torch.full_like(s, h)
+    solver = Newton(equations.newton, iterations)
+    carry, problem = solver.start(q, s, torch.zeros_like(q)), (q, p, s, h, *equations.field(q))
     while bool(solver.unfinished(carry[0], carry[1])):
         carry = solver.iterate(problem, carry, solver.equation.constants)
     _, done, x, delta, merit, _, _, _, L, c = carry
-    return q + x, status_of(problem[3], merit, delta.abs().amax(-1), done, L, c), delta.abs().amax(-1)
+    return q + x, status_of(h, merit, delta.abs().amax(-1), done, L, c), delta.abs().amax(-1)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])

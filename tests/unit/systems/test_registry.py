@@ -24,7 +24,7 @@ def test_scene_is_the_function():
 
 def test_unknown_scene():
     # fails if the message does not list the names to choose from
-    with pytest.raises(InputError, match="unknown scene 'pendulum'; choose one of damped_oscillator, damped_pendulum"):
+    with pytest.raises(InputError, match="unknown scene 'pendulum'; choose one of chain, damped_oscillator, damped_p"):
         scene("pendulum")
 
 
@@ -51,6 +51,13 @@ def test_value_that_is_no_number(value):
         ("quadratic_drag", {"m": -2.0}, "quadratic_drag: mass m must be > 0, got -2.0"),
         ("quadratic_drag", {"lam": 0.0}, "quadratic_drag: drag lam must not be 0, got 0.0"),
         ("kepler", {"m": 0.0}, "kepler: mass m must be > 0, got 0.0"),
+        ("chain", {"masses": 2.5}, "chain: masses must be a whole number >= 1, got 2.5"),
+        ("chain", {"masses": 0}, "chain: masses must be a whole number >= 1, got 0"),
+        ("chain", {"m": -1.0}, "chain: mass m must be > 0, got -1.0"),
+        ("chain", {"k": 0.0}, "chain: stiffness k must be > 0, got 0.0"),
+        ("chain", {"beta": -0.1}, "chain: hardening beta must be >= 0, got -0.1"),
+        ("rigid_body", {"J3": 0.0}, "moments must be > 0, none larger than the sum of the others, got 3.0, 2.0, 0.0"),
+        ("rigid_body", {"J1": 3.1}, "none larger than the sum of the others, got 3.1, 2.0, 1.0"),
     ],
 )
 def test_value_out_of_range(name, parameters, message):

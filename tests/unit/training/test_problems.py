@@ -306,7 +306,7 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"level": "cubic"}, "unknown level 'cubic'; choose one of conservative, linear, affine"),
+        ({"level": "cubic"}, "unknown level 'cubic'; choose one of auto, conservative, linear, affine"),
         ({"objective": "best"}, "unknown objective 'best'"),
         ({"optimiser": "sgd", "objective": "raw"}, "unknown optimiser 'sgd'"),
         ({"dtype": "float16"}, "unknown dtype 'float16'; choose one of float64, float32"),

@@ -1,12 +1,14 @@
 """The posterior of a fit: bands that cover, and directions that the data do not determine."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.systems import scene
-from herglotz.training import FitConfig, fit, laplace
+from herglotz.training import FitConfig, ensemble_bands, fit, laplace
 
 NOISE = 0.01
 SETTINGS = FitConfig(departures=(6e-4, 2e-3))
@@ -93,3 +95,20 @@ def test_the_level_is_checked(posteriors):
     # fails if a percentage is taken for a share
     with pytest.raises(InputError, match="between 0 and 1"):
         posteriors[0][1].bands().interval(90)
+
+
+def test_bands_of_seeds(posteriors):
+    # fails if the spread of the seeds, or each seed's own variance, is left out; or runs of other data are mixed in
+    run, posterior, _ = posteriors[0]
+    other = fit(run.data, replace(SETTINGS, seed=7), progress=False)
+    bands = ensemble_bands([run, other])
+    inside = bands.inside(run.data.q)[held_out(run)].double().mean()
+    assert 0.75 <= float(inside) <= 1.0
+    own, theirs = posterior.bands(), laplace(other).bands()
+    wanted = (own.std.square() + theirs.std.square()) / 2 + (own.q - theirs.q).square() / 2
+    torch.testing.assert_close(bands.std.square(), wanted)
+    torch.testing.assert_close(bands.q, (own.q + theirs.q) / 2)
+    with pytest.raises(InputError, match="two runs or more, got 1"):
+        ensemble_bands([run])
+    with pytest.raises(InputError, match="fits to the same data"):
+        ensemble_bands([run, posteriors[1][0]])

@@ -1,0 +1,126 @@
+"""Does `select` choose right? Eight generated scenes, two a level: `python benchmarks/ladder.py [--scenes NAMES]`.
+
+Each level of the ladder is needed by two scenes and offered to all eight: one that needs less must not be given more.
+Positions with a little noise; the levels, the seeds and every setting are the defaults of `select`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import subprocess
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from herglotz.data import Trajectories, simulate
+from herglotz.data.files import write_atomically
+from herglotz.systems import scene
+from herglotz.training import select
+
+ROOT = Path(__file__).resolve().parents[1]
+NOISE = 1e-3  # of the motion's size
+
+
+@dataclass(frozen=True)
+class CoupledMasses:
+    """Two unit masses, three springs, a damper on the second one only: q̈ = −K q − D q̇, exactly by exp(hA).
+
+    No single rate γ describes it, nor a damping of the whole by position: each joint has its own friction.
+    """
+
+    friction: tuple[float, float]
+    springs: tuple[float, float, float] = (1.0, 0.6, 1.4)
+    name = "coupled_masses"
+    dof = 2
+    coordinates = ("x", "y")
+    units = ("m", "m")
+    angles = (False, False)
+    q_range = (-1.0, 1.0)
+    v_range = (-1.0, 1.0)
+
+    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(q, p) a time h later; the action is not needed for positions and is left as it is."""
+        a, b, c = self.springs
+        K = torch.tensor([[a + b, -b], [-b, b + c]], dtype=q.dtype)
+        D = torch.diag(torch.tensor(self.friction, dtype=q.dtype))
+        A = torch.cat([torch.cat([torch.zeros_like(K), torch.eye(2, dtype=q.dtype)], 1), torch.cat([-K, -D], 1)])
+        y = torch.cat([q, p], -1) @ torch.linalg.matrix_exp(h * A).mT
+        return y[..., :2], y[..., 2:], s
+
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        """Unit masses: p = v."""
+        del q, s
+        return v
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene, the level that it needs, and the step at which it is sampled."""
+
+    level: str
+    what: object
+    h: float
+
+
+CASES = {
+    "undamped pendulum": Case("conservative", scene("damped_pendulum", gamma=0.0), 0.2),
+    "undamped masses": Case("conservative", CoupledMasses((0.0, 0.0)), 0.3),
+    "oscillator": Case("linear", scene("damped_oscillator"), 0.2),
+    "pendulum": Case("linear", scene("damped_pendulum"), 0.2),
+    "parachute": Case("affine", scene("parachute"), 0.2),
+    "quadratic drag": Case("affine", scene("quadratic_drag", lam=0.1), 0.2),
+    "one damper": Case("forced", CoupledMasses((0.0, 0.4)), 0.3),
+    "two dampers": Case("forced", CoupledMasses((0.5, 0.1)), 0.3),
+}
+
+
+def sampled(case: Case) -> Trajectories:
+    """8 trajectories of 61 positions with noise of a thousandth of the motion's size."""
+    clean = simulate(case.what, trajectories=8, steps=60, h=case.h)  # pyright: ignore[reportArgumentType]
+    noise = NOISE * float((clean.q - clean.q.mean(0)).square().mean().sqrt())
+    return simulate(case.what, trajectories=8, steps=60, h=case.h, noise=noise)  # pyright: ignore[reportArgumentType]
+
+
+def main() -> None:
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", default=",".join(CASES), help="with commas; default all: %(default)s")
+    parser.add_argument("--seeds", type=int, default=3, help="fits a level (default %(default)s)")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "ladder.json")
+    arguments = parser.parse_args()
+    names = [name.strip() for name in arguments.scenes.split(",")]
+    unknown = [name for name in names if name not in CASES]
+    if unknown:
+        parser.error(f"unknown scene {unknown[0]!r}; choose some of {', '.join(CASES)}")
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
+    rows = []
+    for name in tqdm(names, desc="scenes", disable=None):
+        case, began = CASES[name], time.perf_counter()
+        found = select(sampled(case), seeds=arguments.seeds, progress=False)
+        right = found.chosen.level == case.level
+        rows.append(
+            {"scene": name, "needs": case.level, "chosen": found.chosen.level, "right": right}
+            | {"seconds": round(time.perf_counter() - began, 1), "levels": [c.to_dict() for c in found.candidates]}
+        )
+        print(f"\n{name}: needs {case.level}, chosen {found.chosen.level}{'' if right else '  (WRONG)'}")
+        print(found.table(), flush=True)
+    print(f"\nright on {sum(row['right'] for row in rows)} of {len(rows)} scenes")
+    result = {
+        "commit": commit.strip(),
+        "machine": {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()},
+        "noise": NOISE,
+        "seeds": arguments.seeds,
+        "scenes": rows,
+    }
+    write_atomically(arguments.out, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,200 @@
+"""herglotz beside its peers, on the same data and machine: `python benchmarks/peers.py [--data ...] [--peers ...]`.
+
+A cell is one fit: a data set, a peer, what it is given, a seed. Every finished cell is kept in peers.json at once; the
+command goes on where it was interrupted, and `--again` measures some peers anew. At the end (or with `--redraw` alone)
+peers.md and peers.png are written.
+
+Data: pendulum_02, pendulum_05, pendulum_10 (simulated damped pendulum at three steps), pendulum_noise, pendulum_one
+(one trajectory), double_pendulum, real_pendulum and ibm (measured; data/README.md says where to get them).
+
+Examples
+--------
+    python benchmarks/peers.py --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out /tmp/peers
+    python benchmarks/peers.py --reproduce            # figures of the sources, measured with our implementations
+    python benchmarks/peers.py --redraw               # table and figure from the JSON that is there
+
+Needs, each for its peer alone: torchdiffeq, pysindy, phlearn (`pip install --no-deps phlearn imageio`, then ipython and
+autograd). A peer whose package is missing is left out, and the command says so.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import signal
+import subprocess
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+from peer_models import PEERS, networks
+from peer_models.known_equation import train_known_equation
+from peer_models.ours import measured
+from peer_models.problems import PROBLEMS, Problem
+from peer_models.report import write
+from peer_models.reproduce import reproduce
+from tqdm import tqdm
+
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+
+ROOT = Path(__file__).resolve().parents[1]
+BUDGET = 10.0  # seconds of processor time of a network peer's fit
+LIMIT = 300  # seconds of processor time after which a cell is given up
+
+
+class _OutOfTimeError(Exception):
+    """A cell took longer than `LIMIT`."""
+
+
+def _out_of_time(*_: Any) -> None:
+    raise _OutOfTimeError
+
+
+def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> dict[str, Any]:
+    """Train and judge; what goes wrong is part of the result."""
+    peer, exact = PEERS[name], given == "exact"
+    signal.signal(signal.SIGVTALRM, _out_of_time)
+    signal.setitimer(signal.ITIMER_VIRTUAL, LIMIT)
+    began = time.process_time()
+    out: dict[str, Any] = {"error": None, "commit": _commit()}
+    try:
+        if name.startswith("ours") and problem.whole is not None:
+            level = {"level": "forced"} if name == "ours_forced" else {}
+            found, out["parameters"] = measured(problem.whole(), seed, **level)
+            return out | found | {"seconds": time.process_time() - began}
+        samples = problem.samples(seed, exact)
+        began = time.process_time()  # simulating the data is not training
+        if peer.train is train_known_equation:
+            model = train_known_equation(samples, seed, budget, relative=problem.relative)
+        else:
+            model = peer.train(samples, seed, budget)
+        out |= {"seconds": time.process_time() - began, "parameters": model.parameters}
+        return out | problem.judge(model, exact)
+    except _OutOfTimeError:
+        error = f"not done in {LIMIT} s"
+    except (RuntimeError, ValueError, ArithmeticError, InputError) as problem_met:
+        error = f"{type(problem_met).__name__}: {str(problem_met).splitlines()[0][:80]}"
+    finally:
+        signal.setitimer(signal.ITIMER_VIRTUAL, 0)
+    out.setdefault("seconds", time.process_time() - began)
+    return out | {"error": error, "rms": None}
+
+
+def _commit() -> str:
+    told = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT)
+    return told.stdout.strip()
+
+
+def settings(budget: float) -> dict[str, Any]:
+    """What every network peer shares."""
+    return {
+        "budget_s": budget,
+        "width": networks.WIDTH,
+        "batch": networks.BATCH,
+        "learning_rate": networks.LEARNING_RATE,
+        "adam_part": networks.ADAM_PART,
+        "patience": networks.PATIENCE,
+        "dtype": "float64",
+    }
+
+
+def opened(path: Path, budget: float | None) -> dict[str, Any]:
+    """The result so far, or an empty one."""
+    if path.is_file():
+        result = json.loads(path.read_text(encoding="utf-8"))
+        if result["settings"] != settings(budget or result["settings"]["budget_s"]):
+            raise InputError(
+                f"{path}: holds results of other settings, {result['settings']}; take that --budget, or another --out"
+            )
+        return result
+    packages = ("torch", "numpy", "scipy", "torchdiffeq", "pysindy", "phlearn")
+    versions = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            versions[package] = version(package)
+        except PackageNotFoundError:
+            versions[package] = "not installed"
+    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    return {"machine": machine, "versions": versions, "settings": settings(budget or BUDGET), "titles": {},
+            "cells": {}}  # fmt: skip
+
+
+def plan(data: list[str], peers: list[str], seeds: int) -> list[tuple[str, str, str, int]]:
+    """All cells, seed by seed: an interrupted run has every data set and peer."""
+    cells = []
+    for seed in range(seeds):
+        for name in data:
+            problem = PROBLEMS[name]()
+            simulated = problem.simulated
+            for peer in peers:
+                if peer == "ours_forced" and problem.dof == 1:
+                    continue  # one rate is all the friction that one joint has
+                needs = PEERS[peer].needs
+                given = ["differences" if needs == "velocities" else "positions"]
+                if needs != "positions" and simulated:
+                    given.append("exact")
+                cells += [(name, peer, one, seed) for one in given]
+    return cells
+
+
+def chosen(names: str | None, known: Any, what: str) -> list[str]:
+    """Names given with commas, checked; all where none are given."""
+    found = names.split(",") if names else list(known)
+    for name in found:
+        if name not in known:
+            raise InputError(f"unknown {what} '{name}'; choose from {', '.join(known)}")
+    return found
+
+
+def store(result: dict[str, Any], path: Path) -> None:
+    write_atomically(path, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", help=f"with commas (default: all of {', '.join(PROBLEMS)})")
+    parser.add_argument("--peers", help=f"with commas (default: all of {', '.join(PEERS)})")
+    parser.add_argument("--seeds", type=int, default=5, help="seeds 0, 1, … of data and weights (default 5)")
+    parser.add_argument("--budget", type=float, help=f"seconds of processor time a network fit (default {BUDGET:g})")
+    parser.add_argument("--again", action="store_true", help="measure the chosen cells anew")
+    parser.add_argument("--reproduce", action="store_true", help="only the figures of the sources")
+    parser.add_argument("--redraw", action="store_true", help="only the table and the figure")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(1)  # small matrices: more threads only wait
+    try:
+        data, peers = chosen(arguments.data, PROBLEMS, "data set"), chosen(arguments.peers, PEERS, "peer")
+        missing = [p for p in peers if not PEERS[p].installed]
+        for name in missing:
+            print(f"{name}: left out, {PEERS[name].package} is not installed", file=sys.stderr)
+        arguments.out.mkdir(parents=True, exist_ok=True)
+        path = arguments.out / "peers.json"
+        result = opened(path, arguments.budget)
+        if arguments.reproduce:
+            reproduce(result, arguments.seeds)
+            store(result, path)
+        elif not arguments.redraw:
+            cells = plan(data, [p for p in peers if p not in missing], arguments.seeds)
+            keys = {"/".join(map(str, c)): c for c in cells}
+            todo = {k: c for k, c in keys.items() if arguments.again or k not in result["cells"]}
+            with tqdm(todo.items(), initial=len(keys) - len(todo), total=len(keys), disable=None) as bar:
+                for key, (name, peer, given, seed) in bar:
+                    bar.set_postfix_str(key)
+                    problem = PROBLEMS[name]()
+                    result["titles"][name] = problem.title
+                    result["cells"][key] = cell(problem, peer, given, seed, result["settings"]["budget_s"])
+                    store(result, path)
+        write(result, arguments.out)
+    except InputError as error:
+        raise SystemExit(f"error: {error}") from None
+    print(arguments.out / "peers.md")
+
+
+if __name__ == "__main__":
+    main()

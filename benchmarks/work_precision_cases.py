@@ -1,0 +1,99 @@
+"""A scene with its data, its fitted model and unseen starts; and how every setting of it is timed."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from work_precision_scenes import Setup, exact_motion, starts_of
+
+from herglotz.data import simulate
+from herglotz.stepping import State
+from herglotz.training import FitConfig, Run, fit
+
+COUNT = 64  # motions whose errors are taken
+TIMED = 16  # of them are timed
+PER = 4e-3  # seconds of one timing of C, at least
+
+
+@dataclass(frozen=True)
+class Timed:
+    """A point of the plot and how to time it: `run` makes `time` units of simulated time; `idle` what surrounds it."""
+
+    point: dict
+    run: Callable[[], Any]
+    time: float
+    idle: Callable[[], Any] | None = None
+
+
+@dataclass(frozen=True)
+class Case:
+    """One scene with its data, its fitted model, unseen starts and their truth."""
+
+    setup: Setup
+    run: Run
+    entry: State  # the starts in the learned model's own momenta
+    start: State  # the same in the scene's
+    truth: Tensor  # (B, CHECKS, n)
+    seconds: dict[str, float]
+
+
+def prepare(setup: Setup, quick: bool) -> Case:
+    """Fit the model to positions, and enter it from two positions as a user must."""
+    system = setup.scene
+    size = (10, 20) if quick else (setup.trajectories, setup.steps)
+    data = simulate(system, trajectories=size[0], steps=size[1], h=setup.h, seed=0, keep_state=True)
+    began = time.process_time()
+    run = fit(replace(data, s=None, p=None), fit_config(setup, quick), progress=False)
+    seconds = {"fit": time.process_time() - began}
+    first = starts_of(system, 16 if quick else COUNT, 1000)
+    u = setup.inputs()
+    before = system if u is None else system.at(u[0])
+    start = State(*before.flow(*first, setup.h))
+    with torch.no_grad():
+        entry = run.stepper.init(first.q, start.q, None, setup.h, **({} if u is None else {"u": u[0]}))
+    return Case(setup, run, State(*(x.detach() for x in entry)), start, exact_motion(setup, start), seconds)
+
+
+def fit_config(setup: Setup, quick: bool, **changes: Any) -> FitConfig:
+    options = {"level": "linear", "iterations": 60, **setup.fit, **changes}
+    iterations = options.pop("iterations")
+    iterations = 10 if quick else iterations
+    return FitConfig(train_fraction=1.0, objective="residual", iterations=iterations, departures=(2e-3,), **options)
+
+
+def repeated(call: Callable[[], Any], keep: Any = None) -> tuple[Callable[[], Any], int]:
+    """The call as often as makes it long enough to time."""
+    call()
+    began = time.perf_counter()
+    call()
+    times = max(1, round(PER / max(1e-7, time.perf_counter() - began)))
+
+    def run(keep: Any = keep) -> None:  # noqa: ARG001
+        for _ in range(times):
+            call()
+
+    return run, times
+
+
+def costs(timed: list[Timed], rounds: int) -> list[dict]:
+    """Processor time of each, in turn: the least of all rounds, and how far the middle one lies above it."""
+    times = torch.zeros(2, len(timed), rounds, dtype=torch.float64)
+    for k in range(-1, rounds):
+        for i, one in enumerate(timed):
+            for j, call in enumerate((one.run, one.idle)):
+                if call is None:
+                    continue
+                began = time.process_time_ns()
+                call()
+                times[j, i, max(k, 0)] = (time.process_time_ns() - began) * 1e-3
+    found = []
+    for i, one in enumerate(timed):
+        best, middle = float(times[0, i].min()), float(times[0, i].median())
+        idle = min(float(times[1, i].min()), best / 2)
+        found.append({**one.point, "us_per_time": (best - idle) / one.time, "spread": (middle - best) / one.time})
+    return found

@@ -1,0 +1,106 @@
+"""A kinetic term with the features of speed that a user names."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.models.feature_potential import Combination
+from herglotz.models.features import Feature
+from herglotz.models.jet import Jet
+from herglotz.models.mass import PositionKinetic
+from herglotz.models.phase import Phase
+from herglotz.models.terms import Kinetic
+
+
+class FeatureKinetic(nn.Module):
+    """K = K of another term + h Σ_g θ_g f_g(w·q̄) ∏v: couplings of speeds, magnetic terms.
+
+    Positive definite where the data have been: the least-squares fit does not keep it so elsewhere.
+    """
+
+    def __init__(
+        self, base: Kinetic | PositionKinetic, features: Sequence[Feature], known: Sequence[Feature], dof: int
+    ):
+        super().__init__()
+        self.base = base
+        self.sum = Combination(features, known, dof)
+        self.monomials: dict[tuple[int, ...], list[int]] = {}  # the products that share their velocities
+        for a, p in enumerate(self.sum.products):
+            self.monomials.setdefault(tuple(sorted(p.velocities)), []).append(a)
+
+    def forward(self, phase: Phase) -> Jet:
+        """K as a jet over (q0, q1)."""
+        p, base = phase, self.base
+        K = base(p.q0, p.q1, p.h, p.order, p.delta) if isinstance(base, Kinetic) else base(p)
+        f = self._functions(phase, 0)
+        for velocities, which in self.monomials.items():
+            K = K + _times(_sum(f, which), phase.velocity, velocities) * phase.h
+        return K
+
+    def mass(self, q: Tensor) -> Tensor:
+        """The features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
+        c, n = self.sum, self.sum.dof
+        f = c.ridge(q @ c.form.T, 0) * c.weights()
+        out = q.new_zeros(*q.shape, n)
+        for velocities, which in self.monomials.items():
+            if len(velocities) == 2:
+                i, j = velocities
+                unit = torch.zeros(n, n, dtype=q.dtype, device=q.device)
+                unit[i, j] += 1.0
+                unit[j, i] += 1.0
+                out = out + f[..., which].sum(-1)[..., None, None] * unit
+        return out
+
+    def straight(self, phase: Phase, rate: Tensor) -> Jet:
+        """K_qq[v, v] + 2γ K_q v + γ² K of the features: how K changes along the straight line."""
+        f = self._functions(phase, 0) * (rate * rate)
+        w = phase.velocity.linear(self.sum.form)
+        f = f + (self._functions(phase, 1) * (2 * rate) + self._functions(phase, 2) * w) * w
+        out = phase.velocity.select(0) * 0.0
+        for velocities, which in self.monomials.items():
+            out = out + _times(_sum(f, which), phase.velocity, velocities)
+        return out
+
+    def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
+        """bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, for constant b and y, (..., n); at most two velocities."""
+        c, v = self.sum, phase.velocity
+        f, slope = self._functions(phase, 0), self._functions(phase, 1)
+        turned = slope * (b @ c.form.T)
+        drag = slope * v.linear(c.form) + f * rate
+        out = v.select(0) * 0.0
+        for velocities, which in self.monomials.items():
+            out = out + _times(_sum(turned, which), v, velocities)
+            out = out - _sum(drag, which) * _derivative(v, velocities, b)
+            if len(velocities) == 2:
+                i, j = velocities
+                out = out - _sum(f, which) * (b[..., i] * y[..., j] + b[..., j] * y[..., i])
+        return out
+
+    def _functions(self, phase: Phase, k: int) -> Jet:
+        """θ times the k-th derivatives of the functions, vector-valued (..., A)."""
+        c, x = self.sum, phase.mean
+        x = x.linear(c.form)
+        f0, f1 = c.ridge(x.value, k), c.ridge(x.value, k + 1)
+        return x.map(f0, f1, c.ridge(x.value, k + 2) if x.order == 2 else None) * c.weights()
+
+
+def _sum(f: Jet, which: list[int]) -> Jet:
+    return Jet(f.data[..., which].sum(-1), f.tangents, f.order)
+
+
+def _times(f: Jet, v: Jet, velocities: tuple[int, ...]) -> Jet:
+    """The product f ∏v."""
+    for i in velocities:
+        f = f * v.select(i)
+    return f
+
+
+def _derivative(v: Jet, velocities: tuple[int, ...], b: Tensor) -> Jet:
+    """The derivative of ∏v along b, for at most two velocities."""
+    if len(velocities) == 1:
+        return v.select(0) * 0.0 + b[..., velocities[0]]
+    i, j = velocities
+    return v.select(i) * b[..., j] + v.select(j) * b[..., i]

@@ -1,0 +1,160 @@
+"""Linear combinations of the features that a user names, and the potential that is one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.models.features import Feature, Product, expand, parse
+from herglotz.models.jet import Jet, pairs
+
+RIDGES = ("cos", "sin", "power")  # functions of a linear form w·q; "radius" is one of r²
+
+
+class Combination(nn.Module):
+    """Σ_g θ_g φ_g, with θ learned from 0, + the sum of the known features as they stand.
+
+    Parameters
+    ----------
+    features, known
+        As parsed; the numbers of a known one are in units in which the first coordinate's mass is 1.
+    dof
+        Number of coordinates n.
+    """
+
+    def __init__(self, features: Sequence[Feature], known: Sequence[Feature], dof: int):
+        super().__init__()
+        every = [(p, g) for g, feature in enumerate([*features, *known]) for p in feature]
+        names = [*RIDGES, "radius"]
+        every.sort(key=lambda pair: names.index(pair[0].function))  # products of one function stand together
+        self.products: list[Product] = [p for p, _ in every]
+        self.counts = [sum(p.function == f for p in self.products) for f in names]
+        self.ridges = sum(self.counts[:3])
+        self.dof, self.learned = dof, len(features)
+        self.highest = max((p.power for p in self.products[: self.ridges]), default=0)
+        self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
+        form = torch.tensor([p.form for p in self.products[: self.ridges]], dtype=torch.float64).reshape(-1, dof)
+        i, j = pairs(dof, torch.device("cpu"))
+        numbers = {
+            "factor": torch.tensor([p.factor for p in self.products], dtype=torch.float64),
+            "form": form,  # (ridges, n) w
+            "outer": form[:, i] * form[:, j],  # (ridges, n(n+1)/2) rows of w wᵀ
+            "power": torch.tensor([float(p.power) for p in self.products], dtype=torch.float64),
+            "group": torch.tensor([g for _, g in every], dtype=torch.long),
+        }
+        for name, value in numbers.items():
+            self.register_buffer(name, value, persistent=False)
+        self.factor: Tensor
+        self.form: Tensor
+        self.outer: Tensor
+        self.power: Tensor
+        self.group: Tensor
+
+    def weights(self) -> Tensor:
+        """The number before each product, (A,)."""
+        if not self.learned:
+            return self.factor
+        known = torch.ones_like(self.coefficient[:1])
+        return torch.cat([self.coefficient, known])[self.group.clamp_max(self.learned)] * self.factor
+
+    def ridge(self, x: Tensor, k: int) -> Tensor:
+        """The k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
+        cos, sin, power = x.split(self.counts[:3], -1)
+        exponent, highest = self.power.split(self.counts)[2], self.highest
+        rest, product = exponent - k, torch.ones_like(power)
+        for j in range(highest - k):  # no pow: its forward-mode derivative takes the logarithm of negative numbers
+            product = product * torch.where(rest > j, power, 1.0)
+        return torch.cat([_wave(cos, k), _wave(sin, k + 3), _front(exponent, k) * product], -1)
+
+    def radial(self, square: Tensor, k: int) -> Tensor:
+        """The k-th derivative of the functions of r², (..., radial ones)."""
+        exponent = self.power.split(self.counts)[3] / 2
+        return _front(exponent, k) * square[..., None].pow(exponent - k)
+
+
+class FeaturePotential(nn.Module):
+    """V = Σ_g θ_g φ_g(q) by a sum over products of which each is a function of one number: no jets are multiplied.
+
+    With a ridge f(w·q): V′ = f′ w, V″ = f″ w wᵀ. With f(r²): V′ = 2 f′ q, V″ = 4 f″ q qᵀ + 2 f′ I.
+    """
+
+    def __init__(self, features: Sequence[Feature], known: Sequence[Feature], dof: int):
+        super().__init__()
+        self.sum = Combination(features, known, dof)
+
+    def forward(self, q: Tensor, order: int, along: Tensor | None = None) -> Jet:
+        """V as a jet over the n components of q; with `along` y, (..., n), its derivative V′y for a constant y."""
+        c, n = self.sum, self.sum.dof
+        ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
+        x = q @ c.form.T
+        k = 0 if along is None else 1
+        if along is not None:
+            ridge = ridge * (along @ c.form.T)
+        f = [c.ridge(x, k + j) * ridge for j in range(order + 1)]
+        rows = [f[0].sum(-1)[None], (f[1] @ c.form).movedim(-1, 0)]
+        if order == 2:
+            rows.append((f[2] @ c.outer).movedim(-1, 0))
+        jet = Jet(torch.cat(rows), n, order)
+        return jet if c.ridges == len(c.products) else jet + self._radial(q, radial, order, along)
+
+    def value_and_slope(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """V (...) and V′ (..., n), without a jet."""
+        c = self.sum
+        ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
+        x = q @ c.form.T
+        V, slope = c.ridge(x, 0) @ ridge, (c.ridge(x, 1) * ridge) @ c.form
+        if c.ridges == len(c.products):
+            return V, slope
+        square = (q * q).sum(-1)
+        return V + c.radial(square, 0) @ radial, slope + 2 * (c.radial(square, 1) @ radial)[..., None] * q
+
+    def _radial(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:
+        """F(r²) as a jet, or 2F′ q·y where y is given."""
+        n, square = self.sum.dof, (q * q).sum(-1)
+        F = [self.sum.radial(square, k) @ weights for k in range(order + 1 + (y is not None))]
+        i, j = pairs(n, q.device)
+        same = (i == j).to(q.dtype)
+        qi, qj = q[..., i], q[..., j]
+        bend = lambda a, b: 4 * b[..., None] * qi * qj + 2 * a[..., None] * same  # noqa: E731  of F: a = F′, b = F″
+        if y is None:
+            rows = [F[0][None], (2 * F[1][..., None] * q).movedim(-1, 0)]
+            return Jet(torch.cat([*rows, bend(F[1], F[2]).movedim(-1, 0)] if order == 2 else rows), n, order)
+        qy = (q * y).sum(-1)
+        rows = [(2 * F[1] * qy)[None], (4 * (F[2] * qy)[..., None] * q + 2 * F[1][..., None] * y).movedim(-1, 0)]
+        if order == 2:
+            mixed = 4 * F[2][..., None] * (qi * y[..., j] + qj * y[..., i])
+            rows.append((2 * qy[..., None] * bend(F[2], F[3]) + mixed).movedim(-1, 0))
+        return Jet(torch.cat(rows), n, order)
+
+
+def baseline_features(
+    angles: Sequence[bool], stiffness: Sequence[float], tilt: Sequence[float]
+) -> tuple[list[str], list[float]]:
+    """The baseline's k (1 − cos q) + b sin q, or k q²/2 + b q, as features and their coefficients."""
+    names, values = [], []
+    for i, (angle, k, b) in enumerate(zip(angles, stiffness, tilt, strict=True), 1):
+        names += [f"cos(q{i})", f"sin(q{i})"] if angle else [f"q{i}^2", f"q{i}"]
+        values += [-k if angle else k / 2, b]
+    return names, values
+
+
+def sorted_features(names: Sequence[str], angles: Sequence[bool]) -> tuple[list[Feature], list[Feature]]:
+    """Features of the potential and of the kinetic term, libraries expanded and texts parsed."""
+    features = [parse(text, angles) for text in expand(names, angles)]
+    return [f for f in features if not f[0].velocities], [f for f in features if f[0].velocities]
+
+
+def _wave(x: Tensor, k: int) -> Tensor:
+    """The k-th derivative of cos; that of sin is three further on."""
+    wave = x.sin() if k % 2 else x.cos()
+    return -wave if k % 4 in (1, 2) else wave
+
+
+def _front(exponent: Tensor, k: int) -> Tensor:
+    """The factor p (p − 1) … of the k-th derivative of a power p."""
+    front = torch.ones_like(exponent)
+    for j in range(k):
+        front = front * (exponent - j)
+    return front

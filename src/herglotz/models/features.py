@@ -1,0 +1,176 @@
+"""Grey-box features: functions of (q, v) that a user names, as text, and whose coefficients are learned or known.
+
+A feature without velocities joins the potential V, one with velocities the kinetic term K. It is a sum of products,
+each of one function of the position and any number of velocities:
+
+    cos(q1 - q2) v1 v2        (q2 - q1)^4 + (q3 - q2)^4        0.5 r^-1        q1 v2 - q2 v1
+
+with cos, sin and whole powers of a linear form of the q, and whole powers of r = |q|. One coefficient multiplies the
+whole sum, which is how parameters are shared. Short names stand for lists of features (`LIBRARIES`).
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+
+from herglotz.errors import InputError
+
+_NUMBER = r"\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+"
+_SPLIT = re.compile(r"\s*([-+])(?<!\^[-+])(?<!\d[eE][-+])(?![^()]*\))\s*")  # signs between products
+_FACTOR = re.compile(
+    rf"\s*\*?\s*(?:(?P<function>cos|sin)\((?P<angle>[^()]+)\)|\((?P<form>[^()]+)\)\s*(?:\^(?P<power>\d+))?"
+    rf"|r\^(?P<radial>-?\d+)|(?P<radius>r)\b|q(?P<q>\d+)(?:\^(?P<qpower>\d+))?|v(?P<v>\d+)(?:\^(?P<vpower>\d+))?"
+    rf"|(?P<number>{_NUMBER}))"
+)
+_ADDEND = re.compile(rf"\s*([-+]?)\s*({_NUMBER})?\s*\*?\s*q(\d+)\s*")
+
+
+@dataclass(frozen=True)
+class Product:
+    """factor · f(w·q) · ∏ v, with f = cos, sin, a power of the linear form, or a power of r = |q| (no w)."""
+
+    factor: float
+    function: str  # "cos", "sin", "power" or "radius"
+    form: tuple[float, ...] = ()  # w, n numbers
+    power: int = 0
+    velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
+
+
+Feature = tuple[Product, ...]
+
+
+def parse(text: str, angles: Sequence[bool]) -> Feature:
+    """The products that a feature is the sum of.
+
+    Raises
+    ------
+    InputError
+        Naming the feature and the part of it that cannot be read.
+    """
+    pieces = _SPLIT.split(text.strip())
+    pieces = pieces[1:] if pieces[0] == "" else ["+", *pieces]
+    terms = zip(pieces[::2], pieces[1::2], strict=True)
+    feature = tuple(_product(body, -1.0 if sign == "-" else 1.0, text, angles) for sign, body in terms)
+    if len({bool(p.velocities) for p in feature}) > 1:
+        raise InputError(f"feature '{text}': some products hold velocities and some do not; make two features of it")
+    return feature
+
+
+def expand(names: Sequence[str], angles: Sequence[bool]) -> list[str]:
+    """Features with the names of libraries replaced by what they stand for, each feature once."""
+    out: list[str] = []
+    for name in names:
+        word, _, argument = name.partition(" ")
+        library = LIBRARIES.get(word)
+        if library is None:
+            out.append(name)
+        elif argument and not argument.strip().isdigit():
+            raise InputError(f"feature '{name}': a library takes one whole number, as '{word} 2' does")
+        else:
+            out += library(angles, *([int(argument)] if argument else []))
+    return list(dict.fromkeys(out))
+
+
+def chain(angles: Sequence[bool], highest: int = 4) -> list[str]:
+    """Springs between neighbours and to both walls, all alike: powers 2 … `highest` of the stretches."""
+    n = len(angles)
+    stretches = ["(q1)", *(f"(q{i + 1} - q{i})" for i in range(1, n)), f"(-q{n})"]
+    return [" + ".join(f"{s}^{power}" for s in stretches) for power in range(2, highest + 1)]
+
+
+def sites(angles: Sequence[bool], highest: int = 4) -> list[str]:
+    """Springs that hold each coordinate by itself, all alike: powers 1 … `highest`."""
+    every = range(1, len(angles) + 1)
+    return [" + ".join(f"q{i}^{power}" for i in every) for power in range(1, highest + 1)]
+
+
+def central(angles: Sequence[bool], highest: int = 3) -> list[str]:  # noqa: ARG001  one signature for all
+    """A potential of the distance r = |q| alone: powers −`highest` … `highest`."""
+    return [f"r^{k}" for k in range(-highest, highest + 1) if k]
+
+
+def pendulums(angles: Sequence[bool]) -> list[str]:
+    """Links in a plane, their angles from one direction: each pair of speeds is coupled by cos(q_i − q_j)."""
+    return [f"cos(q{i + 1} - q{j + 1}) v{i + 1} v{j + 1}" for i, j in combinations(range(len(angles)), 2)]
+
+
+def harmonics(angles: Sequence[bool], highest: int = 2) -> list[str]:
+    """Waves cos and sin of k·q, Σ|k_i| ≤ `highest`, of the angles: in the potential and in every entry of the mass."""
+    which = [i + 1 for i, angle in enumerate(angles) if angle]
+    forms = []
+    for k in product(range(-highest, highest + 1), repeat=len(which)):
+        if 0 < sum(map(abs, k)) <= highest and next(x for x in k if x) > 0:
+            forms.append(" + ".join(f"{x}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- "))
+    waves = [f"{f}({form})" for form in forms for f in ("cos", "sin")]
+    own = {f"{f}(1q{i})" for i in which for f in ("cos", "sin")}  # the baseline's
+    pairs = [f"v{i + 1} v{j + 1}" for i in range(len(angles)) for j in range(i, len(angles))]
+    return [w for w in waves if w not in own] + [f"{w} {pair}" for pair in pairs for w in waves]
+
+
+LIBRARIES: dict[str, Callable[..., list[str]]] = {
+    "chain": chain,
+    "sites": sites,
+    "central": central,
+    "pendulums": pendulums,
+    "harmonics": harmonics,
+}
+
+
+def _product(body: str, factor: float, text: str, angles: Sequence[bool]) -> Product:
+    n = len(angles)
+    found: list[tuple[str, tuple[float, ...], int]] = []
+    velocities: list[int] = []
+    at = 0
+    while at < len(body.rstrip()):
+        match = _FACTOR.match(body, at)
+        if match is None:
+            raise InputError(
+                f"feature '{text}': cannot read '{body[at:].strip()}'; write sums of products of numbers, v1, "
+                "and one of cos(q1 - q2), sin(q1), (q1 - q2)^2, q1^3, r^-1"
+            )
+        part, at = match.groupdict(), match.end()
+        if part["number"]:
+            factor *= float(part["number"])
+        elif part["v"]:
+            velocities += [_coordinate(part["v"], n, text)] * int(part["vpower"] or 1)
+        elif part["radial"] or part["radius"]:
+            found.append(("radius", (), int(part["radial"] or 1)))
+        elif part["function"]:
+            found.append((part["function"], _form(part["angle"], n, text), 0))
+        elif part["form"]:
+            found.append(("power", _form(part["form"], n, text), int(part["power"] or 1)))
+        else:
+            found.append(("power", _form(f"q{part['q']}", n, text), int(part["qpower"] or 1)))
+    if len(found) > 1:
+        raise InputError(
+            f"feature '{text}': '{body.strip()}' has {len(found)} functions of the position, and a product takes one; "
+            "q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
+        )
+    function, form, power = found[0] if found else ("power", (0.0,) * n, 0)
+    used = [True] * n if function == "radius" else form
+    if power and any(w and angle for w, angle in zip(used, angles, strict=True)):
+        raise InputError(f"feature '{text}': a power of an angle is not periodic; use cos or sin")
+    if function == "radius" and velocities:
+        raise InputError(f"feature '{text}': powers of r join the potential; write the product without velocities")
+    return Product(factor, function, form, power, tuple(velocities))
+
+
+def _form(words: str, n: int, text: str) -> tuple[float, ...]:
+    """The n numbers w of a linear form such as 2q1 - q3."""
+    w, at = [0.0] * n, 0
+    while at < len(words):
+        match = _ADDEND.match(words, at)
+        if match is None or (at and not match[1]):
+            raise InputError(f"feature '{text}': cannot read the linear form '{words}'; write q1 - q2 or 2*q1 + q3")
+        w[_coordinate(match[3], n, text)] += float(match[2] or 1) * (-1.0 if match[1] == "-" else 1.0)
+        at = match.end()
+    return tuple(w)
+
+
+def _coordinate(digits: str, n: int, text: str) -> int:
+    if not 1 <= int(digits) <= n:
+        raise InputError(f"feature '{text}': there is no coordinate {digits}; they are numbered 1 … {n}")
+    return int(digits) - 1

@@ -1,0 +1,77 @@
+"""What a step equation is, and that of any L_d through its partials."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+from torch import Tensor
+
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    Partials,
+    momentum_jacobian,
+    momentum_plus,
+    momentum_residual,
+    partials,
+)
+
+
+class Point(NamedTuple):
+    """The step equation at one trial."""
+
+    F: Tensor  # (..., n)
+    J: Tensor | None  # (..., n, n) ∂F/∂q1, where it was asked for
+    rest: Any  # what `end` and `push` go on with
+
+
+class End(NamedTuple):
+    """What a solved step hands on."""
+
+    p1: Tensor  # (..., n)
+    L: Tensor  # (...) s1 − s0
+    c: Tensor  # (...)
+    dp: Tensor | None = None  # (..., n) p1 − p0, made without that difference, where it is known
+
+
+class Equation(Protocol):
+    """The step equation in the unknown x: q1 or, in increments, Δ = q1 − q0."""
+
+    def __call__(self, x: Tensor, second: bool) -> Point:
+        """F, and J if `second`."""
+        ...
+
+    def push(self, point: Point) -> Tensor:
+        """The momentum c p0, (..., n)."""
+        ...
+
+    def end(self, x: Tensor, point: Point) -> End:
+        """p1 = D2 + F⁺, L and c at a solution."""
+        ...
+
+
+class PartialsEquation:
+    """The step equation of any L_d; `rest` holds its partials."""
+
+    def __init__(
+        self, L_d: DiscreteLagrangian, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, order: int, increments: bool
+    ):
+        self.L_d, self.q0, self.p0, self.s0, self.h = L_d, q0, p0, s0, h
+        self.order, self.increments = order, increments
+
+    def __call__(self, x: Tensor, second: bool) -> Point:
+        """See `Equation`."""
+        order = 2 if second else self.order
+        if self.increments:
+            form: Any = self.L_d  # `solve_step` checked
+            P: Partials = form.partials_increment(self.q0, x, self.s0, self.h, order)
+        else:
+            P = partials(self.L_d, self.q0, x, self.s0, self.h, order)
+        return Point(momentum_residual(P, self.p0), momentum_jacobian(P, self.p0) if order == 2 else None, P)
+
+    def push(self, point: Point) -> Tensor:
+        """See `Equation`."""
+        return point.rest.c[..., None] * self.p0
+
+    def end(self, x: Tensor, point: Point) -> End:  # noqa: ARG002  one signature for all
+        """See `Equation`."""
+        return End(momentum_plus(point.rest), point.rest.L, point.rest.c)

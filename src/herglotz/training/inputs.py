@@ -1,0 +1,32 @@
+"""Recorded inputs u (a motor's torque): which step each belongs to, and whether data and model agree about them.
+
+The input recorded at a sample acts from that sample to the next (zero-order hold), as `Stepper.rollout` and the
+exported steppers take it; the last one of a trajectory acts on no step. A gap that is crossed in several model steps
+is crossed at one input.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
+
+
+def step_inputs(model: ContactLagrangian, data: Trajectories) -> Tensor | None:
+    """Inputs of the steps that start at each sample, (N, m); None for a model that takes none.
+
+    Raises
+    ------
+    InputError
+        If the model takes inputs and the data hold none, or another number of them.
+    """
+    if not model.inputs:
+        return None
+    where = data.source or "data"
+    if data.u is None:
+        raise InputError(f"{where}: the model is driven by {model.inputs} input(s) u and these data hold none; add u")
+    if data.u.shape[1] != model.inputs:
+        raise InputError(f"{where}: {data.u.shape[1]} input(s) u are recorded, the model takes {model.inputs}")
+    return data.u

@@ -1,0 +1,51 @@
+"""Was a rollout resolved? Each step against two of half its length: what no status can know."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from herglotz.stepping import Rollout, State, Step
+from herglotz.stepping.state import check_h, step_sizes
+
+
+class Steps(Protocol):
+    """Anything that steps over any h, such as `Stepper`, `Composition` or `ContactSplitting`."""
+
+    def step(self, state: State, h: Any, /) -> Step:
+        """One step."""
+        ...
+
+
+def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
+    """|q after a step − q after two half steps|, the largest coordinate, relative to the step's move; (..., K).
+
+    Values near 1 and above mean that h does not see the motion, however well every step equation was solved: a step
+    over the pericentre of a thin ellipse is as regular as any other. Of a method of order p it estimates the error of
+    the step times 1 − 2^{−p}. Costs two steps for one. A model with a learned correction is right at its own step
+    only, and this number says nothing about it.
+
+    Parameters
+    ----------
+    stepper
+        What made the rollout, without inputs.
+    out
+        Its result, every step kept.
+    h
+        Its step: a scalar, (K,) or (..., K).
+    """
+    steps = out.status.shape[-1]
+    sizes = step_sizes(check_h(h, out.q), steps if torch.as_tensor(h).ndim == 0 else None)
+    errors = []
+    with torch.no_grad():
+        for k in range(steps):
+            half = sizes[..., k] / 2
+            state = State(out.q[..., k, :], out.p[..., k, :], out.s[..., k])
+            middle = stepper.step(state, half).state
+            end = stepper.step(middle, half).state.q
+            whole = out.q[..., k + 1, :]
+            moved = torch.maximum((whole - state.q).abs().amax(-1), (end - state.q).abs().amax(-1))
+            errors.append((whole - end).abs().amax(-1) / moved.clamp(min=torch.finfo(end.dtype).tiny))
+    return torch.stack(errors, -1)

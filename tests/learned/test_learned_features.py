@@ -1,0 +1,49 @@
+"""Structure that is told: a chain with one spring for all, and two links with hinges, from few positions."""
+
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.stepping import Stepper
+from herglotz.systems import scene
+from herglotz.training import FitConfig, fit
+
+
+def free_run(model, of, h, steps):
+    """RMS of |error| over a free run from 5 unseen starts, relative to the motion."""
+    q = simulate(of, trajectories=5, steps=steps + 1, h=h, seed=1000).q.reshape(5, steps + 2, of.dof)
+    stepper = Stepper(model)
+    with torch.no_grad():
+        out = stepper.rollout(*stepper.init(q[:, 0], q[:, 1], None, h), h=h, steps=steps)
+    return float((out.q - q[:, 1:]).square().mean().sqrt() / q.square().mean().sqrt())
+
+
+def test_a_chain_is_learned_from_three_numbers():
+    # fails if the springs do not share their parameters, or order 4 is lost in training
+    of = scene("chain", masses=4, beta=0.5)
+    data = simulate(of, trajectories=3, steps=15, h=0.1, seed=0)
+    settings = FitConfig(
+        level="linear", objective="residual", train_fraction=1.0, features=("chain",), alike=True, order=4
+    )
+    run = fit(data, settings, progress=False)
+    model: Any = run.model
+    k, cubic, beta = (model.potential.features.sum.coefficient * torch.tensor([2.0, 3.0, 4.0])).tolist()
+    assert run.metrics["parameters"] == 4
+    assert k == pytest.approx(1.0, abs=1e-4)
+    assert cubic == pytest.approx(0.0, abs=1e-4)
+    assert beta == pytest.approx(0.5, abs=1e-2)
+    assert run.metrics["rate"] == pytest.approx(0.1, abs=1e-4)
+    assert free_run(model, of, 0.1, 40) < 1e-4
+
+
+@pytest.mark.slow
+def test_two_links_are_learned_from_six_numbers():
+    # fails if the mass that depends on position is not found, or its part of the rule's error is wrong
+    of = scene("double_pendulum")
+    data = simulate(of, trajectories=10, steps=30, h=0.02, seed=0)
+    settings = FitConfig(level="linear", objective="residual", train_fraction=1.0, features=("pendulums",), order=4)
+    run = fit(data, settings, progress=False)
+    assert run.metrics["rate"] == pytest.approx(0.1, abs=1e-4)
+    assert free_run(run.model, of, 0.02, 50) < 1e-4

@@ -1,0 +1,67 @@
+"""Spikes in recorded positions: found where there are some, and nowhere else; inputs over what is left out."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.data.spikes import spikes, without
+from herglotz.errors import InputError
+from herglotz.systems import scene
+
+
+@pytest.mark.parametrize("h", [0.02, 0.2, 0.5, 1.0])
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_smooth_motion_has_none(h, noise):
+    # fails if fast motion at few samples a period, or plain noise, is taken for errors
+    data = simulate(scene("damped_pendulum"), trajectories=4, steps=60, h=h, noise=noise, gaps=2, seed=1)
+    assert int(spikes(data.unwrapped()).sum()) == 0
+
+
+def test_spikes_are_found():
+    # fails if a spike is missed, or a good sample beside a spike is taken for it
+    data = simulate(scene("damped_pendulum"), trajectories=4, steps=60, h=0.2, noise=0.01, seed=2)
+    rows = torch.tensor([10, 30, 45, 80, 150, 200])
+    q = data.q.clone()
+    q[rows, 0] += torch.tensor([0.5, -0.7, 1.0, -0.4, 0.6, 0.9], dtype=q.dtype)
+    assert spikes(replace(data, q=q)).nonzero()[:, 0].tolist() == rows.tolist()
+
+
+def test_quantisation_is_no_error():
+    # fails if a last digit of a sensor at rest is a spike
+    t = torch.arange(200, dtype=torch.float64) * 0.01
+    q = torch.zeros(200, 1, dtype=torch.float64)
+    q[100:] = (torch.sin(t[100:] - 1) * 300).round()[:, None] / 300
+    assert int(spikes(Trajectories.of(t, q)).sum()) == 0
+
+
+def test_what_is_left_out_keeps_its_impulse():
+    # fails if the input of a long step is that of its first part alone, or trajectories run into each other
+    t = torch.tensor([0.0, 1, 2, 4, 5] * 2, dtype=torch.float64)
+    u = torch.tensor([1.0, 2, 3, 4, 9] * 2, dtype=torch.float64)
+    data = Trajectories.of(t, t.clone(), (5, 5), u=u)
+    dropped = torch.zeros(10, dtype=torch.bool)
+    dropped[[2, 8]] = True
+    left = without(data, dropped)
+    assert left.lengths == (4, 4)
+    assert left.u is not None
+    # 2 over one unit of time and 3 over two; 3 over two units and 4 over one
+    torch.testing.assert_close(left.u[:, 0], torch.tensor([1, 8 / 3, 4, 9, 1, 2, 10 / 3, 9], dtype=torch.float64))
+    assert without(data, torch.zeros_like(dropped)) is data
+
+
+def test_every_mth_sample():
+    # fails if samples of another trajectory are taken, or the inputs' impulse is lost
+    t = torch.tensor([0.0, 1, 2, 4, 5, 7, 8] * 2, dtype=torch.float64)
+    u = torch.tensor([1.0, 2, 3, 4, 5, 6, 7] * 2, dtype=torch.float64)
+    data = Trajectories.of(t, t.clone(), (7, 7), u=u).thinned(3)
+    assert data.lengths == (3, 3)
+    assert data.t.tolist() == [0, 4, 8] * 2
+    assert data.u is not None
+    impulse = data.u[:2, 0] * data.t[:3].diff()
+    assert impulse.tolist() == [1 + 2 + 2 * 3, 4 + 2 * 5 + 6]
+    with pytest.raises(InputError, match="whole number >= 1, got 0"):
+        data.thinned(0)
+    with pytest.raises(InputError, match="at least 3 are needed"):
+        data.thinned(2)

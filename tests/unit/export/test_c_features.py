@@ -1,0 +1,69 @@
+"""Features in C: every function they are made of, up to 32 coordinates, and the terms that C does not know."""
+
+import shutil
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export import compile_c, export_c
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper
+
+needs_cc = pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="needs a C compiler")
+
+
+def model_of(n, angles, features, **settings) -> Any:
+    sizes: dict[str, Any] = {name: (1.0,) * n for name in ("scale", "speed", "stiffness", "tilt")}
+    model: Any = ContactLagrangian(
+        ModelConfig(angles=(angles,) * n, features=features, potential_width=0, **(sizes | settings))
+    )
+    make = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        theta = model.potential.features.sum.coefficient
+        theta += 0.2 * torch.rand(theta.shape, generator=make, dtype=torch.float64)
+    return model
+
+
+CASES = {
+    "angles": model_of(3, True, ("cos(q1 - 2q2)", "sin(q3) + 0.5 cos(q1)"), known=("sin(q2 + q3)",)),
+    "r": model_of(2, False, ("r^-1", "r^2", "r", "q1^3"), correction_width=4),
+    "chain of 32": model_of(32, False, ("chain",), alike=True, stiffness=(0.0,) * 32, tilt=(0.0,) * 32),
+}
+
+
+@needs_cc
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
+def test_features_step_in_c_as_they_do_in_eager(tmp_path, monkeypatch, name, dtype):
+    # fails if a function, its slope or a coordinate's number differs in C, for one sample or a register of them
+    monkeypatch.setenv("HERGLOTZ_CACHE", str(tmp_path))
+    model = CASES[name].to(dtype)
+    make = torch.Generator().manual_seed(1)
+    q = (0.6 + 0.3 * torch.randn(5, model.dof, generator=make, dtype=torch.float64)).to(dtype)
+    p, s = 0.3 * q.flip(-1), torch.zeros(5, dtype=dtype)
+    with torch.no_grad():
+        expected = Stepper(model).rollout(q, p, s, h=0.05, steps=20)
+    assert bool(expected.ok.all())
+    out = compile_c(model, h=0.05).rollout(q, p, s, h=0.05, steps=20)
+    tol = 1e-12 if dtype == torch.float64 else 2e-4
+    torch.testing.assert_close(out.q, expected.q, rtol=tol, atol=tol)
+    torch.testing.assert_close(out.p, expected.p, rtol=tol, atol=tol)
+    torch.testing.assert_close(out.s, expected.s, rtol=tol, atol=10 * tol)
+    CASES[name].double()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"features": ("cos(q1 - q2) v1 v2",)}, "features of the velocity cannot be written as C"),
+        ({"level": "forced", "coupled": True}, "coupled friction cannot be written as C"),
+        ({"order": 4, "potential_width": 0}, "the rule of order 4 cannot be written as C"),
+    ],
+)
+def test_terms_without_c_are_refused_by_name(tmp_path, settings, words):
+    # fails if a term is left out of the file in silence
+    sizes: dict[str, Any] = {name: (1.0,) * 2 for name in ("scale", "speed", "stiffness", "tilt")}
+    with pytest.raises(InputError, match=words):
+        export_c(ContactLagrangian(ModelConfig(angles=(True,) * 2, **sizes, **settings)), tmp_path / "x.h", h=0.1)

@@ -1,0 +1,115 @@
+"""Smoothed states: nearer to the truth than the data, with standard errors that say how near."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper
+from herglotz.systems import scene
+from herglotz.training import ShootingProblem, levenberg_marquardt, smooth
+from herglotz.training.grid import segment_grid
+from herglotz.training.trajectory_fit import StatesOnly
+
+NOISE = 0.05
+
+
+def pendulum(level="linear", **settings):
+    sizes = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
+    model = ContactLagrangian(
+        ModelConfig(level=level, rate=0.2, potential_width=0, damping_width=0, **sizes, **settings)
+    )
+    if model.friction is not None and model.inputs:
+        torch.nn.init.constant_(model.friction.input_map, 1.0)
+    return model
+
+
+def recorded(model, seed=0, steps=60, count=3, gaps=True, push=0.0, inputs=None):
+    """Noisy positions of the model's own motion, and its states; one sample in nine is missing."""
+    make = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=make, dtype=torch.float64)  # noqa: E731
+    h = 0.2 * (1 + 0.3 * (2 * torch.rand(count, steps, generator=make, dtype=torch.float64) - 1))
+    stepper, half = Stepper(model), steps // 2
+    with torch.no_grad():
+        u = [None, None] if inputs is None else [inputs[:, :half], inputs[:, half:]]
+        a = stepper.rollout(draw(count, 1), draw(count, 1), h=h[:, :half], inputs=u[0])
+        b = stepper.rollout(a.q[:, -1], a.p[:, -1] + push, a.s[:, -1], h=h[:, half:], inputs=u[1])
+    q, p, s = (torch.cat([getattr(a, k), getattr(b, k)[:, 1:]], 1) for k in "qps")
+    t = torch.cat([h.new_zeros(count, 1), h.cumsum(1)], 1)
+    keep = torch.ones(steps + 1, dtype=torch.bool)
+    keep[4 : steps - 3 : 9] = not gaps
+    truth = [x[:, keep].flatten(0, 1) for x in (q, p, s)]
+    noisy = truth[0] + NOISE * draw(*truth[0].shape)
+    return Trajectories.of(t[:, keep].flatten(), noisy, (int(keep.sum()),) * count, angles=(True,)), truth
+
+
+@pytest.mark.parametrize("level", ["conservative", "linear", "affine"])
+def test_states_and_their_standard_errors(level):
+    # fails if a block, the guess or the variance is wrong: scores would not be those of a unit normal
+    model = pendulum(level)
+    scores, better = [], []
+    for seed in range(4):
+        data, (q, p, _) = recorded(model, seed)
+        found = smooth(model, data, NOISE, process=0.01)
+        scores += [(found.states.q - q) / found.std.q, (found.states.p - p) / found.std.p]
+        better.append((found.states.q - q).square().mean().sqrt())
+    score = torch.cat(scores).flatten()
+    assert float(torch.stack(better).mean()) < 0.5 * NOISE
+    assert 0.75 < float(score.square().mean().sqrt()) < 1.25
+    assert float((score.abs() < 1.645).double().mean()) > 0.8
+
+
+def test_little_process_noise_is_single_shooting():
+    # fails if the steps' defects enter with a wrong sign or weight: w → 0 is the fit of the start state alone
+    model = pendulum()
+    data, _ = recorded(model, gaps=False, count=1)
+    found = smooth(model, data, NOISE, process=1e-4)
+    problem = ShootingProblem(model, data, segment_grid(data, data.samples, 1.0), sigma=NOISE)
+    states = StatesOnly(problem, problem.flat.get())
+    start = torch.cat([found.states.q[0], found.states.p[0]]) + 0.05
+    x = levenberg_marquardt(states, start, rtol=1e-12).x
+    torch.testing.assert_close(torch.cat([found.states.q[0], found.states.p[0]]), x, rtol=0, atol=1e-4)
+    _, A, _ = states.normal_equations(x)
+    std = torch.linalg.inv(A).diagonal().sqrt()
+    torch.testing.assert_close(torch.cat([found.std.q[0], found.std.p[0]]), std, rtol=2e-2, atol=0)
+
+
+def test_a_push_is_followed_with_process_noise():
+    # fails if the process noise does not reach the momentum
+    model = pendulum()
+    data, (q, _, _) = recorded(model, push=1.0)
+    stiff, soft = (smooth(model, data, NOISE, process=w).states.q - q for w in (1e-3, 1.0))
+    assert float(soft.square().mean()) < 0.1 * float(stiff.square().mean())
+
+
+def test_inputs_drive_the_smoother():
+    # fails if the steps between states are taken without their inputs
+    model = pendulum("forced", inputs=1)
+    u = torch.randn(3, 60, 1, generator=torch.Generator().manual_seed(5), dtype=torch.float64)
+    data, (q, _, _) = recorded(model, inputs=u, gaps=False)
+    u = torch.cat([u, torch.zeros_like(u[:, :1])], 1).flatten(0, 1)
+    found = smooth(model, replace(data, u=u), NOISE, process=0.01)
+    assert float((found.states.q - q).square().mean().sqrt()) < 0.5 * NOISE
+    with pytest.raises(InputError, match="hold none; add u"):
+        smooth(model, data, NOISE)
+
+
+def test_s_counts_along():
+    # fails if s is not the model's own along the smoothed motion
+    model = pendulum()
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=20, h=0.2, seed=1)
+    states = smooth(model, data, 1e-6, process=1e-3).states
+    out = Stepper(model).rollout(states.q[0], states.p[0], states.s[0], h=0.2, steps=20)
+    torch.testing.assert_close(states.s, out.s.detach(), rtol=0, atol=5e-3)
+
+
+@pytest.mark.parametrize(("sigma", "process", "name"), [(0.0, 0.1, "sigma"), (0.1, -1.0, "process")])
+def test_sizes_are_checked(sigma, process, name):
+    # fails if a zero gives infinite weights
+    model = pendulum()
+    data, _ = recorded(model)
+    with pytest.raises(InputError, match=f"{name} must be finite and > 0"):
+        smooth(model, data, sigma, process=process)
