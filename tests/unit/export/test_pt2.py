@@ -282,6 +282,7 @@ def newton(model, iterations, q, p, s, h):
     """The loop of the exported graphs, turned by hand."""
     equations, h = Equations.of(model), torch.full_like(s, h)
     solver = Newton(equations.newton, iterations)
+    assert equations.field is not None
     carry, problem = solver.start(q, s, torch.zeros_like(q)), (q, p, s, h, *equations.field(q))
     while bool(solver.unfinished(carry[0], carry[1])):
         carry = solver.iterate(problem, carry, solver.equation.constants)
