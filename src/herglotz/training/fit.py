@@ -32,7 +32,7 @@ from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, make_prior
 
 PROBE = 40  # iterations of the flexible fit that measures the noise
-NOISY = 1e-4  # a one-step error above this fraction of the motion's size is noise, not the fit
+NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 RESTART = 7919  # between the seeds of one fit's restarts
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
