@@ -101,7 +101,7 @@ class Newton(nn.Module):
         accept = ~done & (better | settled)
         new = ((trial, x), (delta_trial, delta), (merit_trial, merit))
         new = (*new, *zip(values_trial, values, strict=True))
-        x, delta, merit, *values = (torch.where(_like(accept, a), a, b) for a, b in new)
+        x, delta, merit, *values = (dense(torch.where(_like(accept, a), a, b)) for a, b in new)
         fraction = torch.where(accept, 1.0, fraction / 2)
         return count + 1, done | settled | stalled | hopeless, x, delta, merit, fraction, scale.clone(), *values
 
@@ -114,7 +114,7 @@ class Newton(nn.Module):
 
         # The operator itself: its wrapper would first have dynamo trace the loop, which takes longer than all else.
         more: Any = (*problem, *constants)
-        start: Any = carry
+        start: Any = tuple(dense(x) for x in carry)
         ended = while_loop_op(lambda *x: self.unfinished(x[0], x[1]), turn, start, more)
         _, done, x, delta, merit, _, _, *values = ended
         return x, delta, merit, done, *values
