@@ -9,7 +9,7 @@ Data: pendulum_02, pendulum_05, pendulum_10 (simulated damped pendulum at three 
 
 Examples
 --------
-    python benchmarks/peers.py --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out /tmp/peers
+    python benchmarks/peers.py --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out runs/peers
     python benchmarks/peers.py --reproduce            # figures of the sources, measured with our implementations
     python benchmarks/peers.py --redraw               # table and figure from the JSON that is there
 
