@@ -6,6 +6,8 @@ damping is uniform, m q̈ = F − mγq̇, so one scalar s says it exactly at any
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules, strang
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5, gamma: float = 0.1) -> Scene:
@@ -77,9 +79,6 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
 
     motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = {**all_rules(lagrangian), "strang": strang(potential, m, gamma)}
     return Scene(
         name="chain",
@@ -94,7 +93,7 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,

@@ -7,6 +7,8 @@ compared for tens of seconds.
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
@@ -57,9 +59,6 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
 
     motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = all_rules(lagrangian)
     return Scene(
         name="double_pendulum",
@@ -74,7 +73,7 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,

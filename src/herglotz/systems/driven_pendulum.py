@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -18,7 +19,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import RULES, strang
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -91,9 +92,6 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
 
         motion = herglotz_motion(lagrangian, momentum, momentum, force, constant_rate(-gamma))
 
-        def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-            return reference_flow(motion.vector_field, q, p, s, h)
-
         return Scene(
             name="driven_pendulum",
             description="damped pendulum under a given torque, θ̈ = −sin θ − γθ̇ + u; reference flow to about 1e-13",
@@ -107,7 +105,7 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
             lagrangian=lagrangian,
             momentum=momentum,
             velocity=momentum,
-            flow=flow,
+            flow=partial(reference_flow, motion.vector_field),
             L_d=rules["midpoint_heun"],
             exact=False,
             L_d_rules=rules,

@@ -7,6 +7,8 @@ singular and no step across or near it is exact to any order.
 
 from __future__ import annotations
 
+from functools import partial
+
 from torch import Tensor
 
 from herglotz.errors import InputError
@@ -14,7 +16,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules, strang
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
@@ -57,9 +59,6 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
 
     motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = {**all_rules(lagrangian), "strang": strang(potential, m, gamma)}
     return Scene(
         name="kepler",
@@ -74,7 +73,7 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,

@@ -6,6 +6,8 @@ system on which an exchanged index, a transposed block or a c taken for constant
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -13,7 +15,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def nonlinear_action(damping: float = 1.0) -> Scene:
@@ -57,9 +59,6 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
 
     motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = all_rules(lagrangian)
     return Scene(
         name="nonlinear_action",
@@ -74,7 +73,7 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,

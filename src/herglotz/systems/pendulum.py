@@ -5,6 +5,8 @@ L = v²/2 − (1 − cos q) − γs and H = p²/2 + (1 − cos q) + γs, in unit
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules, strang
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def damped_pendulum(gamma: float = 0.2) -> Scene:
@@ -42,9 +44,6 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
     # Written out, so that the flow is differentiable and fast; a test holds it to `contact_vector_field`.
     motion = herglotz_motion(lagrangian, momentum, momentum, force, constant_rate(-gamma))
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = {**all_rules(lagrangian), "strang": strang(potential, 1.0, gamma)}
     return Scene(
         name="damped_pendulum",
@@ -59,7 +58,7 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=momentum,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,

@@ -6,6 +6,8 @@ R = R_z(ψ) R_y(θ) R_x(φ). The angular momentum in space, R JΩ, is scaled by 
 
 from __future__ import annotations
 
+from functools import partial
+
 import torch
 from torch import Tensor
 
@@ -14,7 +16,7 @@ from herglotz.systems.exact import exact_discrete_lagrangian
 from herglotz.systems.motion import constant_rate, herglotz_motion
 from herglotz.systems.reference import reference_flow
 from herglotz.systems.rules import all_rules
-from herglotz.systems.scene import Scene, State, Step
+from herglotz.systems.scene import Scene
 
 
 def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float = 0.1) -> Scene:
@@ -91,9 +93,6 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
 
     motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        return reference_flow(motion.vector_field, q, p, s, h)
-
     rules = all_rules(lagrangian)
     return Scene(
         name="rigid_body",
@@ -108,7 +107,7 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=flow,
+        flow=partial(reference_flow, motion.vector_field),
         L_d=rules["midpoint_heun"],
         exact=False,
         L_d_rules=rules,
