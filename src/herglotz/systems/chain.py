@@ -6,16 +6,13 @@ damping is uniform, m q̈ = F − mγq̇, so one scalar s says it exactly at any
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import constant_rate, herglotz_motion
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules, strang
+from herglotz.systems.motion import constant_rate
+from herglotz.systems.natural import Natural, scene_without_closed_form
+from herglotz.systems.rules import strang
 from herglotz.systems.scene import Scene
 
 
@@ -61,26 +58,12 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
         d2 = stretches(q) ** 2
         return (d2 * (0.5 * k + 0.25 * beta * d2)).sum(-1)
 
-    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * m * (v * v).sum(-1) - potential(q) - gamma * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return (p * p).sum(-1) / (2 * m) + potential(q) + gamma * s
-
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return m * v
-
-    def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return p / m
-
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         d = stretches(q)
         return torch.diff(d * (k + beta * d * d))
 
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
-
-    rules = {**all_rules(lagrangian), "strang": strang(potential, m, gamma)}
-    return Scene(
+    system = Natural(potential, gamma, m)
+    return scene_without_closed_form(
         name="chain",
         description="masses between two walls, hardening springs, one damping rate; reference flow to about 1e-13",
         dof=n,
@@ -89,17 +72,15 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
         time_unit="s",
         angles=(False,) * n,
         parameters={"masses": n, "m": m, "k": k, "beta": beta, "gamma": gamma},
-        hamiltonian=hamiltonian,
-        lagrangian=lagrangian,
-        momentum=momentum,
-        velocity=velocity,
-        flow=partial(reference_flow, motion.vector_field),
-        L_d=rules["midpoint_heun"],
-        exact=False,
-        L_d_rules=rules,
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        rules={"strang": strang(potential, m, gamma)},
         q_range=(-0.5, 0.5),
         v_range=(-0.5, 0.5),
         h=0.2,
-        numerical=exact_discrete_lagrangian(motion),
         examples=({"masses": 3, "m": 1.3, "k": 0.8, "beta": 1.1, "gamma": 0.3},),
     )

@@ -7,15 +7,11 @@ compared for tens of seconds.
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import constant_rate, herglotz_motion
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules
+from herglotz.systems.motion import constant_rate
+from herglotz.systems.natural import scene_without_closed_form
 from herglotz.systems.scene import Scene
 
 
@@ -57,10 +53,7 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         weight = g * torch.sin(q)
         return torch.stack([-twist - 2 * weight[..., 0], twist - weight[..., 1]], -1)
 
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
-
-    rules = all_rules(lagrangian)
-    return Scene(
+    return scene_without_closed_form(
         name="double_pendulum",
         description="damped double pendulum, m = ℓ = 1; no closed form, reference flow to about 1e-13",
         dof=2,
@@ -73,13 +66,10 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=partial(reference_flow, motion.vector_field),
-        L_d=rules["midpoint_heun"],
-        exact=False,
-        L_d_rules=rules,
+        force=force,
+        rate=constant_rate(-gamma),
         q_range=(-1.2, 1.2),
         v_range=(-1.5, 1.5),
         h=0.05,
-        numerical=exact_discrete_lagrangian(motion),
         examples=({"g": 4.0, "gamma": 0.4},),
     )

@@ -8,16 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.mechanics.continuous import Lagrangian
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import constant_rate, herglotz_motion
-from herglotz.systems.reference import reference_flow
+from herglotz.systems.motion import constant_rate
+from herglotz.systems.natural import Natural, scene_without_closed_form
 from herglotz.systems.rules import RULES, strang
 from herglotz.systems.scene import Scene
 
@@ -60,12 +57,8 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
     def potential_at(u: Tensor | float) -> Callable[[Tensor], Tensor]:
         return lambda q: 2.0 * torch.sin(0.5 * q[..., 0]) ** 2 - u * q[..., 0]  # 1 − cos q without its cancellation
 
-    def lagrangian_at(u: Tensor | float) -> Lagrangian:
-        potential = potential_at(u)
-        return lambda q, v, s: 0.5 * v[..., 0] ** 2 - potential(q) - gamma * s
-
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return v
+    def system_at(u: Tensor | float) -> Natural:
+        return Natural(potential_at(u), gamma)
 
     def drive(t: Tensor) -> Tensor:
         return amplitude * torch.cos(frequency * t)[..., None]
@@ -75,24 +68,20 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
 
     rules: dict[str, DiscreteLagrangian] = {}
     for name, rule in RULES.items():
-        # Galerkin rules evaluate L at several nodes at once, which an input of each sample does not broadcast to.
-        plain = name.startswith("lobatto")
-        rules[name] = rule(lagrangian_at(amplitude)) if plain else driven(lambda u, r=rule: r(lagrangian_at(u)))
+        if name.startswith("lobatto"):  # evaluates L at several nodes at once: no broadcast of u
+            rules[name] = rule(system_at(amplitude).lagrangian)
+        else:
+            rules[name] = driven(lambda u, r=rule: r(system_at(u).lagrangian))
     rules["strang"] = driven(lambda u: strang(potential_at(u), 1.0, gamma))
 
     def scene_at(u: Tensor | float) -> Scene:
-        potential, lagrangian = potential_at(u), lagrangian_at(u)
-
-        def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-            return 0.5 * p[..., 0] ** 2 + potential(q) + gamma * s
+        system = system_at(u)
 
         def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
             torque = u[..., None] if isinstance(u, Tensor) else u
             return torque - torch.sin(q)
 
-        motion = herglotz_motion(lagrangian, momentum, momentum, force, constant_rate(-gamma))
-
-        return Scene(
+        return scene_without_closed_form(
             name="driven_pendulum",
             description="damped pendulum under a given torque, θ̈ = −sin θ − γθ̇ + u; reference flow to about 1e-13",
             dof=1,
@@ -101,18 +90,16 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
             time_unit="s",
             angles=(True,),
             parameters={"gamma": gamma, "amplitude": amplitude, "frequency": frequency},
-            hamiltonian=hamiltonian,
-            lagrangian=lagrangian,
-            momentum=momentum,
-            velocity=momentum,
-            flow=partial(reference_flow, motion.vector_field),
-            L_d=rules["midpoint_heun"],
-            exact=False,
-            L_d_rules=rules,
+            hamiltonian=system.hamiltonian,
+            lagrangian=system.lagrangian,
+            momentum=system.momentum,
+            velocity=system.velocity,
+            force=force,
+            rate=constant_rate(-gamma),
+            rules=rules,
             q_range=(-2.0, 2.0),
             v_range=(-1.2, 1.2),
             h=0.2,
-            numerical=exact_discrete_lagrangian(motion),
             examples=({"gamma": 0.35, "amplitude": 0.7, "frequency": 0.9},),
             at=lambda u: scene_at(u[..., 0]),
             drive=drive,

@@ -7,15 +7,12 @@ singular and no step across or near it is exact to any order.
 
 from __future__ import annotations
 
-from functools import partial
-
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import constant_rate, herglotz_motion
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules, strang
+from herglotz.systems.motion import constant_rate
+from herglotz.systems.natural import Natural, scene_without_closed_form
+from herglotz.systems.rules import strang
 from herglotz.systems.scene import Scene
 
 
@@ -42,25 +39,11 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
     def potential(q: Tensor) -> Tensor:
         return -k / (q * q).sum(-1).sqrt()
 
-    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * m * (v * v).sum(-1) - potential(q) - gamma * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return (p * p).sum(-1) / (2 * m) + potential(q) + gamma * s
-
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return m * v
-
-    def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return p / m
-
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         return -k * q * (q * q).sum(-1, keepdim=True) ** -1.5
 
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
-
-    rules = {**all_rules(lagrangian), "strang": strang(potential, m, gamma)}
-    return Scene(
+    system = Natural(potential, gamma, m)
+    return scene_without_closed_form(
         name="kepler",
         description="planar Kepler problem with linear drag; no closed form, reference flow to about 1e-13",
         dof=2,
@@ -69,17 +52,15 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
         time_unit="s",
         angles=(False, False),
         parameters={"m": m, "k": k, "gamma": gamma},
-        hamiltonian=hamiltonian,
-        lagrangian=lagrangian,
-        momentum=momentum,
-        velocity=velocity,
-        flow=partial(reference_flow, motion.vector_field),
-        L_d=rules["midpoint_heun"],
-        exact=False,
-        L_d_rules=rules,
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        rules={"strang": strang(potential, m, gamma)},
         q_range=((0.8, -0.3), (1.2, 0.3)),
         v_range=((-0.2, 0.8), (0.2, 1.2)),
         h=0.1,
-        numerical=exact_discrete_lagrangian(motion),
         examples=({"m": 1.3, "k": 0.9, "gamma": 0.2},),
     )

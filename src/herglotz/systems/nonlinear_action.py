@@ -6,15 +6,10 @@ system on which an exchanged index, a transposed block or a c taken for constant
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import herglotz_motion
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules
+from herglotz.systems.natural import scene_without_closed_form
 from herglotz.systems.scene import Scene
 
 
@@ -57,10 +52,7 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
     def rate(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         return -damping * (0.3 + 0.1 * torch.cos(s) * (1 + 0.2 * q[..., 1])) - drag * v[..., 0]
 
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
-
-    rules = all_rules(lagrangian)
-    return Scene(
+    return scene_without_closed_form(
         name="nonlinear_action",
         description="two degrees of freedom, nonlinear in s; no closed form, reference flow to about 1e-13",
         dof=2,
@@ -73,13 +65,10 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=partial(reference_flow, motion.vector_field),
-        L_d=rules["midpoint_heun"],
-        exact=False,
-        L_d_rules=rules,
+        force=force,
+        rate=rate,
         q_range=(-1.0, 1.0),
         v_range=(-1.0, 1.0),
         h=0.2,
-        numerical=exact_discrete_lagrangian(motion),
         examples=({"damping": 1.5},),
     )

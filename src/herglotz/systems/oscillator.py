@@ -12,6 +12,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
+from herglotz.systems.natural import Natural
 from herglotz.systems.rules import all_rules, strang
 from herglotz.systems.scene import Scene, State, Step
 from herglotz.systems.special import as_step, cosw, sincw, versw
@@ -97,11 +98,7 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
     def potential(q: Tensor) -> Tensor:
         return 0.5 * stiffness * (q * q).sum(-1)
 
-    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * m * (v * v).sum(-1) - potential(q) - gamma * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return (p * p).sum(-1) / (2 * m) + potential(q) + gamma * s
+    system = Natural(potential, gamma, m)
 
     def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
@@ -140,14 +137,14 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
         time_unit="s",
         angles=(False,),
         parameters={"m": m, "omega0": omega0, "gamma": gamma},
-        hamiltonian=hamiltonian,
-        lagrangian=lagrangian,
-        momentum=lambda q, v, s: m * v,  # noqa: ARG005
-        velocity=lambda q, p, s: p / m,  # noqa: ARG005
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
         flow=flow,
         L_d=L_d,
         exact=True,
-        L_d_rules={**all_rules(lagrangian), "strang": strang(potential, m, gamma)},
+        L_d_rules={**all_rules(system.lagrangian), "strang": strang(potential, m, gamma)},
         q_range=(-1.5, 1.5),
         v_range=(-1.5, 1.5),
         h=0.1,

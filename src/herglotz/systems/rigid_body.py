@@ -6,16 +6,12 @@ R = R_z(ψ) R_y(θ) R_x(φ). The angular momentum in space, R JΩ, is scaled by 
 
 from __future__ import annotations
 
-from functools import partial
-
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.systems.exact import exact_discrete_lagrangian
-from herglotz.systems.motion import constant_rate, herglotz_motion
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.rules import all_rules
+from herglotz.systems.motion import constant_rate
+from herglotz.systems.natural import scene_without_closed_form
 from herglotz.systems.scene import Scene
 
 
@@ -91,10 +87,7 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
         pitch = -yaw * (J1 * O1 * cp + sp * (J2 * O2 * sr + J3 * O3 * cr))
         return torch.stack([roll, pitch, torch.zeros_like(roll)], -1)
 
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, constant_rate(-gamma))
-
-    rules = all_rules(lagrangian)
-    return Scene(
+    return scene_without_closed_form(
         name="rigid_body",
         description="free rigid body with one damping rate, in roll, pitch and yaw; reference flow to about 1e-13",
         dof=3,
@@ -107,13 +100,10 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
-        flow=partial(reference_flow, motion.vector_field),
-        L_d=rules["midpoint_heun"],
-        exact=False,
-        L_d_rules=rules,
+        force=force,
+        rate=constant_rate(-gamma),
         q_range=((-1.0, -0.4, -1.0), (1.0, 0.4, 1.0)),
         v_range=((0.8, -0.2, -0.2), (1.2, 0.2, 0.2)),
         h=0.1,
-        numerical=exact_discrete_lagrangian(motion),
         examples=({"J1": 2.1, "J2": 1.7, "J3": 0.9, "gamma": 0.3},),
     )
