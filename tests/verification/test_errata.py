@@ -14,6 +14,7 @@ from herglotz.systems import PrintedParachute, scene
 from herglotz.systems.printed_parachute import MAP_START
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT / "train"))  # as for a script that is run there
 
 
 def script(name):
