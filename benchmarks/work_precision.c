@@ -61,21 +61,29 @@ static inline void pull(const real *q, real *a) {
 }
 #endif
 
-#if SYSTEM == 1 /* double pendulum: M a = f, from p' = L_q - gamma p */
+#if SYSTEM == 1 /* double pendulum: M a = f, from p' = L_q - gamma p; the constants are the true ones, or learned */
+#ifndef M00
+#define M00 2.0 /* K = (M00 v0^2 + 2 (M01 + MC cos(q0 - q1)) v0 v1 + M11 v1^2)/2, V = -G0 cos q0 - G1 cos q1 */
+#define M01 0.0
+#define MC 1.0
+#define M11 1.0
+#define G0 19.62
+#define G1 9.81
+#define RATE 0.1
+#endif
 static inline void slope(const real *y, real *f) {
-  const real g = (real)9.81, gamma = (real)0.1;
-  real s0, c0, s1, c1, c, s, f0, f1, det;
+  real s0, c0, s1, c1, m, s, f0, f1, det;
   sine_cosine(y[0], &s0, &c0);
   sine_cosine(y[1], &s1, &c1);
-  s = s0 * c1 - c0 * s1;
-  c = c0 * c1 + s0 * s1;
-  f0 = -s * y[3] * y[3] - 2 * g * s0;
-  f1 = s * y[2] * y[2] - g * s1;
-  det = 1 / (2 - c * c);
+  s = (real)MC * (s0 * c1 - c0 * s1);
+  m = (real)M01 + (real)MC * (c0 * c1 + s0 * s1);
+  f0 = -s * y[3] * y[3] - (real)G0 * s0;
+  f1 = s * y[2] * y[2] - (real)G1 * s1;
+  det = 1 / ((real)(M00 * M11) - m * m);
   f[0] = y[2];
   f[1] = y[3];
-  f[2] = (f0 - c * f1) * det - gamma * y[2];
-  f[3] = (2 * f1 - c * f0) * det - gamma * y[3];
+  f[2] = ((real)M11 * f0 - m * f1) * det - (real)RATE * y[2];
+  f[3] = ((real)M00 * f1 - m * f0) * det - (real)RATE * y[3];
 }
 #elif SYSTEM == 3 /* parachute */
 static inline void slope(const real *y, real *f) {

@@ -30,6 +30,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from work_precision_analytic import analytic
 from work_precision_cases import prepare
+from work_precision_headline import WANTED, study, study_table
 from work_precision_learned import points
 from work_precision_report import add_leapfrog_unit, draw, front, headline, markdown, spread_of
 from work_precision_scenes import SETUPS
@@ -43,6 +44,7 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--quick", action="store_true", help="small fits, few settings")
     parser.add_argument("--scenes", default=None, help="with commas (default: all)")
     parser.add_argument("--resume", action="store_true", help="keep the scenes that OUT.json already holds")
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5; 0: none)")
     parser.add_argument("--only", choices=("analytic", "learned"), help="one half of the settings")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "work_precision.json")
     arguments = parser.parse_args(argv)
@@ -75,6 +77,10 @@ def main(argv: list[str] | None = None) -> dict:
             notes |= {"T": SETUPS[name].T, "h": SETUPS[name].h, "spread": spread_of(found)}
             result["notes"][name] = {**notes, "total_seconds": time.process_time() - began}
             _write(result, arguments.out)
+    for name in (n for n in WANTED if n in names and arguments.seeds and arguments.only is None):
+        if name not in result["study"]:
+            result["study"][name] = study(name, arguments.seeds, arguments.quick, lambda what, n=name: print(n, what))
+            _write(result, arguments.out)
     for name in names:
         print(f"{name}: the front")
         for p in front(result["scenes"][name]):
@@ -87,11 +93,11 @@ def _begun(arguments: argparse.Namespace) -> dict[str, Any]:
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
     result: dict[str, Any] = {
         "commit": commit.strip(), "machine": machine, "torch": torch.__version__, "quick": arguments.quick,
-        "scenes": {}, "headline": {}, "notes": {},
+        "scenes": {}, "headline": {}, "notes": {}, "study": {},
     }  # fmt: skip
     if arguments.resume and arguments.out.exists():
         old = json.loads(arguments.out.read_text())
-        result |= {k: old[k] for k in ("scenes", "headline", "notes")}
+        result |= {k: old[k] for k in ("scenes", "headline", "notes", "study") if k in old}
     return result
 
 
@@ -102,7 +108,8 @@ def _write(result: dict[str, Any], out: Path) -> None:
     partial = out.with_suffix(".part")
     partial.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     partial.replace(out)
-    out.with_suffix(".md").write_text(markdown(result))
+    tables = [line for name, found in result["study"].items() for line in study_table(name, found)]
+    out.with_suffix(".md").write_text(markdown(result) + "\n".join([*tables, ""]))
     draw(order, out.with_suffix(".png"))
 
 

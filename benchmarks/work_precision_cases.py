@@ -9,13 +9,15 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from work_precision_scenes import Setup, exact_motion, starts_of
+from work_precision_scenes import CHECKS, Setup, exact_motion, judged, starts_of
 
 from herglotz.data import simulate
+from herglotz.errors import InputError
 from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, fit
+from herglotz.tune.reference import draw_starts, record
 
-COUNT = 64  # motions whose errors are taken
+COUNT = 192  # motions whose errors are taken: half to choose a setting by, half to judge it
 TIMED = 16  # of them are timed
 PER = 4e-3  # seconds of one timing of C, at least
 
@@ -40,23 +42,30 @@ class Case:
     start: State  # the same in the scene's
     truth: Tensor  # (B, CHECKS, n)
     seconds: dict[str, float]
+    seed: int = 0
 
 
-def prepare(setup: Setup, quick: bool) -> Case:
+def prepare(setup: Setup, quick: bool, seed: int = 0) -> Case:
     """Fit the model to positions, and enter it from two positions as a user must."""
     system = setup.scene
     size = (10, 20) if quick else (setup.trajectories, setup.steps)
-    data = simulate(system, trajectories=size[0], steps=size[1], h=setup.h, seed=0, keep_state=True)
+    data = simulate(system, trajectories=size[0], steps=size[1], h=setup.h, seed=seed, keep_state=True)
     began = time.process_time()
-    run = fit(replace(data, s=None, p=None), fit_config(setup, quick), progress=False)
+    run = fit(replace(data, s=None, p=None), fit_config(setup, quick, seed=seed), progress=False)
     seconds = {"fit": time.process_time() - began}
     first = starts_of(system, 16 if quick else COUNT, 1000)
     u = setup.inputs()
     before = system if u is None else system.at(u[0])
     start = State(*before.flow(*first, setup.h))
+    return Case(setup, run, entered(setup, run, first, start), start, exact_motion(setup, start), seconds, seed)
+
+
+def entered(setup: Setup, run: Run, first: State, start: State) -> State:
+    """The learned model's own state at `start`, from the two positions."""
+    u = setup.inputs() if run.model.inputs else None
     with torch.no_grad():
         entry = run.stepper.init(first.q, start.q, None, setup.h, **({} if u is None else {"u": u[0]}))
-    return Case(setup, run, State(*(x.detach() for x in entry)), start, exact_motion(setup, start), seconds)
+    return State(*(x.detach() for x in entry))
 
 
 def fit_config(setup: Setup, quick: bool, **changes: Any) -> FitConfig:
@@ -64,6 +73,28 @@ def fit_config(setup: Setup, quick: bool, **changes: Any) -> FitConfig:
     iterations = options.pop("iterations")
     iterations = 10 if quick else iterations
     return FitConfig(train_fraction=1.0, objective="residual", iterations=iterations, departures=(2e-3,), **options)
+
+
+def rolled(case: Case, stepper: Any, h: float, dtype: torch.dtype = torch.float64) -> dict[str, float | None]:
+    steps, u = round(case.setup.T / h), inputs_of(case)
+    if steps % CHECKS:
+        raise InputError(f"{steps} steps do not reach the {CHECKS} times of the check")
+    options = {} if u is None else {"inputs": u.to(dtype)}
+    with torch.no_grad():
+        start = (x.to(dtype).contiguous() for x in case.entry)
+        q = stepper.rollout(*start, h=h, steps=steps, **options).q[:, 1:]
+    return judged(q[:, steps // CHECKS - 1 :: steps // CHECKS], case.truth)
+
+
+def inputs_of(case: Case) -> Tensor | None:
+    """The inputs of the scene, where the model takes them."""
+    return case.setup.inputs() if case.run.model.inputs else None
+
+
+def motions_of(case: Case) -> State:
+    """Motions of the fitted model itself, to distil from."""
+    made = record(case.run, draw_starts(case.run, 60, 5), case.setup.T, "own")
+    return made.states
 
 
 def repeated(call: Callable[[], Any], keep: Any = None) -> tuple[Callable[[], Any], int]:

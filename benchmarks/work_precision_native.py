@@ -56,10 +56,19 @@ class Weights:
 class Native:
     """One compiled set of methods: of a scene's true equations, or of a network."""
 
-    def __init__(self, name: str, dtype: str, weights: Weights | None = None, dof: int = 1, fast: bool = True):
+    def __init__(
+        self,
+        name: str,
+        dtype: str,
+        weights: Weights | None = None,
+        dof: int = 1,
+        fast: bool = True,
+        constants: Mapping[str, float] | None = None,
+    ):
         self.dof = dof
         system = SYSTEMS[name] if weights is None else NETWORK
         defines = {"SYSTEM": system, "DOF": dof, "real": REAL[dtype], "FAST_SINE": int(fast), **_constants()}
+        defines |= {k: repr(v) for k, v in (constants or {}).items()}
         if weights is not None:
             defines |= {"IN": weights.inputs, "WIDTH": weights.width, "LAYERS": weights.layers}
             defines["ANGLES"] = int(weights.angles)

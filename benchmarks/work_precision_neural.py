@@ -17,7 +17,7 @@ PAIRS = 700
 PARTS = 4  # RK4 steps between two samples
 
 
-def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iterations: int) -> Weights:
+def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iterations: int, seed: int = 0) -> Weights:
     """Weights of a = net(sin q, cos q, v), or net(q, v) where q is no angle, fitted to exact states h apart.
 
     It is given what the learned steppers are not: the exact velocities. An input u is added to a, known.
@@ -26,7 +26,7 @@ def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iteration
     n, angles = system.dof, all(system.angles)
     blank = Weights(torch.empty(0), n, width, layers, angles)
     sizes = [(blank.inputs, width), (width,), *([(width, width), (width,)] if layers == 2 else []), (n, width)]
-    generator = torch.Generator().manual_seed(0)
+    generator = torch.Generator().manual_seed(seed)
     first = [torch.randn(s, generator=generator, dtype=torch.float64) / s[0] ** 0.5 for s in sizes]
     first[-1] = first[-1] * 0.1
     theta = torch.cat([x.flatten() for x in first])

@@ -9,7 +9,7 @@ from torch import Tensor
 from work_precision_cases import TIMED, Case, Timed, repeated
 from work_precision_native import FLOPS, SEPARABLE, Native, Weights
 from work_precision_neural import train_neural_ode
-from work_precision_scenes import CHECKS, Setup, errors_of
+from work_precision_scenes import CHECKS, Setup, judged
 
 from herglotz.data import simulate
 
@@ -70,7 +70,7 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
     call, times = repeated(library.call(few, setup.T, segments, method, x, u))
     each = count / len(y) / setup.T
     more = {"evaluations_per_time": each, "flops_per_time": each * flops, "artefact": "C"}
-    errors = errors_of(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
+    errors = judged(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
     return Timed({**point, **errors, **more}, call, times * len(few) * setup.T)
 
 
@@ -79,12 +79,13 @@ def neural(case: Case, quick: bool) -> list[Timed]:
     setup = case.setup
     if not setup.neural:
         return []
-    data = simulate(setup.scene, trajectories=setup.trajectories, steps=setup.steps, h=setup.h, seed=0, keep_state=True)
-    sizes, iterations = setup.neural, 120 if setup.scene.dof == 1 else 60
+    size = {"trajectories": setup.trajectories, "steps": setup.steps, "h": setup.h, "seed": case.seed}
+    data = simulate(setup.scene, **size, keep_state=True)
+    sizes, iterations = setup.neural, setup.neural_iterations
     y = torch.cat([case.start.q, setup.scene.velocity(*case.start)], -1)
     found, began = [], time.process_time()
     for width, layers in sizes[:1] if quick else sizes:
-        weights: Weights = train_neural_ode(data, setup, width, layers, 10 if quick else iterations)
+        weights: Weights = train_neural_ode(data, setup, width, layers, 10 if quick else iterations, case.seed)
         for dtype in ("float64", "float32"):
             library = Native(setup.name, dtype, weights, setup.scene.dof)
             for method in ("RK4", "DOP853"):

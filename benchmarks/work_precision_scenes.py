@@ -14,6 +14,7 @@ from herglotz.stepping import State
 from herglotz.systems import scene
 
 CHECKS = 4  # times at which errors are taken
+TOLD = {"features": ("pendulums",), "order": 4, "correction_width": 0}  # what a user knows of two links
 
 
 @dataclass(frozen=True)
@@ -29,6 +30,7 @@ class Setup:
     multiples: tuple[int, ...] = (2, 4)  # steps of distilled models, in h
     kick_steps: tuple[int, ...] = ()  # in h
     neural: tuple[tuple[int, int], ...] = ((8, 1),)  # width and depth of the neural ODEs
+    neural_iterations: int = 60
     rules: tuple[int, ...] = (1, 2, 4)  # steps of analytic rules in one h
 
     # What a term of the model brings, or costs where it is not needed: the same data without it, or with it.
@@ -54,7 +56,19 @@ class Setup:
 SETUPS = {
     s.name: s
     for s in (
-        Setup("damped_oscillator", 0.5, 12.0, {"potential_width": 0, "correction_width": 8}, kick_steps=(2, 6)),
+        Setup(
+            "damped_oscillator",
+            0.5,
+            12.0,
+            {"potential_width": 0, "correction_width": 8},
+            kick_steps=(2, 6),
+            other={
+                "level conservative": {"level": "conservative"},
+                "level affine": {"level": "affine"},
+                "potential network": {"potential_width": 16},
+                "no correction": {"correction_width": 0},
+            },
+        ),
         Setup(
             "damped_pendulum",
             0.5,
@@ -66,6 +80,7 @@ SETUPS = {
             (2, 3, 6),
             rules=(1, 2, 4, 8),
             neural=((4, 1), (8, 1), (8, 2), (16, 2)),
+            neural_iterations=300,
             other={
                 "level conservative": {"level": "conservative"},
                 "level affine": {"level": "affine"},
@@ -78,33 +93,62 @@ SETUPS = {
             2.4,
             {"correction_width": 16, "mass_width": 8, "iterations": 120},
             multiples=(2, 3),
-            neural=((8, 1), (8, 2), (16, 2)),
+            neural=((8, 1), (16, 2)),
+            neural_iterations=120,
+            other={
+                "level conservative": {"level": "conservative"},
+                "constant mass": {"mass_width": 0},
+                "no correction": {"correction_width": 0},
+                "structure told": TOLD,
+            },
         ),
         Setup(
             "parachute",
             0.1,
             2.4,
             {"level": "affine"},
-            other={"level conservative": {"level": "conservative"}, "level linear": {"level": "linear"}},
+            other={
+                "level conservative": {"level": "conservative"},
+                "level linear": {"level": "linear"},
+                "no correction": {"correction_width": 0},
+            },
         ),
-        Setup("kepler", 0.1, 4.8, {"correction_width": 16}, other={"level conservative": {"level": "conservative"}}),
+        Setup(
+            "kepler",
+            0.1,
+            4.8,
+            {"features": ("central",), "alike": True, "correction_width": 16},
+            other={
+                "level conservative": {"level": "conservative"},
+                "potential network": {"features": (), "alike": False},
+                "no correction": {"correction_width": 0},
+            },
+        ),
         Setup(
             "chain",
             0.2,
             4.8,
-            {"potential_width": 0, "correction_width": 0},
+            {"features": ("chain",), "alike": True, "correction_width": 0},
             12,
             20,
-            (),
-            neural=(),
-            other={"level conservative": {"level": "conservative"}},
+            (2,),
+            neural_iterations=30,
+            other={
+                "level conservative": {"level": "conservative"},
+                "linear springs": {"features": (), "alike": False, "potential_width": 0},
+            },
         ),
         Setup(
             "driven_pendulum",
             0.25,
             12.0,
             {"level": "forced", "correction_width": 12},
-            other={"no input": {"use_inputs": False}},
+            other={
+                "no input": {"use_inputs": False},
+                "no correction": {"correction_width": 0},
+                "correction 6 × 2": {"correction_width": 6},
+                "correction 12 × 1": {"correction_depth": 1},
+            },
         ),
         Setup(
             "rigid_body",
@@ -113,8 +157,12 @@ SETUPS = {
             {"correction_width": 12, "mass_width": 8},
             20,
             24,
-            neural=(),
-            other={"constant mass": {"mass_width": 0}, "level conservative": {"level": "conservative"}},
+            neural=((12, 1),),
+            other={
+                "constant mass": {"mass_width": 0},
+                "level conservative": {"level": "conservative"},
+                "no correction": {"correction_width": 0},
+            },
         ),
     )
 }
@@ -148,3 +196,10 @@ def errors_of(q: Tensor, truth: Tensor) -> dict[str, float | None]:
     e = (q.double() - truth).abs().flatten(1).amax(1).nan_to_num(nan=math.inf)
     found = {"median": float(e.median()), "q95": float(e.quantile(0.95, interpolation="higher"))}
     return {k: v if math.isfinite(v) else None for k, v in found.items()}
+
+
+def judged(q: Tensor, truth: Tensor) -> dict[str, float | None]:
+    """Errors of the second half of the motions, and, to choose a setting by, of the first."""
+    half = len(q) // 2
+    choice = {f"choice_{k}": v for k, v in errors_of(q[:half], truth[:half]).items()}
+    return {**errors_of(q[half:], truth[half:]), **choice}

@@ -33,6 +33,18 @@ def test_a_linear_motion_has_no_scale(name, size):
 
 
 @pytest.mark.parametrize("name", LINEAR)
+def test_the_smallest_motion_is_solved_to_what_is_representable(name):
+    # fails if a motion of 1e-300, whose action of 1e-600 is zero, fails, or is wrong by more than 1e-306 over h a step
+    with torch.no_grad():
+        one = Stepper(LINEAR[name]).rollout(*state([1.0], [0.5]), h=0.1, steps=5)
+        out = Stepper(LINEAR[name]).rollout(*state([1e-300], [5e-301]), h=0.1, steps=5)
+    assert bool(out.ok.all())
+    assert bool((out.s == 0).all())
+    assert float((out.q / 1e-300 - one.q).abs().max()) < 2e-5
+    assert float((out.p / 1e-300 - one.p).abs().max()) < 2e-4
+
+
+@pytest.mark.parametrize("name", LINEAR)
 @pytest.mark.parametrize("size", [1e155, 1e200, 1e300])
 def test_an_action_that_overflows_stops_the_motion_with_a_status(name, size):
     # fails if inf appears in s without a status: s ~ m q²/h is not representable from q ~ 1e154 on

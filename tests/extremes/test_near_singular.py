@@ -10,7 +10,7 @@ from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.stepping import ContactSplitting, State, Status, Stepper, explain_step
 from herglotz.systems import scene
-from herglotz.tune import local_errors
+from herglotz.tune import flag_unresolved
 
 TINY = 1e-300  # stands for no damping in scenes whose s-derivative must exist
 
@@ -120,16 +120,25 @@ def test_equal_steps_over_the_pericentre_are_found_by_half_steps():
     planet = scene("kepler", gamma=TINY)
     zero = torch.zeros(1, 2, dtype=torch.float64)
     splitting = ContactSplitting(lambda q: planet.hamiltonian(q, zero, zero[:, 0]), 1.0, 0.0, force=_attraction)
-    found = {}
     anomaly = torch.linspace(0, 2 * math.pi, steps + 1, dtype=torch.float64)
-    for name, h in {
-        "equal": torch.full((steps,), 2 * math.pi / steps, dtype=torch.float64),
-        "radius": (anomaly - e * torch.sin(anomaly)).diff(),
-    }.items():
+    equal = torch.full((steps,), 2 * math.pi / steps, dtype=torch.float64)
+    for h, bound, resolved in ((equal, 0.5, False), ((anomaly - e * torch.sin(anomaly)).diff(), 0.05, True)):
         out, _, _ = kepler(e, h)
-        found[name] = float(local_errors(splitting, out, h).max())
-    assert found["equal"] > 0.5
-    assert found["radius"] < 0.05
+        flagged = flag_unresolved(splitting, out, h, bound)
+        assert bool(flagged.ok.all()) == resolved
+        assert torch.equal(flagged.q, out.q)
+        if not resolved:  # the steps next to the pericentre and no others
+            wrong = (flagged.status[0] == Status.UNRESOLVED).nonzero()[:, 0].tolist()
+            assert 0 in wrong
+            assert {*wrong} <= {*range(20), *range(steps - 20, steps)}
+
+
+@pytest.mark.parametrize("bound", [0.0, -1.0, math.nan, math.inf])
+def test_a_bound_that_is_none_is_refused(bound):
+    # fails if a bound that nothing exceeds, or everything does, is taken for an answer
+    out, _, _ = kepler(0.5, torch.full((4,), 0.1, dtype=torch.float64))
+    with pytest.raises(InputError, match="bound must be"):
+        flag_unresolved(Stepper(scene("kepler").L_d), out, 0.1, bound)
 
 
 def test_kepler_at_e_099_is_refused_by_the_reference_flow_in_one_step():

@@ -39,10 +39,14 @@ def test_coordinates_that_do_not_interact_do_not():
     torch.testing.assert_close(b.q, a.q[..., :1].expand_as(b.q), rtol=1e-14, atol=1e-14)
 
 
-@pytest.mark.parametrize("batch", [1, 1000, 1_000_000])
-def test_any_number_of_trajectories(batch):
+@pytest.mark.parametrize(
+    ("batch", "settings"),
+    [(1, {}), (1000, {}), (1_000_000, {}), (1000, NEWTON), pytest.param(1_000_000, NEWTON, marks=pytest.mark.slow)],
+    ids=lambda x: str(x) if isinstance(x, int) else "newton" if x else "explicit",
+)
+def test_any_number_of_trajectories(batch, settings):
     # fails if a sample depends on its batch, or memory grows by more than the states of the rollout
-    stepper = Stepper(build(0.1, potential_width=4))
+    stepper = Stepper(build(0.1, **{"potential_width": 4, **settings}))
     q, p, s = starts(batch)
     with torch.no_grad():
         out = stepper.rollout(q, p, s, h=0.1, steps=2)

@@ -4,7 +4,7 @@ from herglotz.tune.config import TuneConfig
 from herglotz.tune.distil import distil
 from herglotz.tune.kicks import KickStepper, fit_kicks
 from herglotz.tune.kicks_c import CompiledKicks, export_kicks_c
-from herglotz.tune.local_error import local_errors
+from herglotz.tune.local_error import flag_unresolved, local_errors
 from herglotz.tune.result import Candidate, Setting, Tuning, pareto
 from herglotz.tune.search import tune
 
@@ -18,6 +18,7 @@ __all__ = [
     "distil",
     "export_kicks_c",
     "fit_kicks",
+    "flag_unresolved",
     "local_errors",
     "pareto",
     "tune",

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from herglotz.stepping import Rollout, State, Step
+from herglotz.errors import InputError
+from herglotz.stepping import Rollout, State, Status, Step
 from herglotz.stepping.state import check_h, step_sizes
 
 
@@ -35,8 +37,15 @@ def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
         Its result, every step kept.
     h
         Its step: a scalar, (K,) or (..., K).
+
+    Raises
+    ------
+    InputError
+        If h lists another number of steps than the rollout keeps.
     """
     steps = out.status.shape[-1]
+    if torch.as_tensor(h).ndim and torch.as_tensor(h).shape[-1] != steps:
+        raise InputError(f"h lists {torch.as_tensor(h).shape[-1]} steps, but {steps} were kept; keep every step")
     sizes = step_sizes(check_h(h, out.q), steps if torch.as_tensor(h).ndim == 0 else None)
     errors = []
     with torch.no_grad():
@@ -49,3 +58,27 @@ def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
             moved = torch.maximum((whole - state.q).abs().amax(-1), (end - state.q).abs().amax(-1))
             errors.append((whole - end).abs().amax(-1) / moved.clamp(min=torch.finfo(end.dtype).tiny))
     return torch.stack(errors, -1)
+
+
+def flag_unresolved(stepper: Steps, out: Rollout, h: Tensor | float, bound: float = 0.1) -> Rollout:
+    """The same rollout with `Status.UNRESOLVED` at every converged step whose `local_errors` exceed a bound.
+
+    The states stay as they are; `Rollout.ok` is then False for a motion that is finite and wrong, such as one that
+    crosses the pericentre of a thin ellipse in a single step. A half step that fails is unresolved too.
+
+    Parameters
+    ----------
+    stepper, out, h
+        As for `local_errors`; the same caution about learned corrections holds.
+    bound
+        Error of a step relative to its move, > 0.
+
+    Raises
+    ------
+    InputError
+        If the bound is not a finite number > 0, or `local_errors` refuses h.
+    """
+    if not 0 < bound < float("inf"):
+        raise InputError(f"bound must be a finite number > 0, got {bound:g}")
+    wrong = ~(local_errors(stepper, out, h) <= bound) & (out.status == Status.CONVERGED)
+    return replace(out, status=torch.where(wrong, int(Status.UNRESOLVED), out.status.int()).to(torch.uint8))
