@@ -10,18 +10,8 @@ from typing import Any
 # Families of the figure, each with what its kinds begin with; the first that fits.
 FAMILIES = (
     ("learned kicks (C)", ("learned kicks",)),
-    (
-        "learned, C",
-        (
-            "learned, distilled",
-            "learned, Newton",
-            "learned, bf16",
-            "learned, level",
-            "learned, no ",
-            "learned, constant",
-            "learned",
-        ),
-    ),
+    ("learned equation (C)", ("learned equation",)),
+    ("learned, C", ("learned",)),
     ("neural ODE (C)", ("neural ODE",)),
     ("DOP853 (C)", ("DOP853",)),
     ("RK4 (C)", ("RK4",)),
@@ -49,20 +39,66 @@ def family(p: dict) -> str:
 def front(points: list[dict], error: str = "median") -> list[dict]:
     """Points that no other beats in both error and cost, cheapest first."""
     kept: list[dict] = []
-    for p in sorted((p for p in points if p[error] is not None), key=lambda p: p["us_per_time"]):
+    for p in sorted((p for p in points if p.get(error) is not None), key=lambda p: p["us_per_time"]):
         if not kept or p[error] < kept[-1][error]:
             kept.append(p)
     return kept
 
 
+# What a knob is, in points: at least one of them must hold for every predicate.
+COVERED = (
+    ("rules of order 1, 2, 4, 6, implicit", lambda p: p.get("order") == 6 and p["kind"].startswith("lobatto")),
+    ("compositions of order 4, 6, explicit", lambda p: p["kind"].startswith(("yoshida", "suzuki", "kahan"))),
+    ("larger h, learned", lambda p: p["kind"] in ("learned, no re-training", "learned, distilled", "learned kicks")),
+    ("correction on/off", lambda p: p["kind"] == "learned, no correction" or "width" in p),
+    ("width, depth", lambda p: p["kind"] in ("learned, distilled", "learned, correction 6 × 2")),
+    ("level", lambda p: p["kind"].startswith("learned, level")),
+    ("float32", lambda p: p["kind"] == "learned" and p.get("dtype") == "float32"),
+    ("bf16 weights", lambda p: p["kind"] == "learned, bf16 weights"),
+    ("Newton tolerance", lambda p: p["kind"] == "Newton tolerance"),
+    ("Newton iterations", lambda p: p["kind"] == "Newton iterations"),
+    ("guess order", lambda p: p["kind"] == "guess order"),
+    ("eager", lambda p: p["kind"] == "learned, eager"),
+    ("torch.compile", lambda p: p.get("artefact") == "torch.compile"),
+    ("C", lambda p: p["kind"] == "learned" and p.get("artefact") == "C"),
+    ("ONNX", lambda p: p.get("artefact") == "ONNX"),
+    ("RK4, DOP853, implicit midpoint", lambda p: p["kind"].startswith("implicit midpoint")),
+    ("neural ODE", lambda p: p["kind"].startswith("neural ODE")),
+)
+MISSING = {
+    ("driven_pendulum", "compositions of order 4, 6, explicit"): "compositions take no held input",
+    ("driven_pendulum", "larger h, learned"): "an input is held over h only",
+    ("driven_pendulum", "level"): "an input is a force: forced only",
+    ("parachute", "compositions of order 4, 6, explicit"): "not separable",
+    ("double_pendulum", "compositions of order 4, 6, explicit"): "not separable",
+    ("rigid_body", "compositions of order 4, 6, explicit"): "not separable",
+}
+
+
+def coverage(scenes: dict[str, list[dict]]) -> list[str]:
+    """Which knob was measured on which scene, and why not where it was not."""
+    lines = ["", "## Knobs", "", f"| knob | {' | '.join(scenes)} |", "|" + "---|" * (1 + len(scenes))]
+    for knob, belongs in COVERED:
+        cells = []
+        for name, points in scenes.items():
+            there = any(belongs(p) for p in points)
+            cells.append("yes" if there else f"no: {MISSING.get((name, knob), 'failed or not asked for')}")
+        lines.append(f"| {knob} | {' | '.join(cells)} |")
+    return lines
+
+
 def headline(points: list[dict], error: str = "median") -> list[dict]:
     """At the error of each learned setting on the learned front: what the others cost over what it costs.
 
-    `error` is "median" (of all starts) or "q95". A rival is the cheapest of its settings, of all sizes and in both
-    precisions, whose error is no larger.
+    The front is that of the choosing starts, where there are any; the errors are those of the judging ones. `error` is
+    "median" or "q95". A rival is the cheapest of its settings, of all sizes and in both precisions, whose error is no
+    larger.
     """
     rows = []
-    for p in front([p for p in points if p["kind"].startswith("learned")], error):
+    learned = [{f"choice_{error}": p[error], **p} for p in points if p["kind"].startswith("learned")]
+    for p in front(learned, f"choice_{error}"):
+        if p[error] is None:
+            continue
         row: dict[str, Any] = {k: p[k] for k in ("setting", "us_per_time", "spread")}
         row |= {"kind": p["kind"], "error": p[error]}
         for name, belongs in RIVALS:
@@ -129,17 +165,17 @@ def markdown(result: dict[str, Any]) -> str:
             for r in rows:
                 ratios = " | ".join("not reached" if r[n] is None else f"{r[n]:.3g}" for n, _ in RIVALS)
                 lines.append(f"| {r['setting']} | {r['error']:.2g} | {r['us_per_time']:.3g} | {ratios} |")
-    return "\n".join(lines) + "\n"
+    return "\n".join([*lines, *coverage(result["scenes"])]) + "\n"
 
 
-KNOBS = ("Newton tolerance", "Newton iterations", "guess order", "learned, eager", "learned, Newton tolerance",
-         "learned, bf16 weights", "learned, ONNX", "learned, torch.compile", "learned, no re-training")  # fmt: skip
-TERMS = ("learned, level", "learned, no correction", "learned, no input", "learned, constant mass")
+ON_FRONT = ("learned", "learned, distilled", "learned kicks")  # shown there; all others are knobs or terms
 
 
 def knob_rows(points: list[dict]) -> list[str]:
     """Settings that are off the front and stand for a knob."""
-    chosen = [p for p in points if p["kind"] in KNOBS or p["kind"].startswith(TERMS)]
+    solver = ("Newton", "guess order")
+    learned = [p for p in points if p["kind"].startswith("learned") and p["kind"] not in ON_FRONT]
+    chosen = [p for p in points if p["kind"].startswith(solver)] + learned
     shown = []
     for p in chosen:
         error = "fails" if p["median"] is None else f"{p['median']:.2g}"
@@ -148,40 +184,39 @@ def knob_rows(points: list[dict]) -> list[str]:
 
 
 def draw(scenes: dict[str, list[dict]], path: Path) -> None:
-    """A panel a scene: every family's own points, and the front of them all as a line."""
-    from herglotz.plots.style import INK, SERIES, new_figure, save_figure, styled
+    """A panel a scene: every setting as a faint dot, the front of every family as a line; learned ones are thick."""
+    from herglotz.plots.style import SERIES, new_figure, save_figure, styled
 
     names = list(dict.fromkeys(family(p) for points in scenes.values() for p in points))
-    order = [*(n for n, _ in FAMILIES[:2]), "learned (PyTorch, ONNX)", *(n for n, _ in FAMILIES[2:])]
+    order = [*(n for n, _ in FAMILIES[:3]), "learned (PyTorch, ONNX)", *(n for n, _ in FAMILIES[3:])]
     names.sort(key=order.index)
+    colours = (*SERIES, "#7F7F7F", "#8C564B", "#332288", "#BCBD22")
     with styled():
         columns = min(4, len(scenes))
         rows = -(-len(scenes) // columns)
-        figure = new_figure(4.4 * columns, 3.7 * rows + 0.7, "Error against cost")
+        figure = new_figure(4.4 * columns, 3.7 * rows + 0.7, "Error against cost: lower left is better")
         axes = list(figure.subplots(rows, columns, squeeze=False).flat)
         for ax in axes[len(scenes) :]:
             ax.set_visible(False)
         handles: dict[str, Any] = {}
         for ax, (name, points) in zip(axes, scenes.items(), strict=False):
-            for k, kind in enumerate(names):
+            for kind in names:
+                k, learned = order.index(kind), kind.startswith("learned")
                 mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
                 if not mine:
                     continue
-                style = {"color": SERIES[k % len(SERIES)], "marker": "o*sD^vPX<>"[k % 10], "ms": 6 if k < 2 else 3.5}
-                x, y = [p["us_per_time"] for p in mine], [max(p["median"], 1e-15) for p in mine]
-                (handles[kind],) = ax.plot(x, y, lw=0, alpha=0.75, zorder=3 if k < 2 else 2, **style)
-            best = front(points)
-            ax.step(
-                [p["us_per_time"] for p in best],
-                [max(p["median"], 1e-15) for p in best],
-                where="post",
-                color=INK,
-                lw=1.2,
-            )
+                style = {"color": colours[k], "marker": "o*sD^vPX<>"[k], "zorder": 3 if learned else 2}
+                for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if learned else 4, 1.0)):
+                    x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
+                    width = 0 if faint < 1 else 2.2 if learned else 1.0
+                    (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **style)
             ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
+            ax.set_ylim(top=10)
             ax.set_xlabel("µs per unit of time")
             ax.set_ylabel("median error of q")
-        figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=columns + 1, fontsize=8)
+        shown = [n for n in names if n in handles]
+        keys = [handles[n] for n in shown]
+        figure.legend(keys, shown, loc="outside lower center", ncols=columns + 1, fontsize=8)
         save_figure(figure, path)
 
 

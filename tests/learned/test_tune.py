@@ -85,7 +85,7 @@ def test_command_writes_a_run_that_exports(pendulum_run, tmp_path, capsys):
 
 
 def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
-    # fails if kicks are not among the settings, their header is not the chosen step, or the folder is no run
+    # fails if kicks are not among the settings, export writes another step than the chosen one, or the folder is no run
     try:
         compiler()
     except InputError as error:
@@ -101,6 +101,11 @@ def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
     assert found["held_out"]["share_within"] >= 0.95
     assert f"h = {chosen['h']!r}" in (out / "kicks.h").read_text()
     assert load_run(out).h == pytest.approx(0.1)
+    # export takes the step that was chosen, not the model that it came from
+    assert main(["export", str(out), "--format", "c", "--out", str(tmp_path / "step.h")]) == 0
+    assert (tmp_path / "step.h").read_text() == (out / "kicks.h").read_text()
+    assert main(["export", str(out), "--out", str(tmp_path / "model.pt2")]) == 0
+    assert "exist in C only" in capsys.readouterr().out
     # a choice without kicks leaves none behind
     assert main([*command, "--kicks", "none", "--max-error", "1"]) == 0
     assert not (out / "kicks.h").exists()

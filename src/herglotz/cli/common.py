@@ -12,6 +12,8 @@ from typing import Any
 
 from herglotz.errors import InputError
 
+KICKS = "kicks.h"  # in a folder of `tune`: the chosen step, where it is one of kicks
+
 
 def positive(text: str) -> float:
     """Parse a finite number > 0 (argparse type)."""

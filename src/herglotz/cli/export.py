@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_file, print_json
+from herglotz.cli.common import KICKS, check_output_file, print_json
 
 # Extension of each format, and what may be said of the next thing to do.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
@@ -42,6 +42,9 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Export, load again and say what it is."""
     check_output_file(arguments.out, (SUFFIX[arguments.format],))
+    kicks = arguments.source / KICKS
+    if kicks.is_file() and arguments.format == "c":
+        return _kicks(arguments, kicks)
 
     from herglotz.training import load_run
 
@@ -70,8 +73,24 @@ def run(arguments: argparse.Namespace) -> int:
         print_json({"file": str(arguments.out), "bytes": size, "metadata": found})
     else:
         print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} coordinate(s), h {result.h:g}")
+        if kicks.is_file():
+            print(f"The kicks that tune chose exist in C only (--format c); {arguments.out} is the model behind them")
         if arguments.format == "c":
             print(f"Next: the example at the top of {arguments.out}, with cc -O3 -march=native")
         else:
             print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
+    return 0
+
+
+def _kicks(arguments: argparse.Namespace, kicks: Path) -> int:
+    """The step that `herglotz tune` chose, as it wrote it."""
+    from herglotz.data.files import write_atomically
+
+    text = kicks.read_bytes()
+    write_atomically(arguments.out, text)
+    if arguments.json:
+        print_json({"file": str(arguments.out), "bytes": len(text), "kicks": True})
+    else:
+        print(f"{arguments.out}: {len(text) / 1024:.0f} KiB, the large step of kicks that tune chose")
+        print("Next: include it and call herglotz_kicks_step or herglotz_kicks_rollout, with cc -O3 -march=native")
     return 0

@@ -7,13 +7,11 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import check_output_folder, count, positive, print_json
+from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
     from herglotz.tune import Tuning
-
-KICKS = "kicks.h"
 
 DESCRIPTION = """\
 Trade speed for accuracy: measure the error and the cost of stepping RUN at several steps, with its own model and with
@@ -150,9 +148,7 @@ def _report(found: Tuning, out: Path) -> None:
         print(f"  {note}")
     print(f"Figure: {out / 'tuned.png'}")
     if c.kicks is not None:
-        print(
-            f"Next: include {out / KICKS}, the step of {c.setting.kicks} kicks; {out} holds the model it was made from"
-        )
+        print(f"Next: herglotz export {out} --format c --out kicks.h (the {c.setting.kicks} kicks)")
         return
     form = "c" if c.setting.artefact == "c" else "pt2"
     print(f"Next: herglotz export {out} --format {form} --out stepper{'.h' if form == 'c' else '.pt2'}")

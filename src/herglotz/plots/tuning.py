@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, styled
 
 if TYPE_CHECKING:
-    from herglotz.tune.result import Tuning
+    from herglotz.tune.result import Candidate, Tuning
 
 FLOOR = 1e-16  # an error of zero (the run's own setting) has no place on a logarithmic axis
 KINDS = (
@@ -20,8 +20,14 @@ KINDS = (
 )
 
 
+def _form(candidate: Candidate) -> str:
+    if candidate.kicks is not None:
+        return "kicks"
+    return "own model" if candidate.setting.width is None else "distilled"
+
+
 def plot_tuning(tuning: Tuning) -> Figure:
-    """Draw the error bound against the cost per unit of time; filled: distilled; the choice in colour."""
+    """Draw the error bound against the cost; filled: distilled, half: kicks; a circle: the choice."""
     good = [c for c in tuning.candidates if math.isfinite(c.bound)]
     share, unit = f"{100 * tuning.config.quantile:g} % of starts", tuning.run.data.time_unit
     units = tuning.run.data.units
@@ -37,12 +43,12 @@ def plot_tuning(tuning: Tuning) -> Figure:
         ax.step([c.us for c in front], [max(c.bound, FLOOR) for c in front], where="post", color=INK, lw=0.9)
         for artefact, dtype, mark, color, name in KINDS:
             mine = [c for c in good if (c.setting.artefact, c.setting.dtype) == (artefact, dtype)]
-            for distilled in (False, True):
-                some = [c for c in mine if (c.setting.width is not None) == distilled]
+            for form, fill in (("own model", "none"), ("distilled", "full"), ("kicks", "left")):
+                some = [c for c in mine if _form(c) == form]
                 if some:
                     x, y = [c.us for c in some], [max(c.bound, FLOOR) for c in some]
-                    text = f"{name}, {'distilled' if distilled else 'own model'}"
-                    ax.plot(x, y, mark, color=color, mfc=color if distilled else "white", ms=5.5, label=text)
+                    text = f"{name}, {form}"
+                    ax.plot(x, y, mark, color=color, fillstyle=fill, ms=6, ls="", label=text)
         ax.plot([chosen.us], [max(chosen.bound, FLOOR)], "o", ms=14, mfc="none", mec=UNSEEN, mew=2)
         label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, 8))
         if "max_error" in tuning.asked:
