@@ -46,7 +46,7 @@ class KickStepper:
     drifts
         (K + 1,) d_0 … d_K, in time over mass.
     cosines, sines
-        (K, N) V_i = Σ_n a_in cos nq + b_in sin nq of an angle; of a length Σ_n a_in x^{n+1}, and no sines.
+        (K, N) V_i = Σ_n a_in cos nq + b_in sin nq of an angle; of a length Σ_n a_in x^n, n ≥ 1, and no sines.
     """
 
     h: float
@@ -83,7 +83,7 @@ class KickStepper:
         n = torch.arange(1, len(a) + 1, dtype=q.dtype, device=q.device)
         if not self.angle:
             x = (q[..., None] - self.middle) / self.half
-            return (a * x ** (n + 1)).sum(-1), ((n + 1) * a * x**n).sum(-1) / self.half
+            return (a * x**n).sum(-1), (n * a * x ** (n - 1)).sum(-1) / self.half
         cos, sin = torch.cos(n * q[..., None]), torch.sin(n * q[..., None])
         return (a * cos + b * sin).sum(-1), (n * (b * cos - a * sin)).sum(-1)
 
@@ -206,9 +206,13 @@ def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int, deg
     middle, half = (0.0, 1.0) if config.angles[0] else ((low + high) / 2, (high - low) / 2)
     drifts = torch.full((kicks + 1,), h / kicks, dtype=torch.float64)
     drifts[0] = drifts[-1] = h / kicks / 2
-    a = torch.zeros(kicks, degree, dtype=torch.float64)
+    # A length needs its linear term as well: the middle of the data is not where the force is zero.
+    a = torch.zeros(kicks, degree if config.angles[0] else degree + 1, dtype=torch.float64)
     b = torch.zeros(kicks, degree if config.angles[0] else 0, dtype=torch.float64)
     k = float(config.stiffness[0])
-    a[:, 0] = -k * h / kicks if config.angles[0] else 0.5 * k * half**2 * h / kicks
+    if config.angles[0]:
+        a[:, 0] = -k * h / kicks
+    else:
+        a[:, 1] = 0.5 * k * half**2 * h / kicks
     rate = 0.0 if model.damping is None else float(model.damping.rate.detach())
     return KickStepper(h, rate, config.angles[0], middle, half, drifts, a, b)

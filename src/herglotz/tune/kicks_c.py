@@ -183,7 +183,7 @@ def _kick(stepper: KickStepper, i: int, dtype: str) -> str:
         lines += [f"    s -= {_sum(even, 'c', number)} + sine * {_sum(odd, 'c', number)};"]
         lines += [f"    p = (p - {_sum(slope, 'c', number)}) + sine * {_sum(turn, 'c', number)};"]
     else:
-        V = np.r_[0.0, 0.0, a]
+        V = np.r_[0.0, a]
         shift = f"(q - {number(stepper.middle)}) * {number(1 / stepper.half)}"
         lines = [f"    const herglotz_real c = {shift};", f"    s -= {_sum(V, 'c', number)};"]
         lines += [f"    p -= {_sum(power.polyder(V) / stepper.half, 'c', number)};"]

@@ -81,6 +81,18 @@ def test_a_few_kicks_reproduce_a_large_step_of_the_pendulum(kicks, worst):
     assert float((plain.step(start, H).state.q - end.q).square().mean().sqrt()) > 10 * worst
 
 
+@pytest.mark.parametrize("h", [1.0, 3.0])
+def test_two_kicks_are_the_oscillator_wherever_the_data_lie(h):
+    # fails if a kick vanishes at the middle of the data instead of where the force does: 1e-3 a step was left
+    system = scene("damped_oscillator")
+    model = ContactLagrangian(ModelConfig(angles=(False,), rate=0.2, potential_width=0))
+    start = State(torch.linspace(-0.4, 1.6, 40).double()[:, None], torch.cos(torch.arange(40.0)).double()[:, None],
+                  torch.zeros(40).double())  # fmt: skip
+    found = fit_kicks(model, start, State(*system.flow(*start, h)), h, kicks=2, iterations=60)
+    assert found.error < 1e-12
+    torch.testing.assert_close(found.step(start, h).state.p, system.flow(*start, h)[1], rtol=0, atol=1e-12)
+
+
 @needs_c
 @pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-11), ("float32", 1e-4)])
 @pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
