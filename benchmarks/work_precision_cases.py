@@ -13,9 +13,10 @@ from work_precision_scenes import CHECKS, Setup, exact_motion, judged, starts_of
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
+from herglotz.export import ExportedStepper
 from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, fit
-from herglotz.tune.reference import draw_starts, record
+from herglotz.tune.reference import JITTER, draw_starts, record
 
 COUNT = 192  # motions whose errors are taken: half to choose a setting by, half to judge it
 TIMED = 16  # of them are timed
@@ -79,11 +80,16 @@ def rolled(case: Case, stepper: Any, h: float, dtype: torch.dtype = torch.float6
     steps, u = round(case.setup.T / h), inputs_of(case)
     if steps % CHECKS:
         raise InputError(f"{steps} steps do not reach the {CHECKS} times of the check")
-    options = {} if u is None else {"inputs": u.to(dtype)}
+    options = {} if u is None else given(stepper, u.to(dtype))
     with torch.no_grad():
         start = (x.to(dtype).contiguous() for x in case.entry)
         q = stepper.rollout(*start, h=h, steps=steps, **options).q[:, 1:]
     return judged(q[:, steps // CHECKS - 1 :: steps // CHECKS], case.truth)
+
+
+def given(stepper: Any, u: Tensor) -> dict[str, Tensor]:
+    """The inputs under the name that this kind of stepper has for them."""
+    return {"u" if isinstance(stepper, ExportedStepper) else "inputs": u}
 
 
 def inputs_of(case: Case) -> Tensor | None:
@@ -92,9 +98,21 @@ def inputs_of(case: Case) -> Tensor | None:
 
 
 def motions_of(case: Case) -> State:
-    """Motions of the fitted model itself, to distil from."""
-    made = record(case.run, draw_starts(case.run, 60, 5), case.setup.T, "own")
-    return made.states
+    """Motions of the fitted model itself, to distil from: from near every recorded state, and from near the first ones.
+
+    Motions of a damped scene spend most of their time near rest; where they begin is where large steps are worst.
+    """
+    run = case.run
+    make = torch.Generator().manual_seed(case.seed)
+    rows = (torch.tensor(run.data.offsets) + 1).repeat(3)
+    first = []
+    for name, x in zip("qps", run.states, strict=True):
+        x = x.detach().double()[rows].reshape(len(rows), -1)
+        size = (torch.tensor(run.box[f"{name}_high"]) - torch.tensor(run.box[f"{name}_low"])).double()
+        first.append(x + JITTER * size * (2 * torch.rand(x.shape, generator=make, dtype=torch.float64) - 1))
+    anywhere = draw_starts(run, 40, case.seed + 5)
+    starts = State(*(torch.cat([a.reshape(len(a), -1), b]) for a, b in zip(anywhere, first, strict=True)))
+    return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T, "own").states
 
 
 def repeated(call: Callable[[], Any], keep: Any = None) -> tuple[Callable[[], Any], int]:

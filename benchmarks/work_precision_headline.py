@@ -42,7 +42,7 @@ def kicks(case: Case, quick: bool) -> list[Timed]:
         before, after = pairs_of(states, m, 1000, case.seed)
         h = m * setup.h
         least = max(2, round(1.5 * h))
-        for count in range(least, least + (1 if quick else 4)):
+        for count in range(least, least + (1 if quick else 5 if m > 3 else 4)):
             stepper = fit_kicks(case.run.model, before, after, h, kicks=count, iterations=30 if quick else 150)
             for dtype in ("float64", "float32"):
                 compiled, number = CompiledKicks(stepper, dtype), getattr(torch, dtype)
@@ -70,7 +70,7 @@ def equation(case: Case) -> list[Timed]:
     y = torch.cat([case.entry.q, _velocity(constants, case.entry)], -1)
     for dtype in ("float64", "float32"):
         library = Native(setup.name, dtype, dof=2, constants=constants)
-        for method, sizes in (("RK4", (4, 5, 6, 8, 12, 16)), ("DOP853 fixed", (2, 3, 4))):
+        for method, sizes in (("RK4", (4, 5, 6, 7, 8, 10, 12, 16)), ("DOP853 fixed", (2, 3, 4))):
             for x in sizes:
                 q, count = library.motions(y, setup.T, CHECKS, method, x)
                 call, times = repeated(library.call(y[:TIMED], setup.T, CHECKS, method, x))

@@ -45,6 +45,8 @@ def front(points: list[dict], error: str = "median") -> list[dict]:
     return kept
 
 
+NOT_TERMS = ("learned, bf16 weights",)
+
 # What a knob is, in points: at least one of them must hold for every predicate.
 COVERED = (
     ("rules of order 1, 2, 4, 6, implicit", lambda p: p.get("order") == 6 and p["kind"].startswith("lobatto")),
@@ -73,6 +75,35 @@ MISSING = {
     ("double_pendulum", "compositions of order 4, 6, explicit"): "not separable",
     ("rigid_body", "compositions of order 4, 6, explicit"): "not separable",
 }
+
+
+TERMS = {
+    "damped_oscillator": "K, V quadratic, γ, correction",
+    "damped_pendulum": "K, V network, γ, correction",
+    "double_pendulum": "K(q) network, V network, γ, correction",
+    "parachute": "K, V, γ, λ, drag network, correction",
+    "kepler": "K, V of r, γ, correction",
+    "chain": "K, V of stretches, γ",
+    "driven_pendulum": "K, V network, γ, friction, input, correction",
+    "rigid_body": "K(q) network, V network, γ, correction",
+}
+
+
+def terms(scenes: dict[str, list[dict]]) -> list[str]:
+    """Each scene's own model at the step of its data, and what other terms cost and bring: all fitted alike."""
+    lines = ["", "## Terms", "", "| scene | terms | µs a step | median error |", "|---|---|---|---|"]
+
+    def cells(p: dict) -> str:
+        error = "fails" if p["median"] is None else f"{p['median']:.2g}"
+        eager = " (PyTorch)" if p["artefact"] == "eager" else ""
+        return f"{p['us_per_time'] * p['h']:.2g}{eager} | {error} |"
+
+    for name, points in scenes.items():
+        own = [p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"]
+        lines += [f"| **{name}** | **{TERMS[name]}** | {cells(p)}" for p in own]
+        others = [p for p in points if p["kind"].startswith("learned, ") and p["setting"].startswith(p["kind"][9:])]
+        lines += [f"| | {p['kind'][9:]} | {cells(p)}" for p in others if p["kind"] not in NOT_TERMS]
+    return lines
 
 
 def coverage(scenes: dict[str, list[dict]]) -> list[str]:
@@ -165,7 +196,7 @@ def markdown(result: dict[str, Any]) -> str:
             for r in rows:
                 ratios = " | ".join("not reached" if r[n] is None else f"{r[n]:.3g}" for n, _ in RIVALS)
                 lines.append(f"| {r['setting']} | {r['error']:.2g} | {r['us_per_time']:.3g} | {ratios} |")
-    return "\n".join([*lines, *coverage(result["scenes"])]) + "\n"
+    return "\n".join([*lines, *terms(result["scenes"]), *coverage(result["scenes"])]) + "\n"
 
 
 ON_FRONT = ("learned", "learned, distilled", "learned kicks")  # shown there; all others are knobs or terms
