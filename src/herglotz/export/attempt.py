@@ -29,12 +29,12 @@ class Plan(NamedTuple):
     """How an attempt solves the step equation."""
 
     lean: bool  # with the matrix of the kinetic term alone (`LeanEquation`); else with J at the guess
-    evaluations: int  # at least 2
+    evaluations: int  # at least 2; or 0: no attempt, its guess is where Newton's loop starts
 
     @property
     def patient(self) -> Plan:
         """For a step without a good guess."""
-        return self._replace(evaluations=self.evaluations + 3)
+        return self._replace(evaluations=self.evaluations + 3) if self.evaluations else self
 
 
 class Attempt(nn.Module):
@@ -64,6 +64,9 @@ class Attempt(nn.Module):
         `misses` (B, 6n), the latest first; `more` holds V and V′ at q where the model has them, then u.
         """
         miss = misses @ continuation(q)
+        if not self.plan.evaluations:  # increments that are no numbers: unsolved, whatever the tolerance
+            after = miss + torch.inf
+            return miss, torch.zeros_like(p), torch.zeros_like(s), torch.ones_like(s), miss, after, after, miss
         if self.plan.lean:
             return self._lean(q, p, s, h, miss, more)
         terms = Terms(self.model, q, p, s[:, 0], h[:, 0], (more[0][:, 0], *more[1:]) if len(more) > 1 else more)
@@ -215,6 +218,8 @@ def best_plan(
     """
     if has_leapfrog(model):
         return Plan(True, 2)  # not used: the step is explicit
+    if model.config.order == 4:
+        return Plan(False, 0)  # an evaluation is a thousand operations: one copy of it in the file, Newton's
     share: list[float] = []
     x = _drawn(model, box, starts)
     n = model.config.dof

@@ -14,6 +14,7 @@ from herglotz.export.onnx_pieces import SOLVE, Pieces
 from herglotz.export.trace import Graph
 
 BLOCK = 8  # steps in the body of the loop: an iteration costs as much as a dozen operations
+LARGE = 400  # nodes of a step beyond which a turn of the loop is nothing, and eight copies are a large file
 Row = tuple[list[str], list[str]]
 
 
@@ -42,22 +43,32 @@ class RolloutWriter:
             carry.append(w.emit("Expand", zero, wide))
         if self.pieces.lost:
             carry += [w.emit("Expand", zero, w.emit("Shape", x)) for x in ("q", column)]
-        steps, size = w.emit("Shape", "h", start=0, end=1), w.integers(BLOCK)
-        blocks = w.emit("Div", steps, size)
-        cut = w.emit("Mul", blocks, size)
-        first = w.integers(0)
-        whole = []  # (blocks, BLOCK, B, ...)
-        for x in table:
-            size = w.emit("Concat", blocks, w.integers(BLOCK), w.emit("Shape", x, start=1), axis=0)
-            whole.append(w.emit("Reshape", w.emit("Slice", x, first, cut, first), size, allowzero=1))
-        carry, found = self.loop(w, blocks, carry, whole, self.block)
-        rest = [w.emit("Slice", x, cut, steps, first) for x in table]
-        _, more = self.loop(w, w.emit("Sub", steps, cut), carry, rest, self.single)
+        steps, cut = w.emit("Shape", "h", start=0, end=1), w.integers(0)
+        parts = []
+        if self.blocked:
+            blocks = w.emit("Div", steps, w.integers(BLOCK))
+            cut = w.emit("Mul", blocks, w.integers(BLOCK))
+            whole = []  # (blocks, BLOCK, B, ...)
+            for x in table:
+                size = w.emit("Concat", blocks, w.integers(BLOCK), w.emit("Shape", x, start=1), axis=0)
+                head = w.emit("Slice", x, w.integers(0), cut, w.integers(0))
+                whole.append(w.emit("Reshape", head, size, allowzero=1))
+            carry, found = self.loop(w, blocks, carry, whole, self.block)
+            parts.append(found)
+            table = [w.emit("Slice", x, cut, steps, w.integers(0)) for x in table]
+        parts.append(self.loop(w, w.emit("Sub", steps, cut), carry, table, self.single)[1])
         rows = []
-        for x, y, width in zip(found, more, self.widths, strict=True):
+        for *found, width in zip(*parts, self.widths, strict=True):
             size = w.emit("Concat", w.integers(-1), batch, w.integers(width), axis=0)
-            rows.append(w.emit("Concat", *(w.emit("Reshape", z, size) for z in (x, y)), axis=0))
+            rows.append(w.emit("Concat", *(w.emit("Reshape", x, size) for x in found), axis=0))
         return self.report(rows, flat, shape)
+
+    @property
+    def blocked(self) -> bool:
+        """Whether steps are taken `BLOCK` at a time."""
+        if self.one.iterates and not self.one.attempt.plan.evaluations:
+            return False
+        return len(self.pieces.parts[0][1].code.graph.nodes) <= LARGE
 
     def _table(self) -> list[str]:
         """What h decides, (K, B, r), h itself first; and u, (K, B, m). Where all samples share their steps B is 1.

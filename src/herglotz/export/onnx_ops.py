@@ -23,18 +23,20 @@ SIMPLE = {
     aten.exp.default: "Exp", aten.tanh.default: "Tanh", aten.sqrt.default: "Sqrt", aten.sigmoid.default: "Sigmoid",
     aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
-    aten.maximum.default: "Max", aten.minimum.default: "Min", aten.matmul.default: "MatMul",
+    aten.maximum.default: "Max", aten.minimum.default: "Min",
     aten.__and__.Tensor: "And", aten.__or__.Tensor: "Or", aten.eq.Scalar: "Equal", aten.eq.Tensor: "Equal",
     aten.le.Tensor: "LessOrEqual", aten.le.Scalar: "LessOrEqual", aten.lt.Tensor: "Less", aten.lt.Scalar: "Less",
     aten.ge.Tensor: "GreaterOrEqual", aten.ge.Scalar: "GreaterOrEqual", aten.gt.Tensor: "Greater",
     aten.gt.Scalar: "Greater", aten.where.self: "Where", aten.where.ScalarSelf: "Where",
     aten.where.ScalarOther: "Where", aten.where.Scalar: "Where", aten.pow.Tensor_Scalar: "Pow",
+    aten.pow.Tensor_Tensor: "Pow",
 }  # fmt: skip
 SAME = (aten.clone.default, aten.detach.default, aten.alias.default)
 SEVERAL = (
     aten.unbind.int,
     aten.broadcast_tensors.default,
     aten.split_with_sizes.default,
+    aten.linalg_inv_ex.default,
 )  # written where one of their outputs is taken
 
 

@@ -36,12 +36,43 @@ def _item(w: Writer, node: Any) -> str:
             names = (w.name(x), w.integers(*sizes))
             w._parts[source] = w.several("Split", names, len(sizes), axis=_axis(axis, x))
         return w._parts[source][index]
+    if source.target == aten.linalg_inv_ex.default:
+        assert index == 0
+        return _inverse(w, source.args[0])
     assert source.target == aten.broadcast_tensors.default
     x, others = source.args[0][index], source.args[0]
     if _of(x).shape == _of(node).shape:
         return w.name(x)
     whole = next(y for y in others if _of(y).shape == _of(node).shape)
     return w.emit("Expand", w.name(x), w.emit("Shape", w.name(whole)))
+
+
+def _inverse(w: Writer, x: Any) -> str:
+    """The inverse of a mass matrix by Gauss and Jordan: ONNX has none, and such a matrix needs no row exchanges."""
+    n, real = _of(x).shape[-1], NUMPY[_of(x).dtype]
+    eye, last = np.eye(n), w.integers(-1)
+    J = w.name(x)
+    for k in range(n):
+        column = w.emit("Slice", J, w.integers(k), w.integers(k + 1), last)  # (..., n, 1)
+        pivot = w.emit("Slice", column, w.integers(k), w.integers(k + 1), w.integers(-2))
+        held = w.emit("Mul", J, w.constant(1 - eye[k], real))
+        cleared = w.emit("Add", held, w.constant(np.outer(eye[k], eye[k]), real))
+        row = w.emit("Div", w.emit("Slice", cleared, w.integers(k), w.integers(k + 1), w.integers(-2)), pivot)
+        J = w.emit("Sub", cleared, w.emit("Mul", w.emit("Sub", column, w.constant(eye[k][:, None], real)), row))
+    return J
+
+
+def _transposed(w: Writer, node: Any) -> str:
+    x, first, second = node.args
+    perm = list(range(len(_of(x).shape)))
+    perm[first], perm[second] = perm[second], perm[first]
+    return w.emit("Transpose", w.name(x), perm=perm)
+
+
+def _flattened(w: Writer, node: Any) -> str:
+    """The axes from one on to the last in one."""
+    x, axis = node.args
+    return w.emit("Reshape", w.name(x), w.integers(*[0] * _axis(axis, x), -1))
 
 
 def _moved(w: Writer, node: Any) -> str:
@@ -59,6 +90,17 @@ def _unflatten(w: Writer, node: Any) -> str:
     return w.emit("Reshape", w.name(x), w.emit("Concat", w.integers(*shape), tail, axis=0))
 
 
+def _product(w: Writer, a: str, b: str, rank: int) -> str:
+    """A B. Not MatMul where it can be helped: onnxruntime makes a number beside one an attribute of it, of 32 bits."""
+    return w.emit("Gemm" if rank == 2 else "MatMul", a, b)
+
+
+def _matmul(w: Writer, node: Any) -> str:
+    a, b = node.args
+    rank = 2 if len(_of(a).shape) == len(_of(b).shape) == 2 else 0
+    return _product(w, w.name(a), w.name(b), rank)
+
+
 def _linear(w: Writer, node: Any) -> str:
     x, weight, *bias = node.args
     known = w._values.get(weight)
@@ -69,7 +111,7 @@ def _linear(w: Writer, node: Any) -> str:
     added = w.name(bias[0]) if bias and bias[0] is not None else None
     if len(_of(x).shape) == 2 and added is not None:
         return w.emit("Gemm", w.name(x), turned, added)
-    product = w.emit("MatMul", w.name(x), turned)
+    product = _product(w, w.name(x), turned, len(_of(x).shape))
     return product if added is None else w.emit("Add", product, added)
 
 
@@ -192,9 +234,12 @@ TABLE: dict[Any, Callable[[Writer, Any], str]] = {
     aten.cat.default: _cat,
     aten.stack.default: _stack,
     aten.linear.default: _linear,
+    aten.matmul.default: _matmul,
     aten.movedim.int: _moved,
     aten.movedim.intlist: _moved,
     aten.unflatten.int: _unflatten,
+    aten.flatten.using_ints: _flattened,
+    aten.transpose.int: _transposed,
     aten.reshape.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
     aten.view.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
     aten.expand.default: lambda w, n: w.emit(

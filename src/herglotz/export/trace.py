@@ -80,11 +80,15 @@ def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
     arguments
         Examples, with a batch from `example_batch`.
     """
+    from torch._guards import TracingContext, tracing
+    from torch._subclasses import FakeTensorMode
     from torch.fx.experimental.proxy_tensor import make_fx
 
     with torch.no_grad():
         module(*arguments)  # fills index caches outside the trace
-        found = make_fx(module, pre_dispatch=True)(*arguments)
+        # A mode of our own: without one, torch makes a new one for the description of every value, half of the time.
+        with tracing(TracingContext(FakeTensorMode(allow_fallback_kernels=True))):
+            found = make_fx(module, pre_dispatch=True)(*arguments)
         values = _values(found, arguments)
         lean = _lean(found, values, next(len(x) for x in arguments if x.ndim))
         values = _values(lean.code, (*arguments, *lean.constants))

@@ -57,39 +57,45 @@ class Bend:
         if order == 1:
             return out
         E = self._slope(y)
-        bend = 2 * E.mT @ solve(self.mass, E)
+        bend = 2 * E.transpose(-1, -2) @ solve(self.mass, E)
         i, j = pairs(out.tangents, y.device)
-        more = bend[..., i, j].movedim(-1, 0)
+        more = bend.flatten(-2)[..., i * out.tangents + j].movedim(-1, 0)
         return Jet(torch.cat([out.data[: 1 + out.tangents], out.data[1 + out.tangents :] + more]), out.tangents, 2)
 
     def along(self, b: Tensor, y: Tensor, order: int) -> Jet:
         """The scalar bᵀ(e − M y) as a jet over (q0, q1), for constant b and y, (..., n)."""
-        phase = Phase(self.phase.q0, self.phase.q1, self.phase.h, order, self.phase.sizes, self.phase.delta)
+        p = self.phase
+        return self._along(Phase(p.q0, p.q1, p.h, order, p.sizes, p.delta), b, y)
+
+    def _along(self, phase: Phase, b: Tensor, y: Tensor) -> Jet:
         push = b @ self.constant
-        out = -of_mean(self.potential(phase.mean.value, order, b))
+        out = -of_mean(self.potential(phase.mean.value, phase.order, b))
         out = out - (phase.velocity * push).sum() * self.rate - (push * y).sum(-1)
         return out if self.features is None else out + self.features.along(phase, b, y, self.rate)
 
     def _force(self) -> Tensor:
         """The force e, (..., n)."""
         if self.features is not None:
-            zero = torch.zeros_like(self.phase.q0)
-            return torch.stack([self.along(x, zero, 1).value for x in self._basis()], -1)
+            return self._columns(torch.zeros_like(self.phase.q0)).value.movedim(0, -1)
         _, slope = self.potential.value_and_slope(self.phase.mean.value)
         return -slope - self.rate * (self.phase.velocity.value @ self.constant)
 
     def _slope(self, y: Tensor) -> Tensor:
         """The derivatives of e − M y along (q0, q1) for a constant y, (..., n, 2n)."""
         if self.features is not None:
-            return torch.stack([self.along(x, y, 1).gradient for x in self._basis()]).movedim((0, 1), (-2, -1))
+            return self._columns(y).gradient.movedim((1, 0), (-2, -1))
         bend = self.potential(self.phase.mean.value, 2).hessian().movedim((0, 1), (-2, -1)) / 2
         drag = self.rate * self.constant / self.phase.h[..., None, None]
         return torch.cat([drag - bend, -drag - bend], -1)
 
-    def _basis(self) -> list[Tensor]:
-        """The n unit vectors, (..., n) each."""
-        q = self.phase.q0
-        return [torch.zeros_like(q).index_fill(-1, torch.tensor(k, device=q.device), 1.0) for k in range(q.shape[-1])]
+    def _columns(self, y: Tensor) -> Jet:
+        """The n components of e − M y, (n, ...), for a constant y: all at once, each with its own copy of (q0, q1)."""
+        p, n = self.phase, self.phase.q0.shape[-1]
+        delta = None if p.delta is None else p.delta.expand(n, *p.q0.shape)
+        h = p.h.expand(n, *p.q0.shape[:-1])
+        unit = torch.eye(n, dtype=y.dtype, device=y.device).reshape(n, *(1,) * (y.ndim - 1), n)
+        phase = Phase(p.q0.expand(n, *p.q0.shape), p.q1.expand(n, *p.q1.shape), h, 1, p.sizes, delta)
+        return self._along(phase, unit.expand(n, *y.shape), y.expand(n, *y.shape))
 
 
 def missing(bend: Bend, V0: Jet, V1: Jet, root: Tensor) -> Jet:
