@@ -195,6 +195,9 @@ static inline void NAME_increments(const NAME_problem *P, const NAME_terms *t, c
 {%end}
 {%if friction}
     dp[i] += h / R(2.0) * (R(1.0) + t->c) * t->f[i];
+{%if !linear}
+    dp[i] += (R(1.0) + t->c) / R(2.0) * t->slope[i] * t->rest[i];  /* dry friction near rest is steep */
+{%end}
 {%end}
 {%if !linear}
     *ds += (P->p0[i] + dp[i]) * t->rest[i];
