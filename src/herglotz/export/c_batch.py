@@ -129,10 +129,12 @@ static inline void NAME_wide_solve(const NAME_wide_problem *P, NAME_wide_terms *
       }
     }
     for (order = 1, w = 0; w < NAME_LANES; w++) {
+      real rounding = P->h[w] * NAME_top_speed;
       if (!open[w]) continue;
       residual[w] = size[w];
+      rounding = NAME_floor * (scale[w] > rounding ? scale[w] : rounding);
       if (size[w] <= NAME_tolerance * scale[w] || (iteration > 0 && merit[w] > before[w] &&
-          last[w] <= NAME_floor * scale[w] && size[w] <= NAME_floor * scale[w])) {
+          last[w] <= rounding && size[w] <= rounding)) {
         open[w] = 0;
         left--;
         for (i = 0; i < NAME_N; i++) t->rest[i][w] = delta[i][w];

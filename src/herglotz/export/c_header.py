@@ -98,6 +98,7 @@ static const real NAME_h = @H@;  /* typical step: recorded, not imposed */
 static const real NAME_h_low = @H_LOW@, NAME_h_high = @H_HIGH@;  /* steps it was fitted for */
 static const real NAME_tolerance = @TOLERANCE@;  /* of Newton, relative to the size of q */
 static const real NAME_floor = @FLOOR@;  /* rounding that no iteration removes */
+static const real NAME_top_speed = @TOP_SPEED@;  /* the networks' rounding is relative to h times this, even at rest */
 static const real NAME_near = R(0.01);  /* moves below this, relative, keep the last J */
 enum { NAME_max_iterations = @MAX_ITERATIONS@, NAME_BOXED = @BOXED@ };
 @BOX@"""
@@ -186,6 +187,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
         "BOXED": str(int(flags["box"])),
         "TOLERANCE": number(entries["newton_tolerance"], dtype),
         "FLOOR": number(1000 * eps, dtype),
+        "TOP_SPEED": number(max(model.config.speed), dtype),
         "MAX_ITERATIONS": str(MAX_ITERATIONS),
         "BOX": _box_constants(entries["box"], dtype),
         "VERSIONS": text_constant(versions),

@@ -111,7 +111,7 @@ static inline int NAME_solve(const NAME_problem *P, NAME_terms *t, real *residua
       merit = trial_merit;
       length = R(1.0);
       exact = !kept;
-    } else if (size <= NAME_floor * scale) {
+    } else if (size <= NAME_floor * (scale > P->h * NAME_top_speed ? scale : P->h * NAME_top_speed)) {
       return NAME_CONVERGED;
     } else if (!exact) {
       NAME_evaluate(P, 2, t);

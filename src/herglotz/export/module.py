@@ -47,7 +47,8 @@ class StepModule(nn.Module):
         equations = Equations.of(model)
         self.model, self.field = equations.model, equations.field
         if not has_leapfrog(self.model):
-            self.newton, self.first_order = Newton(equations.slopes, iterations), equations.first_order
+            top = max(self.model.config.speed)
+            self.newton, self.first_order = Newton(equations.slopes, iterations, top), equations.first_order
         self.report = Report(Box.of(box, equations.model))
 
     def forward(

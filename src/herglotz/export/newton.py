@@ -36,11 +36,13 @@ class Newton(nn.Module):
         `StepEquation` as a graph, with or without J.
     iterations
         Bound on the iterations.
+    speed
+        The data's top speed: the networks' rounding is relative to h times this, even at rest.
     """
 
-    def __init__(self, equation: Graph, iterations: int):
+    def __init__(self, equation: Graph, iterations: int, speed: float):
         super().__init__()
-        self.equation = equation
+        self.equation, self.speed = equation, speed
         self.iterations = iterations
 
     def start(self, q: Tensor, s: Tensor, guess: Tensor, with_J: bool = False) -> Values:
@@ -95,7 +97,7 @@ class Newton(nn.Module):
         scale = torch.where(first, torch.nan_to_num(torch.maximum(scale + size, left), nan=1.0, posinf=1.0), scale)
         better = first | (merit_trial <= (1 - 1e-4 * fraction) * merit)
         settled = left <= TOLERANCE * eps * scale
-        rounding = FLOOR * eps * torch.maximum(scale, length(q))
+        rounding = FLOOR * eps * torch.maximum(torch.maximum(scale, length(q)), self.speed * h)
         stalled = ~better & (length(delta) <= rounding)  # not a wrong direction
         hopeless = first & ~torch.isfinite(merit_trial + left)  # there is no direction to follow
         accept = ~done & (better | settled)

@@ -91,7 +91,7 @@ class OneStep(nn.Module):
         self.kept = 2 if self.field is not None else 0
         if self.iterates:
             plan = plans(model)[0] if plan is None else plan
-            self.newton = Newton(equations.newton, iterations)
+            self.newton = Newton(equations.newton, iterations, max(model.config.speed))
             self.attempt, self.patient = Attempt(model, plan), Attempt(model, plan.patient)
             self.tolerance = TOLERANCE * torch.finfo(dtype).eps
             self.land = Land(model, self.field is not None)

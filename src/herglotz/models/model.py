@@ -170,6 +170,13 @@ class ContactLagrangian(nn.Module):
             raise InputError("this model has no inputs; build it with level='forced' and inputs=m in its ModelConfig")
         return DrivenLagrangian(self, u)
 
+    def typical_increment(self, h: Tensor) -> Tensor:
+        """The size of q1 − q0 at the data's top speed, shaped like h: what the rounding of the networks is relative to.
+
+        They are not zero near rest as the motion is: there J⁻¹F cannot be had better than some eps of this size.
+        """
+        return h * max(self.config.speed)
+
     def forward(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 0, u: Tensor | None = None
     ) -> Tensor | Partials:
@@ -258,6 +265,10 @@ class DrivenLagrangian:
     def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
         """`partials` at (q0, q0 + Δ, s0)."""
         return self.model.partials_increment(q0, delta, s0, h, order, self.u)
+
+    def typical_increment(self, h: Tensor) -> Tensor:
+        """See `ContactLagrangian.typical_increment`."""
+        return self.model.typical_increment(h)
 
     def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
         """F⁻ and F⁺, each (..., n)."""

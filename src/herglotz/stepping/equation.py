@@ -189,6 +189,10 @@ class StepOfModel:
         p1, L = torch.addcmul(p1, half, there.slope, value=-1), torch.addcmul(L, half[..., 0], there.V, value=-1)
         return End(p1, L, c, self._gained(point, there) if self.increments else None)
 
+    def typical_increment(self) -> Tensor:
+        """See `Equation`."""
+        return self.maker.model.typical_increment(self.constants.h).expand(self.s0.shape)
+
     def _gained(self, point: Point, there: Field) -> Tensor | None:
         """(c − 1) p0 + (D1 + D2) L_d + F⁻ + F⁺, p1 − p0 as F = 0: large terms of D1 and D2 have cancelled."""
         k, (_, _, N, damping, force) = self.constants, point.rest

@@ -122,7 +122,8 @@ def find_root(
     scale = torch.maximum(size, torch.maximum(_length(x), residual))
     limits = torch.finfo(scale.dtype)  # the floor: tolerances of denormal size would keep a motion from coming to rest
     scale = torch.nan_to_num(scale, nan=1.0, posinf=1.0).clamp(min=limits.tiny / limits.eps)
-    tiny, floor, near = tol * scale, 1e3 * limits.eps * scale, CLOSE * scale
+    tiny, near = tol * scale, CLOSE * scale
+    floor = 1e3 * limits.eps * torch.maximum(scale, equation.typical_increment())
     # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
     done = (residual <= tiny) | ~torch.isfinite(residual)
     length: Tensor | None = None  # None: every sample takes full steps

@@ -45,7 +45,8 @@ def find_one(
     move = _newton(J, point.F)
     scale = _scale(equation, q0, x, point, J, move.left, increments)
     eps = torch.finfo(x.dtype).eps
-    tiny, floor, near = tol * scale, 1e3 * eps * scale, CLOSE * scale
+    tiny, near = tol * scale, CLOSE * scale
+    floor = 1e3 * eps * max(scale, equation.typical_increment().item())
     # A direction that is not finite can never be followed: such a sample is over.
     done, length, slow, iterations = move.left <= tiny or not isfinite(move.left), 1.0, False, 0
     while iterations < max_iterations and not done:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple, Protocol
 
+import torch
 from torch import Tensor
 
 from herglotz.mechanics import (
@@ -48,6 +49,10 @@ class Equation(Protocol):
         """p1 = D2 + F⁺, L and c at a solution."""
         ...
 
+    def typical_increment(self) -> Tensor:
+        """The size that the rounding of F, over J, is relative to even at rest, (...); 0 where nothing is known."""
+        ...
+
 
 class PartialsEquation:
     """The step equation of any L_d; `rest` holds its partials."""
@@ -75,3 +80,9 @@ class PartialsEquation:
     def end(self, x: Tensor, point: Point) -> End:  # noqa: ARG002  one signature for all
         """See `Equation`."""
         return End(momentum_plus(point.rest), point.rest.L, point.rest.c)
+
+    def typical_increment(self) -> Tensor:
+        """See `Equation`."""
+        of_model = getattr(self.L_d, "typical_increment", None)
+        h = self.h.expand(self.s0.shape)
+        return torch.zeros_like(h) if of_model is None else of_model(h)

@@ -238,6 +238,23 @@ def test_statuses_in_c(tmp_path):
 
 
 @needs_compiler
+def test_a_learned_motion_comes_to_rest():
+    # fails if near rest, where the networks' forces are rounding, the solver asks for digits that F has not
+    model = ContactLagrangian(ModelConfig(rate=0.5, correction_width=16, correction_depth=1, seed=1))
+    weight, last = model.correction.network.weights
+    with torch.no_grad():
+        weight[8:] = weight[:8] * torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
+        model.correction.network.biases[0][8:] = model.correction.network.biases[0][:8]
+        last[:] = 0.1
+    q = torch.linspace(1.0, 0.6, 9, dtype=torch.float64)[:, None]
+    stepper = compile_c(model)
+    for states in (q, q[:1]):
+        out = stepper.rollout(states, 0 * states, 0 * states[:, 0], h=1.0, steps=150)
+        assert bool(out.ok.all())
+        assert float(out.q[:, -1].abs().max()) < 1e-15
+
+
+@needs_compiler
 def test_a_singular_step_is_reported():
     # fails if a zero pivot is divided by: a plain network with a zero last layer has J = 0
     for n in (1, 2):

@@ -281,7 +281,7 @@ def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone(written):
 def newton(model, iterations, q, p, s, h):
     """The loop of the exported graphs, turned by hand."""
     equations, h = Equations.of(model), torch.full_like(s, h)
-    solver = Newton(equations.newton, iterations)
+    solver = Newton(equations.newton, iterations, max(model.config.speed))
     assert equations.field is not None
     carry, problem = solver.start(q, s, torch.zeros_like(q)), (q, p, s, h, *equations.field(q))
     while bool(solver.unfinished(carry[0], carry[1])):

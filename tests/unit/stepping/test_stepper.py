@@ -145,6 +145,27 @@ def test_rest_stays_at_rest():
     assert float(out.q.abs().max()) == 0
 
 
+def even_model():
+    """A learned model that rests at q = 0: units come in pairs, (q̄, v) → −(q̄, v), whose forces cancel to rounding."""
+    model = ContactLagrangian(ModelConfig(rate=0.5, correction_width=16, correction_depth=1, seed=1))
+    weight, last = model.correction.network.weights
+    with torch.no_grad():
+        weight[8:] = weight[:8] * torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
+        model.correction.network.biases[0][8:] = model.correction.network.biases[0][:8]
+        last[:] = 0.1
+    return model
+
+
+@pytest.mark.parametrize("shape", [(1,), (5, 1)], ids=["alone", "batch"])
+def test_a_learned_motion_comes_to_rest(shape):
+    # fails if near rest, where the networks' forces are rounding, the solver asks for digits that F has not
+    q = torch.linspace(1.0, 0.6, shape[0], dtype=torch.float64)[:, None] if len(shape) == 2 else torch.ones(1).double()
+    with torch.no_grad():
+        out = Stepper(even_model()).rollout(q, 0 * q, h=1.0, steps=150)
+    assert bool(out.ok.all())
+    assert float(out.q[..., -1, :].abs().max()) < 1e-15
+
+
 def test_a_state_in_another_dtype_than_the_model_is_refused():
     # fails if torch's own message about dtypes, which names neither, reaches the user
     model = ContactLagrangian(ModelConfig())
