@@ -63,6 +63,12 @@ def triples(
     return Triples(q[index], q[index + 1], q[index + 2], h0, h1, trajectory[index], index)
 
 
+def join(first: Triples, second: Triples) -> Triples:
+    """Both, one after the other."""
+    pairs = zip(vars(first).values(), vars(second).values(), strict=True)
+    return Triples(*(torch.cat(pair) for pair in pairs))
+
+
 def unwrap(
     q: Tensor,  # (N, n) position
     trajectory: Tensor,  # (N,) long

@@ -16,10 +16,12 @@ from torch import Tensor
 import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes, without
+from herglotz.data.windows import Triples
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.training.adam import adam
 from herglotz.training.baseline import Baseline, estimate_baseline
+from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.inputs import step_inputs
 from herglotz.training.judge import Fitted, judge, states_everywhere, with_dropped
@@ -34,6 +36,8 @@ from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, ma
 PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 RESTART = 7919  # between the seeds of one fit's restarts
+WIDER = 3  # a single layer reaches a tenth of the error of two in as much time
+CLEAN = 1e-6  # a baseline that explains the data to this fraction of their size needs no measurement of noise
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
@@ -124,7 +128,8 @@ def _fit_training_part(
         )
         return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
     model = _model(base, config, "plain" if objective == "raw" else "correction")
-    if objective == "auto":
+    expected = _expected(model, train, base, config, exact)
+    if objective == "auto" and (expected is None or expected[1] > CLEAN * size):
         result, rms = _fit_residual(model, train, base, config, stages, "one-step probe", PROBE, sigma=exact)
         enough = len(train.triples(base.max_step)) * train.dof >= 2 * result.x.numel()
         if rms > NOISY * size or not enough:
@@ -135,20 +140,27 @@ def _fit_training_part(
             )
             return _fit_by_trajectory(rigid, train, base, config, stages, sigma or rigid_rms / 6**0.5)
     metric = "raw" if objective == "raw" else "position"
+    network = "plain" if metric == "raw" else "correction" if expected is None else "covered"
+    model = model if expected is None else _model(base, config, network)
     tried = []
     for k in range(config.restarts):
         if k:
-            model = _model(
-                base, replace(config, seed=config.seed + k * RESTART), "plain" if metric == "raw" else "correction"
-            )
+            model = _model(base, replace(config, seed=config.seed + k * RESTART), network)
         name = "one-step error" + (f", restart {k}" if k else "")
         tried.append(
-            (model, *_fit_residual(model, train, base, config, stages, name, config.iterations, exact, metric))
+            (
+                model,
+                *_fit_residual(
+                    model, train, base, config, stages, name, config.iterations, exact, metric, expected=expected
+                ),
+            )
         )
     model, result, rms = min(tried, key=lambda one: one[1].cost)
     noise = max(rms / 6**0.5, exact) if metric == "position" else exact
     # The states are fitted too (parameters held), so that the free run does not start from two noisy samples.
     notes, s = {"iterations": result.iterations, "reason": result.reason}, None
+    if expected is not None:
+        notes["baseline_error"] = expected[1]
     if config.supervision != "q":
         assert train.s is not None
         notes["unit_of_s"] = unit = float(result.x[-1].exp())
@@ -203,7 +215,12 @@ def _states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
 
 
 def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian:
-    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone."""
+    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone.
+
+    Where the whole range is "covered", the correction is one layer of `WIDER` times as many units.
+    """
+    width = config.correction_width if network != "potential" and config.order == 2 else 0
+    width *= WIDER if network == "covered" else 1
     model = ContactLagrangian(
         ModelConfig(
             angles=base.angles,
@@ -215,7 +232,8 @@ def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian
             rate=base.rate,
             potential_width=config.potential_width if network == "potential" and config.order == 2 else 0,
             damping_width=config.damping_width,
-            correction_width=config.correction_width if network != "potential" and config.order == 2 else 0,
+            correction_width=width,
+            correction_depth=1 if network == "covered" else 2,
             baseline=network != "plain",
             seed=config.seed,
             activation=config.activation,
@@ -251,14 +269,16 @@ def _fit_residual(
     sigma: float,
     metric: str = "position",
     freedom: float | None = None,
+    expected: tuple[Triples, float] | None = None,
 ) -> tuple[OptimiserResult, float]:
     """Minimise the one-step objective, write the result into the model, and return it with its RMS."""
     prior = make_prior(model, base, config.departures[-1])
     problem: ResidualProblem | SupervisedProblem
     if config.supervision == "q":
         problem = ResidualProblem(
-            model, train, metric=metric, max_step=base.max_step, sigma=sigma, prior=prior, freedom=freedom
-        )
+            model, train, metric=metric, max_step=base.max_step, sigma=sigma, prior=prior, freedom=freedom,
+            expected=expected,
+        )  # fmt: skip
     else:
         momenta = config.supervision == "qps"
         problem = SupervisedProblem(
@@ -279,6 +299,17 @@ def _fit_residual(
     rms = float(problem.residuals(result.x).square().mean().sqrt())
     problem.flat.set(result.x[: len(problem.flat.get())])
     return result, rms
+
+
+def _expected(
+    model: ContactLagrangian, train: Trajectories, base: Baseline, config: FitConfig, exact: float
+) -> tuple[Triples, float] | None:
+    """Triples of the baseline's motion and how well they are known, where the baseline explains exact data."""
+    own = config.features or config.known or config.alike or config.mass_width or config.supervision != "q"
+    if model.correction is None or not model.config.baseline or own or train.u is not None or model.s_enters_motion:
+        return None
+    motion = fit_baseline_motion(train, base, NOISY * max(base.scale))
+    return None if motion is None else (motion.triples(train, base), max(motion.error, exact))
 
 
 def _key(data: Trajectories, config: FitConfig) -> str:

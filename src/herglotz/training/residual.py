@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.windows import Triples
+from herglotz.data.windows import Triples, join
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
@@ -45,6 +45,8 @@ class ResidualProblem:
         Penalty on the parameters.
     freedom
         Degrees of freedom ν of Student's t for r/σ (`robust`); None: least squares.
+    expected
+        Triples that were not recorded, and their standard deviation (`baseline_motion`). `residuals` leaves them out.
     chunk
         Triples whose Jacobian is held in memory at once.
     """
@@ -59,12 +61,19 @@ class ResidualProblem:
         sigma: float = 1.0,
         prior: Prior | None = None,
         freedom: float | None = None,
+        expected: tuple[Triples, float] | None = None,
         chunk: int = 4096,
     ):
         self.flat = FlatModel(model)
         self.data, self.metric, self.sigma, self.prior, self.chunk = data, metric, sigma, prior, chunk
         self.freedom = freedom
         self.triples: Triples = data.triples(max_step)
+        self.recorded = len(self.triples)
+        self.scale = self.triples.h0.new_full((self.recorded, 1), sigma)  # of every r
+        if expected is not None:
+            more, error = expected
+            self.triples = join(self.triples, more)
+            self.scale = torch.cat([self.scale, self.scale.new_full((len(more), 1), error)])
         self.coupled = model.s_enters_motion
         self.u = step_inputs(model, data)  # (N, m)
         self.latents = len(data) if self.coupled else 0
@@ -77,6 +86,10 @@ class ResidualProblem:
 
     def residuals(self, x: Tensor) -> Tensor:
         """r, shape (T, n), in units of q (or of p for the raw metric)."""
+        return self._all(x)[: self.recorded]
+
+    def _all(self, x: Tensor) -> Tensor:
+        """The residuals, and then those of the triples that are only expected."""
         theta, latent = self._split(x)
         t = self.triples
         with torch.no_grad():
@@ -85,7 +98,7 @@ class ResidualProblem:
 
     def cost(self, x: Tensor) -> Tensor:
         """½ Σ |r|²/σ² + prior."""
-        cost = loss(self.residuals(x) / self.sigma, self.freedom)
+        cost = loss(self._all(x) / self.scale, self.freedom)
         return cost if self.prior is None else cost + self.prior.cost(self._split(x)[0])
 
     def cost_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -98,7 +111,7 @@ class ResidualProblem:
         theta = x.detach().requires_grad_()
         inputs, zero = self._inputs(t.index[own]), torch.zeros_like(t.h0[own])
         r = self._local(theta, t.q0[own], t.q1[own], t.q2[own], zero, t.h0[own], t.h1[own], *inputs)
-        cost = loss(r / self.sigma, self.freedom)
+        cost = loss(r / self.scale[own], self.freedom)
         if self.prior is not None and rank == 0:
             cost = cost + self.prior.cost(theta)
         (gradient,) = torch.autograd.grad(cost, theta)
@@ -128,8 +141,8 @@ class ResidualProblem:
                 r_s = vmap(jacrev(self._local, 4), (None, *axes))(theta, *arguments)
                 J = torch.cat([J, torch.zeros_like(J[..., :1]).expand(*J.shape[:-1], self.latents)], -1)
                 J = J + r_s[..., None] * ds[t.index[part]][:, None, :]
-            J = J.reshape(-1, len(x)) / self.sigma
-            r = r.reshape(-1) / self.sigma
+            J = (J / self.scale[part][..., None]).reshape(-1, len(x))
+            r = (r / self.scale[part]).reshape(-1)
             cost += loss(r, self.freedom)
             if self.freedom is not None:
                 by = root_weights(r, self.freedom)

@@ -1,0 +1,152 @@
+"""Motions of the fitted baseline, as triples where there are no data: what is expected there.
+
+The correction is free wherever no triple has been: in a hole of the data, near a separatrix say, it errs most, and a
+rollout that crosses it never recovers. Where q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ (angles; −kᵢ qᵢ − bᵢ − γ q̇ᵢ for others)
+explains the recorded triples up to an RMS of σ_b, its own motions are expected to be as good elsewhere in their range:
+they join the objective as triples of that standard deviation. Baselines that explain less say nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.windows import Triples
+from herglotz.training.baseline import Baseline
+
+ROUNDS = 12  # Gauss–Newton iterations
+TURN = 0.02  # radians of the fastest motion a Runge–Kutta step: an error of about 1e-10 a triple
+BEYOND = 1.2  # times the energy and the speed of the data
+STARTS = 256  # triples a coordinate
+
+
+@dataclass(frozen=True)
+class BaselineMotion:
+    """The baseline's equation of motion with parameters fitted to triples of positions.
+
+    Parameters
+    ----------
+    angles
+        (n,) bool.
+    parameters
+        (3, n): k, b and the one rate γ, repeated.
+    substeps
+        Runge–Kutta steps a step of the data.
+    error
+        RMS of the predicted third position over the data's triples, in units of q.
+    """
+
+    angles: Tensor
+    parameters: Tensor
+    substeps: int
+    error: float
+
+    def triples(self, data: Trajectories, base: Baseline) -> Triples:
+        """Triples about quasi-random states of the data's range and a little beyond."""
+        recorded = data.triples(base.max_step)
+        columns = [self._states(i, recorded) for i in range(data.dof)]
+        count = min(len(q) for q, _ in columns)
+        q1, v1 = (torch.stack([one[k][:count] for one in columns], -1) for k in (0, 1))
+        like = torch.arange(count, device=q1.device) * len(recorded) // max(count, 1)
+        h0, h1 = recorded.h0[like], recorded.h1[like]
+        q0, q2 = (_flow(self.angles, q1, v1, self.parameters, h, self.substeps)[0] for h in (-h0, h1))
+        return Triples(q0, q1, q2, h0, h1, recorded.trajectory[like], recorded.index[like])
+
+    def _states(self, i: int, recorded: Triples) -> tuple[Tensor, Tensor]:
+        """Positions and velocities of coordinate i: none has `BEYOND` times more energy than the data."""
+        q, v = recorded.q1[:, i], _slopes(recorded)[:, i]
+        low, high = float(q.min()), float(q.max())
+        middle, half = (low + high) / 2, (high - low) / 2 * BEYOND**2
+        half = min(half, math.pi) if self.angles[i] else half
+        unit = torch.quasirandom.SobolEngine(2, seed=i, scramble=True).draw(4 * STARTS * self.angles.numel()).to(q)
+        q1, v1 = middle + (2 * unit[:, 0] - 1) * half, (2 * unit[:, 1] - 1) * v.abs().max() * BEYOND
+        energy, lowest = self._energy(i, q, v), self._energy(i, q, 0 * v).min()
+        inside = self._energy(i, q1, v1) - lowest <= BEYOND * (energy.max() - lowest)
+        return q1[inside][: STARTS * self.angles.numel()], v1[inside][: STARTS * self.angles.numel()]
+
+    def _energy(self, i: int, q: Tensor, v: Tensor) -> Tensor:
+        """½v² + V of coordinate i."""
+        k, b, _ = self.parameters[:, i]
+        return v.square() / 2 + (b * q.sin() - k * q.cos() if self.angles[i] else k * q.square() / 2 + b * q)
+
+
+def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> BaselineMotion | None:
+    """Least squares over the data's triples; None where the error that is left exceeds `worst`."""
+    t, n = data.triples(base.max_step), data.dof
+    angles = torch.tensor(base.angles, device=data.t.device)
+    parameters = t.q0.new_tensor([base.stiffness, base.tilt, (base.rate,) * n])
+    fastest = max(max(v / x for v, x in zip(base.speed, base.scale, strict=True)), max(map(abs, base.stiffness)) ** 0.5)
+    substeps = math.ceil(float(torch.maximum(t.h0, t.h1).max()) * fastest / TURN)
+    v, best = _slopes(t), None
+    for k in range(ROUNDS):
+        r, columns, v_of = _linearised(angles, t, v, parameters, substeps)
+        error = float(r.square().mean().sqrt())
+        if not math.isfinite(error) or (best is not None and k > 3 and error > 0.5 * best.error):
+            break
+        best = BaselineMotion(angles, parameters, substeps, error)
+        A = torch.cat([torch.diag_embed(columns[0]), torch.diag_embed(columns[1]), columns[2][..., None]], -1)
+        x = torch.linalg.lstsq(A.flatten(0, 1).cpu(), -r.reshape(-1, 1).cpu(), driver="gelsd").solution[:, 0].to(r)
+        step = torch.stack([x[:n], x[n : 2 * n], x[2 * n].expand(n)])
+        parameters, v = parameters + step, v_of(step)
+    return best if best is not None and best.error <= worst else None
+
+
+def _slopes(t: Triples) -> Tensor:
+    return (t.q2 - t.q0) / (t.h0 + t.h1)[:, None]
+
+
+def _linearised(
+    angles: Tensor, t: Triples, v: Tensor, parameters: Tensor, substeps: int
+) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
+    """Errors r of q2 (T, n), their slopes in k, b and γ (3, T, n), and the velocity v at q1 after a step of these.
+
+    The velocity that leads back to q0 is eliminated.
+    """
+    before, back = _flow(angles, t.q1, v, parameters, -t.h0, substeps, slopes=True)
+    after, on = _flow(angles, t.q1, v, parameters, t.h1, substeps, slopes=True)
+    missed = t.q0 - before
+    gain = on[0] / back[0]
+
+    def v_of(step: Tensor) -> Tensor:
+        return v + (missed - (back[1:] * step[:, None]).sum(0)) / back[0]
+
+    return after - t.q2 + gain * missed, on[1:] - gain * back[1:], v_of
+
+
+def _flow(
+    angles: Tensor, q: Tensor, v: Tensor, parameters: Tensor, h: Tensor, substeps: int, slopes: bool = False
+) -> tuple[Tensor, Tensor]:
+    """Position (T, n) a time h (T,) later, by Runge–Kutta of order 4; its slopes in v, k, b and γ, (4, T, n), or none.
+
+    Coordinates do not act on one another: each has its own four slopes.
+    """
+    k, b, rate = parameters
+    d = (h / substeps)[:, None]
+
+    def a(q: Tensor, v: Tensor) -> Tensor:
+        sin, cos = torch.where(angles, q[0].sin(), q[0]), torch.where(angles, q[0].cos(), 1.0)
+        own = (-k * sin - b * cos - rate * v[0])[None]
+        if not slopes:
+            return own
+        stiffness = torch.where(angles, k * cos - b * sin, k)
+        direct = torch.stack([torch.zeros_like(sin), sin, cos, v[0]])
+        return torch.cat([own, -stiffness * q[1:] - rate * v[1:] - direct])
+
+    still = q.new_zeros(4 * slopes, *q.shape)
+    first = torch.cat([torch.ones_like(v)[None], still[1:]]) if slopes else still
+    q, v = torch.cat([q[None], still]), torch.cat([v[None], first])
+    for _ in range(substeps):
+        a1 = a(q, v)
+        v2 = v + d / 2 * a1
+        a2 = a(q + d / 2 * v, v2)
+        v3 = v + d / 2 * a2
+        a3 = a(q + d / 2 * v2, v3)
+        v4 = v + d * a3
+        a4 = a(q + d * v3, v4)
+        q, v = q + d / 6 * (v + 2 * v2 + 2 * v3 + v4), v + d / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    return q[0], q[1:]

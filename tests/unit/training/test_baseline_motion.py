@@ -1,0 +1,88 @@
+"""Motions of the baseline where there are no data."""
+
+import math
+from functools import partial
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.mechanics import contact_vector_field
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.systems import scene
+from herglotz.systems.reference import reference_flow
+from herglotz.training import FitConfig, ResidualProblem, fit
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.baseline_motion import fit_baseline_motion
+
+
+@pytest.fixture(scope="module")
+def data():
+    return simulate(scene("damped_pendulum"), trajectories=4, steps=12, h=1.0, seed=0).unwrapped()
+
+
+def test_the_parameters_are_those_of_the_motion(data):
+    # fails if the step's size biases them, or the velocity at the middle is not eliminated
+    motion = fit_baseline_motion(data, estimate_baseline(data), worst=1e-6)
+    assert motion is not None
+    expected = torch.tensor([[1.0], [0.0], [0.2]], dtype=torch.float64)
+    torch.testing.assert_close(motion.parameters, expected, rtol=0, atol=1e-6)
+
+
+def test_triples_are_motions_inside_the_range(data):
+    # fails if the triples do not solve the equation, leave the energies of the data, or miss a part of their range
+    base = estimate_baseline(data)
+    motion = fit_baseline_motion(data, base, worst=1e-6)
+    assert motion is not None
+    t = motion.triples(data, base)
+    H, (q0, q1, q2) = scene("damped_pendulum").hamiltonian, (t.q0, t.q1, t.q2)
+    flow = partial(reference_flow, partial(contact_vector_field, H))
+    # The momentum at q0 that leads to q1, by Newton with a difference quotient.
+    p, zero = (q1 - q0) / t.h0[:, None], torch.zeros_like(t.h0)
+    for _ in range(12):
+        there, _, _ = flow(q0, p, zero, t.h0)
+        slope = (flow(q0, p + 1e-6, zero, t.h0)[0] - there) / 1e-6
+        p = p - (there - q1) / slope
+    end, _, _ = flow(*flow(q0, p, zero, t.h0)[:2], zero, t.h1)
+    assert float((end - q2).abs().max()) < 1e-6
+    low, high = float(data.q.min()), float(data.q.max())
+    assert float(q1.min()) < low
+    assert float(q1.max()) > high
+    assert float(q1.max() - q1.min()) <= 2 * math.pi
+
+
+def test_noise_and_other_motions_say_nothing(data):
+    # fails if a baseline that does not explain the data is believed
+    noisy = simulate(scene("damped_pendulum"), trajectories=4, steps=12, h=1.0, seed=0, noise=0.01).unwrapped()
+    kepler = simulate(scene("kepler"), trajectories=4, steps=12, h=0.1, seed=0).unwrapped()
+    for one in (noisy, kepler):
+        assert fit_baseline_motion(one, estimate_baseline(one), worst=3e-4) is None
+
+
+def test_expected_triples_weigh_by_their_own_error(data):
+    # fails if their residuals are taken for recorded ones, or scaled by the data's σ
+    base = estimate_baseline(data)
+    motion = fit_baseline_motion(data, base, worst=1e-6)
+    assert motion is not None
+    more, model = motion.triples(data, base), ContactLagrangian(ModelConfig())
+    plain = ResidualProblem(model, data, sigma=0.1)
+    both = ResidualProblem(model, data, sigma=0.1, expected=(more, 0.5))
+    x = plain.start()
+    torch.testing.assert_close(both.residuals(x), plain.residuals(x))
+    r = both._all(x)[both.recorded :]
+    torch.testing.assert_close(both.cost(x), plain.cost(x) + (r / 0.5).square().sum() / 2)
+    cost, _, gradient = both.normal_equations(x)
+    torch.testing.assert_close(cost, both.cost(x))
+    torch.testing.assert_close(gradient, both.cost_and_gradient(x)[1])
+
+
+def test_unseen_energies_are_followed(data):
+    # fails if the fit of exact data leaves its correction free where no triple has been
+    run = fit(data, FitConfig(train_fraction=1.0, iterations=60), progress=False)
+    assert run.model.config.correction_depth == 1
+    assert run.metrics["follows_data"]
+    test = simulate(scene("damped_pendulum"), trajectories=5, steps=31, h=1.0, seed=1000).q.reshape(5, 32, 1)
+    with torch.no_grad():
+        out = run.stepper.rollout(*run.stepper.init(test[:, 0], test[:, 1], None, 1.0), h=1.0, steps=30)
+    assert bool(out.ok.all())
+    assert float((out.q - test[:, 1:]).square().mean().sqrt()) < 1e-2
