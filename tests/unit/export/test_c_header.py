@@ -241,10 +241,11 @@ def test_statuses_in_c(tmp_path):
 def test_a_learned_motion_comes_to_rest():
     # fails if near rest, where the networks' forces are rounding, the solver asks for digits that F has not
     model = ContactLagrangian(ModelConfig(rate=0.5, correction_width=16, correction_depth=1, seed=1))
-    weight, last = model.correction.network.weights
+    assert model.correction is not None
+    (weight, last), (bias,) = model.correction.network.weights, model.correction.network.biases
     with torch.no_grad():
         weight[8:] = weight[:8] * torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
-        model.correction.network.biases[0][8:] = model.correction.network.biases[0][:8]
+        bias[8:] = bias[:8]
         last[:] = 0.1
     q = torch.linspace(1.0, 0.6, 9, dtype=torch.float64)[:, None]
     stepper = compile_c(model)

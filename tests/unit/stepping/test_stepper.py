@@ -148,10 +148,11 @@ def test_rest_stays_at_rest():
 def even_model():
     """A learned model that rests at q = 0: units come in pairs, (q̄, v) → −(q̄, v), whose forces cancel to rounding."""
     model = ContactLagrangian(ModelConfig(rate=0.5, correction_width=16, correction_depth=1, seed=1))
-    weight, last = model.correction.network.weights
+    assert model.correction is not None
+    (weight, last), (bias,) = model.correction.network.weights, model.correction.network.biases
     with torch.no_grad():
         weight[8:] = weight[:8] * torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)
-        model.correction.network.biases[0][8:] = model.correction.network.biases[0][:8]
+        bias[8:] = bias[:8]
         last[:] = 0.1
     return model
 
