@@ -86,7 +86,8 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
     for k in range(ROUNDS):
         r, columns, v_of = _linearised(angles, t, v, parameters, substeps)
         error = float(r.square().mean().sqrt())
-        if not math.isfinite(error) or (best is not None and k > 3 and error > 0.5 * best.error):
+        lost = not (math.isfinite(error) and bool(torch.isfinite(columns).all()))
+        if lost or (best is not None and k > 3 and error > 0.5 * best.error):
             break
         best = BaselineMotion(angles, parameters, substeps, error)
         A = torch.cat([torch.diag_embed(columns[0]), torch.diag_embed(columns[1]), columns[2][..., None]], -1)

@@ -52,7 +52,8 @@ class FitConfig:
         value fixes it.
     potential_width, damping_width, correction_width
         Hidden units of the networks; the correction is used by the residual objectives, the potential's network by
-        trajectory fitting.
+        trajectory fitting. The correction has two layers, or one of three times as many units where the baseline's
+        equation of motion explains exact data and its motions fill their holes (`herglotz.training.baseline_motion`).
     learning_rate
         Of Adam.
     activation
