@@ -68,16 +68,24 @@ class ResidualProblem:
         self.data, self.metric, self.sigma, self.prior, self.chunk = data, metric, sigma, prior, chunk
         self.freedom = freedom
         self.triples: Triples = data.triples(max_step)
-        self.recorded = len(self.triples)
-        self.scale = self.triples.h0.new_full((self.recorded, 1), sigma)  # of every r
+        self.expected, self.error = 0, sigma
         if expected is not None:
-            more, error = expected
-            self.triples = join(self.triples, more)
-            self.scale = torch.cat([self.scale, self.scale.new_full((len(more), 1), error)])
+            self.triples, self.expected, self.error = join(self.triples, expected[0]), len(expected[0]), expected[1]
         self.coupled = model.s_enters_motion
         self.u = step_inputs(model, data)  # (N, m)
         self.latents = len(data) if self.coupled else 0
         self.many = data.dof >= MANY and not self.coupled and metric == "position"
+
+    @property
+    def recorded(self) -> int:
+        """How many of the triples are data; those that are only expected follow them."""
+        return len(self.triples) - self.expected
+
+    @property
+    def scale(self) -> Tensor:
+        """The standard deviation of every r, (T, 1)."""
+        return torch.cat([self.triples.h0.new_full((k, 1), s) for k, s in
+                          ((self.recorded, self.sigma), (self.expected, self.error))])  # fmt: skip
 
     def start(self) -> Tensor:
         """The flat unknowns: parameters, then the latents (zero)."""
@@ -124,7 +132,7 @@ class ResidualProblem:
         theta, latent = self._split(x)
         s = self._action(theta, latent)
         ds = self._action_derivative(theta, s) if self.coupled else None
-        A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+        A, b, scale = x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), self.scale
         cost = x.new_zeros(())
         t, axes = self.triples, (0,) * 6 + ((None, None) if self.u is None else (0, 0))
         _, processes = world()
@@ -141,8 +149,8 @@ class ResidualProblem:
                 r_s = vmap(jacrev(self._local, 4), (None, *axes))(theta, *arguments)
                 J = torch.cat([J, torch.zeros_like(J[..., :1]).expand(*J.shape[:-1], self.latents)], -1)
                 J = J + r_s[..., None] * ds[t.index[part]][:, None, :]
-            J = (J / self.scale[part][..., None]).reshape(-1, len(x))
-            r = (r / self.scale[part]).reshape(-1)
+            J = (J / scale[part][..., None]).reshape(-1, len(x))
+            r = (r / scale[part]).reshape(-1)
             cost += loss(r, self.freedom)
             if self.freedom is not None:
                 by = root_weights(r, self.freedom)
