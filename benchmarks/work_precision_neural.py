@@ -13,7 +13,7 @@ from work_precision_scenes import Setup
 
 from herglotz.training import levenberg_marquardt
 
-PAIRS = 700
+PAIRS, ROWS = 700, 2000  # pairs of states; of several coordinates fewer
 PARTS = 4  # RK4 steps between two samples
 
 
@@ -34,7 +34,7 @@ def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iteration
     keep = torch.ones(len(y), dtype=torch.bool)
     keep[torch.tensor(data.offsets) + torch.tensor(data.lengths) - 1] = False
     rows = keep.nonzero()[:, 0]
-    rows = rows[torch.randperm(len(rows), generator=generator)[:PAIRS]]
+    rows = rows[torch.randperm(len(rows), generator=generator)[: min(PAIRS, ROWS // n)]]
     u = torch.zeros(len(y), n, dtype=y.dtype) if data.u is None else data.u
     pairs = (y[rows], y[rows + 1], u[rows])
     k = setup.h / PARTS

@@ -80,7 +80,7 @@ SETUPS = {
             (2, 3, 6),
             rules=(1, 2, 4, 8),
             neural=((4, 1), (8, 1), (8, 2), (16, 2)),
-            neural_iterations=300,
+            neural_iterations=200,
             other={
                 "level conservative": {"level": "conservative"},
                 "level affine": {"level": "affine"},
