@@ -50,7 +50,7 @@ def plot_tuning(tuning: Tuning) -> Figure:
                     text = f"{name}, {form}"
                     ax.plot(x, y, mark, color=color, fillstyle=fill, ms=6, ls="", label=text)
         ax.plot([chosen.us], [max(chosen.bound, FLOOR)], "o", ms=14, mfc="none", mec=UNSEEN, mew=2)
-        label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, 8))
+        label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, -18))
         if "max_error" in tuning.asked:
             ax.axhline(tuning.asked["max_error"], color=UNSEEN, lw=0.9, ls="--")
         else:
