@@ -21,7 +21,6 @@ from work_precision_report import RIVALS
 from work_precision_rivals import classical, neural
 from work_precision_scenes import CHECKS, SETUPS, TOLD, Setup, judged
 
-from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.tune.distil import pairs_of
 from herglotz.tune.kicks import can_kick, fit_kicks
@@ -83,7 +82,7 @@ def equation(case: Case) -> list[Timed]:
     return found
 
 
-def constants_of(model: ContactLagrangian) -> dict[str, float]:
+def constants_of(model: Any) -> dict[str, float]:
     """The learned numbers of K = (M00 v0² + 2(M01 + MC cos(q0 − q1)) v0 v1 + M11 v1²)/2, V = −G0 cos q0 − G1 cos q1."""
     with torch.no_grad():
         K, base = model.kinetic, model.kinetic.base.mass()
