@@ -37,7 +37,6 @@ PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 RESTART = 7919  # between the seeds of one fit's restarts
 WIDER = 3  # a single layer reaches a tenth of the error of two in as much time
-CLEAN = 1e-6  # a baseline that explains the data to this fraction of their size needs no measurement of noise
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
@@ -129,7 +128,7 @@ def _fit_training_part(
         return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
     model = _model(base, config, "plain" if objective == "raw" else "correction")
     expected = _expected(model, train, base, config, exact)
-    if objective == "auto" and (expected is None or expected[1] > CLEAN * size):
+    if objective == "auto" and expected is None:
         result, rms = _fit_residual(model, train, base, config, stages, "one-step probe", PROBE, sigma=exact)
         enough = len(train.triples(base.max_step)) * train.dof >= 2 * result.x.numel()
         if rms > NOISY * size or not enough:
@@ -308,7 +307,7 @@ def _expected(
     own = config.features or config.known or config.alike or config.mass_width or config.supervision != "q"
     if model.correction is None or not model.config.baseline or own or train.u is not None or model.s_enters_motion:
         return None
-    motion = fit_baseline_motion(train, base, NOISY * max(base.scale))
+    motion = fit_baseline_motion(train, base, min(100 * exact, NOISY * max(base.scale)))
     return None if motion is None else (motion.triples(train, base), max(motion.error, exact))
 
 
