@@ -37,6 +37,7 @@ PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 RESTART = 7919  # between the seeds of one fit's restarts
 WIDER = 3  # a single layer reaches a tenth of the error of two in as much time
+DRAWS, HEAT = 4, 30  # draws of a single layer's weights, and the iterations after which the best of them is taken
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
@@ -141,18 +142,24 @@ def _fit_training_part(
     metric = "raw" if objective == "raw" else "position"
     network = "plain" if metric == "raw" else "correction" if expected is None else "covered"
     model = model if expected is None else _model(base, config, network)
-    tried = []
+    heat = min(HEAT, config.iterations // 10) if network == "covered" else 0
+    tried, draws = [], DRAWS if heat else 1
     for k in range(config.restarts):
-        if k:
-            model = _model(base, replace(config, seed=config.seed + k * RESTART), network)
         name = "one-step error" + (f", restart {k}" if k else "")
+        heats = []
+        for j in range(draws):
+            if k or j:
+                model = _model(base, replace(config, seed=config.seed + (k * draws + j) * RESTART), network)
+            if heat:
+                draw = _fit_residual(
+                    model, train, base, config, stages, f"{name}, draw {j}", heat, exact, metric, expected=expected
+                )
+                heats.append((draw[0].cost, j, model))
+        if heats:
+            model = min(heats)[2]
+        left = config.iterations - heat * len(heats)
         tried.append(
-            (
-                model,
-                *_fit_residual(
-                    model, train, base, config, stages, name, config.iterations, exact, metric, expected=expected
-                ),
-            )
+            (model, *_fit_residual(model, train, base, config, stages, name, left, exact, metric, expected=expected))
         )
     model, result, rms = min(tried, key=lambda one: one[1].cost)
     noise = max(rms / 6**0.5, exact) if metric == "position" else exact
