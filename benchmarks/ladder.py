@@ -88,6 +88,20 @@ def sampled(case: Case) -> Trajectories:
     return simulate(case.what, trajectories=8, steps=60, h=case.h, noise=noise)  # pyright: ignore[reportArgumentType]
 
 
+def table(rows: list[dict]) -> str:
+    """One line a scene: held-out RMS of every level in units of q, and what was chosen."""
+    levels = list(dict.fromkeys(c["level"] for row in rows for c in row["levels"]))
+    head = ["scene", "needs", "chosen", *levels, "seeds"]
+    lines = ["# Does `select` choose right?", "", "Held-out RMS of each level, median of the seeds.", "",
+             f"| {' | '.join(head)} |", "|---" * len(head) + "|"]  # fmt: skip
+    for row in rows:
+        errors = {c["level"]: c["held_out_rms"] for c in row["levels"]}
+        shown = ["failed" if errors.get(level) is None else f"{errors[level]:.3g}" for level in levels]
+        chosen = row["chosen"] if row["right"] else f"**{row['chosen']}**"
+        lines.append(f"| {row['scene']} | {row['needs']} | {chosen} | {' | '.join(shown)} | {row['seeds']} |")
+    return "\n".join([*lines, "", f"Right on {sum(row['right'] for row in rows)} of {len(rows)} scenes."]) + "\n"
+
+
 def main() -> None:
     torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -100,26 +114,24 @@ def main() -> None:
     if unknown:
         parser.error(f"unknown scene {unknown[0]!r}; choose some of {', '.join(CASES)}")
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    rows = []
+    old = json.loads(arguments.out.read_text())["scenes"] if arguments.out.exists() else []
+    rows = {row["scene"]: row for row in old}  # what other runs measured is kept
     for name in tqdm(names, desc="scenes", disable=None):
-        case, began = CASES[name], time.perf_counter()
+        case, began = CASES[name], time.process_time()
         found = select(sampled(case), seeds=arguments.seeds, progress=False)
         right = found.chosen.level == case.level
-        rows.append(
-            {"scene": name, "needs": case.level, "chosen": found.chosen.level, "right": right}
-            | {"seconds": round(time.perf_counter() - began, 1), "levels": [c.to_dict() for c in found.candidates]}
-        )
+        rows[name] = {"scene": name, "needs": case.level, "chosen": found.chosen.level, "right": right,
+                      "seeds": arguments.seeds, "commit": commit.strip(),
+                      "cpu_seconds": round(time.process_time() - began, 1),
+                      "levels": [c.to_dict() for c in found.candidates]}  # fmt: skip
         print(f"\n{name}: needs {case.level}, chosen {found.chosen.level}{'' if right else '  (WRONG)'}")
         print(found.table(), flush=True)
-    print(f"\nright on {sum(row['right'] for row in rows)} of {len(rows)} scenes")
-    result = {
-        "commit": commit.strip(),
-        "machine": {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()},
-        "noise": NOISE,
-        "seeds": arguments.seeds,
-        "scenes": rows,
-    }
-    write_atomically(arguments.out, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+        machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+        ordered = [rows[key] for key in CASES if key in rows]
+        result = {"machine": machine, "noise": NOISE, "scenes": ordered}
+        write_atomically(arguments.out, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
+        write_atomically(arguments.out.with_suffix(".md"), table(ordered).encode())
+    print(f"\nright on {sum(row['right'] for row in rows.values())} of {len(rows)} scenes")
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import torch
 from torch import Tensor
@@ -36,6 +36,13 @@ class Triples:
 
     def __len__(self) -> int:
         return len(self.index)
+
+    def spread_out(self, most: int) -> Triples:
+        """At most so many of them, evenly spread."""
+        if len(self) <= most:
+            return self
+        rows = torch.linspace(0, len(self) - 1, most, device=self.index.device).round().long()
+        return Triples(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 def steps(

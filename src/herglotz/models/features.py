@@ -99,10 +99,23 @@ def pendulums(angles: Sequence[bool]) -> list[str]:
 
 def harmonics(angles: Sequence[bool], highest: int = 2) -> list[str]:
     """Waves cos and sin of k·q, Σ|k_i| ≤ `highest`, of the angles: in the potential and in every entry of the mass."""
+    return _waves(angles, highest, highest)
+
+
+def revolute(angles: Sequence[bool]) -> list[str]:
+    """Waves cos and sin of k·q with every |k_i| ≤ 1, in the potential and in every entry of the mass.
+
+    That is exact for every chain of links in a plane, whether its angles are absolute or those between neighbours.
+    """
+    return _waves(angles, 1, len(angles))
+
+
+def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
+    """The waves of k·q with |k_i| ≤ highest and Σ|k_i| ≤ total, but those of V that the baseline has."""
     which = [i + 1 for i, angle in enumerate(angles) if angle]
     forms = []
     for k in product(range(-highest, highest + 1), repeat=len(which)):
-        if 0 < sum(map(abs, k)) <= highest and next(x for x in k if x) > 0:
+        if 0 < sum(map(abs, k)) <= total and next(x for x in k if x) > 0:
             forms.append(" + ".join(f"{x}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- "))
     waves = [f"{f}({form})" for form in forms for f in ("cos", "sin")]
     own = {f"{f}(1q{i})" for i in which for f in ("cos", "sin")}  # the baseline's
@@ -116,6 +129,7 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "central": central,
     "pendulums": pendulums,
     "harmonics": harmonics,
+    "revolute": revolute,
 }
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -31,6 +32,7 @@ class Baseline:
     low: Tensor  # (n,) lowest position
     high: Tensor  # (n,) highest
     input_map: tuple[float, ...] = ()  # (n · m) accelerations per unit of each input, row by row
+    start: Mapping[str, tuple[float, ...]] = field(default_factory=dict)  # values of parameters, where they are known
 
     @property
     def inputs(self) -> int:
@@ -38,8 +40,11 @@ class Baseline:
         return len(self.input_map) // len(self.angles)
 
 
-def estimate_baseline(data: Trajectories, *, outliers: bool = False) -> Baseline:
+def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False) -> Baseline:
     """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ + (G u)ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ + (G u)ᵢ to finite differences.
+
+    With `drag` d (affine level) there is Σⱼ dⱼ q̇ⱼ q̇ᵢ − dᵢ|q̇|²/2 as well, the motion of L = |q̇|²/2 − V + s d·q̇; a
+    constant V acts there as a force dV, so that the weight of one coordinate, −b, starts as V = −b/d.
 
     Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
     Student's t takes the place of least squares (`herglotz.training.robust`), and rows that miss grossly set no size.
@@ -65,6 +70,9 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False) -> Baseline
         columns[:, i, 2 * n] = -v[:, i]
         if data.u is not None:
             columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (data.u[t.index] + data.u[t.index + 1]) / 2
+    if drag:
+        half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
+        columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
     q = data.q
     if outliers:
         x, good = _robust(columns.cpu(), a.cpu())
@@ -80,17 +88,24 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False) -> Baseline
     # A rate from noisy differences can have either sign; start from a small damping of the right order.
     typical = min(v / s for v, s in zip(speed, scale, strict=True))
     rate = x[2 * n] if x[2 * n] > 1e-3 * typical else 1e-2 * typical
+    tilt, start = x[1 : 2 * n : 2], {}
+    if drag:
+        d = x[len(x) - n :]
+        start["damping.drag"] = tuple(d)
+        if n == 1 and not data.angles[0] and d[0] != 0:
+            start["potential.features.sum.coefficient"], tilt = (-tilt[0] / d[0],), [0.0]
     return Baseline(
         angles=tuple(data.angles),
         scale=tuple(scale),
         speed=tuple(speed),
         stiffness=tuple(x[0 : 2 * n : 2]),
-        tilt=tuple(x[1 : 2 * n : 2]),
+        tilt=tuple(tilt),
         rate=rate,
         max_step=max_step,
         low=q.amin(0),
         high=q.amax(0),
-        input_map=tuple(x[2 * n + 1 :]),
+        input_map=tuple(x[2 * n + 1 : 2 * n + 1 + n * m]),
+        start=start,
     )
 
 

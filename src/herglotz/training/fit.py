@@ -18,25 +18,27 @@ from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
 from herglotz.mechanics import legendre_minus, legendre_plus
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ContactLagrangian
 from herglotz.training.adam import adam
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.baseline_motion import fit_baseline_motion
+from herglotz.training.build import build_model, dragged
 from herglotz.training.config import FitConfig
 from herglotz.training.inputs import step_inputs
 from herglotz.training.judge import Fitted, judge, states_everywhere, with_dropped
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
+from herglotz.training.matrix_free import DENSE, MatrixFree
 from herglotz.training.residual import ResidualProblem
 from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
 from herglotz.training.stages import Stages
+from herglotz.training.structure import ROWS, nothing_told, structured
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, make_prior
 
 PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 RESTART = 7919  # between the seeds of one fit's restarts
-WIDER = 3  # a single layer reaches a tenth of the error of two in as much time
 DRAWS, HEAT = 4, 30  # draws of a single layer's weights, and the iterations after which the best of them is taken
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
@@ -79,7 +81,8 @@ def fit(
         If the data cannot be used or the settings are wrong.
     """
     started = time.perf_counter()
-    config = (config or FitConfig()).resolved(data)
+    told = config or FitConfig()
+    config = told.resolved(data)
     if not config.use_inputs:
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
@@ -87,7 +90,9 @@ def fit(
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())
-    base = estimate_baseline(kept, outliers=suspect)
+    base = estimate_baseline(kept, outliers=suspect, drag=dragged(config))
+    if nothing_told(kept, told):
+        config, base = structured(kept, base, config, NOISY)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config), resume)
     fitted = _fit_training_part(kept, base, config, stages, FREEDOM if suspect else None)
@@ -122,26 +127,26 @@ def _fit_training_part(
     size = max(base.scale)
     exact = EXACT * size if config.dtype == "float64" else 1e-5 * size
     if objective == "trajectory":
-        model = _model(base, config, "potential")
+        model = build_model(base, config, "potential")
         _, rms = _fit_residual(
             model, train, base, config, stages, "one-step start", PROBE, 0.02 * size, freedom=freedom
         )
         return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
-    model = _model(base, config, "plain" if objective == "raw" else "correction")
+    model = build_model(base, config, "plain" if objective == "raw" else "correction")
     expected = _expected(model, train, base, config, exact)
     if objective == "auto" and expected is None:
         result, rms = _fit_residual(model, train, base, config, stages, "one-step probe", PROBE, sigma=exact)
         enough = len(train.triples(base.max_step)) * train.dof >= 2 * result.x.numel()
         if rms > NOISY * size or not enough:
             sigma = rms / 6**0.5 if enough else None
-            rigid = _model(base, config, "potential")
+            rigid = build_model(base, config, "potential")
             _, rigid_rms = _fit_residual(
                 rigid, train, base, config, stages, "one-step start", PROBE, 0.02 * size, freedom=freedom
             )
             return _fit_by_trajectory(rigid, train, base, config, stages, sigma or rigid_rms / 6**0.5)
     metric = "raw" if objective == "raw" else "position"
     network = "plain" if metric == "raw" else "correction" if expected is None else "covered"
-    model = model if expected is None else _model(base, config, network)
+    model = model if expected is None else build_model(base, config, network)
     heat = min(HEAT, config.iterations // 10) if network == "covered" else 0
     tried, draws = [], DRAWS if heat else 1
     for k in range(config.restarts):
@@ -149,7 +154,7 @@ def _fit_training_part(
         heats = []
         for j in range(draws):
             if k or j:
-                model = _model(base, replace(config, seed=config.seed + (k * draws + j) * RESTART), network)
+                model = build_model(base, replace(config, seed=config.seed + (k * draws + j) * RESTART), network)
             if heat:
                 draw = _fit_residual(
                     model, train, base, config, stages, f"{name}, draw {j}", heat, exact, metric, expected=expected
@@ -220,50 +225,6 @@ def _states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
     return out
 
 
-def _model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian:
-    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone.
-
-    Where the whole range is "covered", the correction is one layer of `WIDER` times as many units.
-    """
-    width = config.correction_width if network != "potential" and config.order == 2 else 0
-    width *= WIDER if network == "covered" else 1
-    model = ContactLagrangian(
-        ModelConfig(
-            angles=base.angles,
-            level=config.level,
-            scale=base.scale,
-            speed=base.speed,
-            stiffness=base.stiffness if not config.alike else (0.0,) * len(base.angles),
-            tilt=base.tilt if not config.alike else (0.0,) * len(base.angles),
-            rate=base.rate,
-            potential_width=config.potential_width if network == "potential" and config.order == 2 else 0,
-            damping_width=config.damping_width,
-            correction_width=width,
-            correction_depth=1 if network == "covered" else 2,
-            baseline=network != "plain",
-            seed=config.seed,
-            activation=config.activation,
-            mass_width=config.mass_width if network != "plain" else 0,
-            action_width=config.action_width,
-            coulomb=config.coulomb,
-            inputs=base.inputs if config.level == "forced" else 0,
-            input_map=config.input_map,
-            input_zero=config.level == "forced" and base.inputs > 0,
-            features=config.features if network != "plain" else (),
-            known=config.known if network != "plain" else (),
-            alike=config.alike and network != "plain",
-            coupled=config.coupled,
-            order=config.order,
-        )
-    )
-    if model.inputs and not config.input_map:
-        assert model.friction is not None
-        model.friction.input_map.data.copy_(
-            torch.tensor(base.input_map, dtype=torch.float64).reshape(len(base.angles), -1)
-        )
-    return model.to(dtype=config.torch_dtype, device=config.device)
-
-
 def _fit_residual(
     model: ContactLagrangian,
     train: Trajectories,
@@ -283,13 +244,15 @@ def _fit_residual(
     if config.supervision == "q":
         problem = ResidualProblem(
             model, train, metric=metric, max_step=base.max_step, sigma=sigma, prior=prior, freedom=freedom,
-            expected=expected,
+            expected=expected, most=ROWS * prior.start.numel() if config.coupled and base.start else None,
         )  # fmt: skip
     else:
         momenta = config.supervision == "qps"
         problem = SupervisedProblem(
             model, train, momenta=momenta, max_step=base.max_step, sigma=sigma, prior=prior, freedom=freedom
         )
+    large = isinstance(problem, ResidualProblem) and not problem.coupled and len(prior.start) > DENSE
+    target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
     if config.optimiser == "adam":
         total = 20 * iterations
 
@@ -299,7 +262,7 @@ def _fit_residual(
         total = iterations
 
         def optimise(x: Tensor, callback):
-            return levenberg_marquardt(problem, x, max_iterations=total, callback=callback)
+            return levenberg_marquardt(target, x, max_iterations=total, callback=callback)
 
     result = stages.run(name, problem.start(), total, optimise)
     rms = float(problem.residuals(result.x).square().mean().sqrt())

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, cast
 
 import torch
 from torch import Tensor
@@ -14,6 +14,22 @@ from herglotz.training.distributed import everywhere, of_first
 ROUNDING = 1e-11  # a change of the cost below this, relative, is the rounding of a long sum
 
 
+class ByProducts(Protocol):
+    """A matrix JᵀJ that is known by its products (`matrix_free`)."""
+
+    def __matmul__(self, v: Tensor, /) -> Tensor:
+        """JᵀJ v."""
+        ...
+
+    def diagonal(self) -> Tensor:
+        """Its diagonal, or an estimate of it."""
+        ...
+
+    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """(JᵀJ + diag(damping))⁻¹ b, or None where there is no finite one."""
+        ...
+
+
 class LeastSquares(Protocol):
     """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, so that they may work in chunks."""
 
@@ -21,7 +37,7 @@ class LeastSquares(Protocol):
         """½|r|², a scalar; may be inf or nan where x is not admissible."""
         ...
 
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor] | tuple[Tensor, ByProducts, Tensor]:
         """(½|r|², JᵀJ, Jᵀr) at x."""
         ...
 
@@ -49,7 +65,8 @@ def levenberg_marquardt(
     """Minimise ½|r(x)|².
 
     Each iteration solves (JᵀJ + λ D) δ = −Jᵀr with D the running maximum of diag JᵀJ (Marquardt's scaling, Moré's
-    monotone version) by Cholesky; λ follows the ratio of actual to predicted decrease (Nielsen's rule).
+    monotone version) by Cholesky, or by conjugate gradients where JᵀJ is known by its products; λ follows the ratio of
+    actual to predicted decrease (Nielsen's rule).
 
     Parameters
     ----------
@@ -70,7 +87,7 @@ def levenberg_marquardt(
     OptimiserResult
         Always the best finite point; `reason` tells why the search ended.
     """
-    cost, A, b = of_first(*problem.normal_equations(x))
+    cost, A, b = _of_first(problem.normal_equations(x))
     best = float(cost)
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, best, "not_finite", 0)
@@ -90,7 +107,7 @@ def levenberg_marquardt(
             gain = (best - float(new)) / predicted
             quiet = quiet + 1 if best - float(new) <= rtol * best else 0
             x = x + step
-            cost, A, b = of_first(*problem.normal_equations(x))
+            cost, A, b = _of_first(problem.normal_equations(x))
             best = float(cost)
             history.append(best)
             scale = torch.maximum(scale, A.diagonal())
@@ -115,7 +132,22 @@ def _floored(scale: Tensor) -> Tensor:
     return scale.clamp_min(1e-10 * largest if largest > 0 else 1.0)
 
 
-def _damped_step(A: Tensor, b: Tensor, diagonal: Tensor) -> Tensor | None:
+Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
+
+
+def _of_first(equations: Equations) -> Equations:
+    """The first process's; products are the same everywhere already."""
+    cost, A, b = equations
+    if isinstance(A, Tensor):
+        return cast(Equations, of_first(cost, A, b))
+    cost, b = of_first(cost, b)
+    return cost, A, b
+
+
+def _damped_step(A: Tensor | ByProducts, b: Tensor, diagonal: Tensor) -> Tensor | None:
+    if not isinstance(A, Tensor):
+        step = A.solve(-b, diagonal)
+        return step if everywhere(step is not None) else None
     matrix = (A + torch.diag(diagonal)).double()  # squared condition numbers need float64
     factor, info = torch.linalg.cholesky_ex(matrix)
     if not everywhere(int(info) == 0):

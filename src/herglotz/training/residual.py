@@ -7,6 +7,8 @@ by shrinking M. The raw residual R_k can, and does: it is offered only so that t
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+
 import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
@@ -47,6 +49,8 @@ class ResidualProblem:
         Degrees of freedom ν of Student's t for r/σ (`robust`); None: least squares.
     expected
         Triples that were not recorded, and their standard deviation (`baseline_motion`). `residuals` leaves them out.
+    most
+        Use at most so many recorded triples, evenly spread; None: all. Where s enters the motion all are used.
     chunk
         Triples whose Jacobian is held in memory at once.
     """
@@ -62,16 +66,19 @@ class ResidualProblem:
         prior: Prior | None = None,
         freedom: float | None = None,
         expected: tuple[Triples, float] | None = None,
+        most: int | None = None,
         chunk: int = 4096,
     ):
         self.flat = FlatModel(model)
         self.data, self.metric, self.sigma, self.prior, self.chunk = data, metric, sigma, prior, chunk
         self.freedom = freedom
+        self.coupled = model.s_enters_motion
         self.triples: Triples = data.triples(max_step)
+        if most is not None and not self.coupled:
+            self.triples = self.triples.spread_out(most)
         self.expected, self.error = 0, sigma
         if expected is not None:
             self.triples, self.expected, self.error = join(self.triples, expected[0]), len(expected[0]), expected[1]
-        self.coupled = model.s_enters_motion
         self.u = step_inputs(model, data)  # (N, m)
         self.latents = len(data) if self.coupled else 0
         self.many = data.dof >= MANY and not self.coupled and metric == "position"
@@ -165,6 +172,16 @@ class ResidualProblem:
             b[:P] += prior_b
             cost = cost + prior_cost
         return cost, A, b
+
+    def pieces(self) -> Iterator[Callable[[Tensor], Tensor]]:
+        """r/σ by chunks, those of this process, as functions of the parameters; for models whose motion has no s."""
+        t, scale, (_, processes) = self.triples, self.scale, world()
+        zero = torch.zeros_like(t.h0)
+        chunk = min(self.chunk, -(-len(t) // processes))
+        for part in own_share(torch.arange(len(t), device=zero.device).split(chunk)):
+            rows = (t.q0[part], t.q1[part], t.q2[part], zero[part], t.h0[part], t.h1[part])
+            rows += self._inputs(t.index[part])
+            yield lambda theta, rows=rows, by=scale[part]: (self._local(theta, *rows) / by).reshape(-1)
 
     def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         P = len(x) - self.latents

@@ -65,6 +65,7 @@ class ShootingProblem:
         chunk: int = 4096,
     ):
         self.freedom = freedom
+        self.held = False  # the parameters are not fitted: derivatives by them are left out (as 0)
         self.flat, self.grid, self.data = FlatModel(model), grid, data
         self.sigma, self.prior, self.chunk = sigma, prior, chunk
         self.n = data.dof
@@ -235,7 +236,7 @@ class ShootingProblem:
         """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
         S, K = self.grid.h.shape
         d = self.d
-        B = self._parameter_derivatives(theta, path)[..., :d, :]
+        B = theta.new_zeros(S, K, d, self.P) if self.held else self._parameter_derivatives(theta, path)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         Z = [torch.cat([theta.new_zeros(S, d, self.P), eye], -1)]
         pad = theta.new_zeros(S, d, d)

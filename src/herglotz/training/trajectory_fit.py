@@ -65,6 +65,7 @@ class StatesOnly:
 
     def __init__(self, problem: ShootingProblem, theta: Tensor):
         self.problem, self.theta = problem, theta
+        problem.held = True
 
     def full(self, states: Tensor) -> Tensor:
         """All unknowns of the shooting problem."""

@@ -1,0 +1,118 @@
+"""Where a dictionary of features starts: the coefficients of L_d from one linear problem, without a search.
+
+L_d is linear in the coefficients x of its masses, features and friction, and so are the discrete Herglotz residual R
+and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (gauge), and a small L_d has a small R: so
+
+    Σ |J_k⁻¹ R(x)|² / Σ |J_k⁻¹ J(x)|²
+
+is minimised, J_k being the J of the round before: a generalised eigenproblem, whose smallest eigenvalue is 0 where the
+features can make the motion exactly. (With one coefficient fixed instead, the others cancel it: trap 2. A search by
+least squares from a constant mass ends in other valleys.) Noise biases it, as it does total least squares: it starts a
+fit and does not end one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.data.windows import Triples
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.jet import pairs
+from herglotz.training.flat import FlatModel
+
+LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
+          "friction.viscous", "coupling.viscous")  # fmt: skip
+ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class LinearFit:
+    """A dictionary's residuals over a set of triples, and what they say of its coefficients."""
+
+    R: Tensor  # (T, n, F) of each column of coefficient 1
+    J: Tensor  # (T, n, n, F)
+    names: tuple[str, ...]  # (F,) parameter that each column belongs to; "mass" for the constant masses
+
+    @classmethod
+    def of(cls, angles: Sequence[bool], features: Sequence[str], t: Triples) -> LinearFit:
+        """The columns of a model of order 2 with these features, coupled friction and no other damping."""
+        n = len(angles)
+        zero = (0.0,) * n
+        model = ContactLagrangian(
+            ModelConfig(angles=tuple(angles), level="forced", coupled=True, features=tuple(features), potential_width=0,
+                        stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=(1.0,) * n, rate=0.0)
+        ).to(t.q0)  # fmt: skip
+        flat = FlatModel(model)
+        which = [name for name in LINEAR if name in flat.names]
+        columns = torch.cat([flat.index(name) for name in which])
+
+        def both(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor) -> tuple[Tensor, Tensor]:
+            zero = torch.zeros_like(h0)
+            before, after = flat.partials(theta, q0, q1, zero, h0, 2), flat.partials(theta, q1, q2, zero, h1, 2)
+            p = momentum_plus(before)
+            return momentum_residual(after, p), momentum_jacobian(after, p)
+
+        derivatives = vmap(jacrev(both), (None, *(0,) * 5))
+        R, J = derivatives(flat.get(), t.q0, t.q1, t.q2, t.h0, t.h1)
+        i, j = pairs(n, t.q0.device)
+        eye = torch.eye(n, dtype=t.q0.dtype, device=t.q0.device)
+        unit = eye[:, i, None] * eye[:, j].T[None]  # (n, pairs, n), then symmetric
+        unit = torch.where((i == j)[None, :, None], unit, unit + eye[:, j, None] * eye[:, i].T[None])
+        kick = (t.q1 - t.q0) / t.h0[:, None] - (t.q2 - t.q1) / t.h1[:, None]
+        R = torch.cat([torch.einsum("apb,tb->tap", unit, kick), R[..., columns]], -1)
+        own = -unit.movedim(1, 2) / t.h1[:, None, None, None]
+        J = torch.cat([own, J[..., columns]], -1)
+        sizes = dict(zip(flat.names, flat.sizes, strict=True))
+        return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in range(sizes[name])))
+
+    def rows(self, which: Tensor) -> LinearFit:
+        """The same over some of the triples, (T,) bool."""
+        return LinearFit(self.R[which], self.J[which], self.names)
+
+    def solve(self, columns: Tensor) -> Tensor:
+        """Coefficients (F,) of unit size, zero outside `columns` (F,) bool."""
+        n = self.R.shape[1]
+        R, J = self.R[..., columns], self.J[..., columns]
+        Jk, x = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n), R.new_zeros(0)
+        for _ in range(ROUNDS):
+            inverse = torch.linalg.pinv(Jk)
+            top = (inverse @ R).flatten(0, 1)
+            bottom = torch.einsum("tij,tjkf->tikf", inverse, J).flatten(0, 2)
+            size = bottom.square().sum(0).add(top.square().sum(0)).sqrt()
+            size = size.clamp_min(1e-12 * float(size.max()))
+            # All of R and J in one thin factor: R = Q₁ U, J = Q₂ U with Q₁ᵀQ₁ + Q₂ᵀQ₂ = 1; x = U⁻¹ y, least |Q₁ y|.
+            Q, U = torch.linalg.qr(torch.cat([top, bottom]) / size)
+            y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
+            x = torch.linalg.lstsq(U, y[:, None]).solution[:, 0] / size
+            Jk = J @ x
+        out = self.R.new_zeros(len(self.names))
+        out[columns] = x
+        return out
+
+    def errors(self, x: Tensor) -> Tensor:
+        """J⁻¹R of every triple at the coefficients x, (T, n), in units of q; inf where J is singular."""
+        r, info = torch.linalg.solve_ex(self.J @ x, self.R @ x)
+        return torch.where((info != 0)[:, None], torch.inf, r).nan_to_num(nan=torch.inf)
+
+    def start(self, x: Tensor) -> dict[str, Tensor] | None:
+        """Starting values by the name of the parameter, the first mass being 1; None where no mass matrix fits."""
+        n = self.R.shape[1]
+        i, j = pairs(n, x.device)
+        mass = x.new_zeros(n, n)
+        mass[i, j] = mass[j, i] = x[: len(i)]
+        if float(mass[0, 0]) == 0:
+            return None
+        factor, info = torch.linalg.cholesky_ex(mass / mass[0, 0])
+        if int(info):
+            return None
+        a, b = torch.tril_indices(n, n, -1, device=x.device)
+        values = {"kinetic.base.log_diagonal": factor.diagonal()[1:].log(), "kinetic.base.off_diagonal": factor[a, b]}
+        for name in dict.fromkeys(self.names[len(i) :]):
+            values[name] = x[[k for k, other in enumerate(self.names) if other == name]] / mass[0, 0]
+        return values

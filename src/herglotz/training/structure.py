@@ -1,0 +1,140 @@
+"""What two or three joints are made of, where nobody says it: a mass that depends on the angles, or a constant one.
+
+Every planar chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary
+`revolute` (`herglotz.models.features`). Both structures are solved as linear problems (`linear_start`) without a fifth
+of the data at a time; the richer one is taken where it predicts that fifth better, beyond the spread of the fifths. A
+short one-step fit then leaves out the features that the data do not need, and tells noise from what the rule lacks.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models.features import revolute
+from herglotz.training.baseline import Baseline
+from herglotz.training.build import build_model
+from herglotz.training.config import FitConfig
+from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
+from herglotz.training.distributed import of_first
+from herglotz.training.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.linear_start import LinearFit
+from herglotz.training.pruning import prune
+from herglotz.training.residual import ResidualProblem
+from herglotz.training.trajectory_fit import make_prior
+
+MOST = 3  # coordinates: the dictionary's size grows as 3ⁿ n²
+TRIPLES, ENOUGH = 4000, 5  # triples that tell the structures apart; residuals a coefficient, at least
+THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shorter ones
+ROWS = 50  # residuals a coefficient that the one-step fit takes
+BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks
+KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
+
+
+def nothing_told(data: Trajectories, told: FitConfig) -> bool:
+    """Whether the structure of these data is left to `structured`: joints without motors, and no word about them."""
+    free = told.level == "auto" and not (told.features or told.known or told.alike or told.mass_width or told.coulomb)
+    plain = told.order == 2 and told.objective != "raw" and told.supervision == "q" and told.optimiser == "lm"
+    driven = data.u is not None and told.use_inputs
+    return free and plain and not driven and 1 < data.dof <= MOST and any(data.angles)
+
+
+def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: float) -> tuple[FitConfig, Baseline]:
+    """Settings and starting values with the structure that the data show; unchanged where they show none.
+
+    Parameters
+    ----------
+    data
+        What is trained on.
+    base
+        The first look at it.
+    config
+        Settings of the fit.
+    noisy
+        One-step error, relative to the size of the motion, above which it is noise.
+    """
+    names = tuple(revolute(data.angles))
+    found = _linear(data, base, names)
+    if found is None:
+        return config, base
+    every, fit = found
+    constant = torch.tensor([name != KINETIC for name in fit.names])
+    x, poor, good = of_first(
+        fit.solve(torch.ones_like(constant)), _held_out(fit, constant), _held_out(fit, torch.ones_like(constant))
+    )
+    start, held_out = fit.start(x), {0.0: poor, 1.0: good}
+    if start is None or simplest_not_beaten(held_out) == 0.0:
+        return config, base
+    base = _with(base, {name: tuple(values.tolist()) for name, values in start.items()})
+    rich = replace(config, level="forced", coupled=True, features=names, order=4)
+    base, kept, rms = _short_fit(data.thinned(every), base, rich, every * base.max_step)
+    if not any("v" in name for name in kept):
+        return config, base
+    rich = replace(rich, features=kept)
+    if rms > noisy * max(base.scale):
+        return replace(rich, order=2, objective="trajectory"), base
+    if rms > BETTER * float(fit.errors(x).square().mean().sqrt()):
+        return replace(rich, order=2), base  # and a correction network for the rest
+    return replace(rich, objective="residual" if config.objective == "auto" else config.objective), base
+
+
+def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit] | None:
+    """The thinning whose one-step errors are least beside the motion's curvature, and the linear problem there."""
+    best: tuple[float, int, LinearFit] | None = None
+    for every in THINNED:
+        t = data.thinned(every).triples(every * base.max_step).spread_out(TRIPLES)
+        if len(t) * data.dof < ENOUGH * (len(names) + data.dof**2):
+            break
+        fit = LinearFit.of(data.angles, names, t)
+        x = fit.solve(torch.ones(len(fit.names), dtype=torch.bool))
+        moved = t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)
+        score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
+        if best is None or score < best[0]:
+            best = score, every, fit
+    return None if best is None else best[1:]
+
+
+def _held_out(fit: LinearFit, columns: Tensor) -> Tensor:
+    """RMS of each fold's one-step errors at the coefficients that the others give, (FOLDS,)."""
+    fold = torch.arange(len(fit.R), device=fit.R.device) * FOLDS // len(fit.R)
+    rest = [(fit.rows(fold == k), fit.rows(fold != k).solve(columns)) for k in range(FOLDS)]
+    return torch.stack([own.errors(x).square().mean().sqrt() for own, x in rest]).cpu()
+
+
+def _short_fit(
+    data: Trajectories, base: Baseline, config: FitConfig, max_step: float
+) -> tuple[Baseline, tuple[str, ...], float]:
+    """Starting values, the features that stay and the one-step error of a short fit of order 4."""
+    model, n = build_model(base, config, "potential"), data.dof
+    prior = make_prior(model, base, None)
+    most = ROWS * prior.start.numel() // n
+    problem = ResidualProblem(model, data, max_step=max_step, sigma=1e-6 * max(base.scale), prior=prior, most=most)
+    result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
+    r = problem.residuals(result.x)
+    _, A, _ = problem.normal_equations(result.x)
+    moving, still = problem.flat.index(KINETIC), problem.flat.index(POTENTIAL)[2 * n :]
+    features = [name for name in config.features if "v" not in name] + [name for name in config.features if "v" in name]
+    named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
+    relative = A * problem.sigma**2 / r.square().mean()
+    kept, x = prune(relative, result.x, torch.cat([still, moving]), r.numel())
+    values = {name: tuple(x[problem.flat.index(name)].tolist()) for name in problem.flat.names}
+    own = values[POTENTIAL][: 2 * n]  # −k, b of each angle; k/2, b of the others
+    turn = [-1.0 if angle else 2.0 for angle in data.angles]
+    values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
+    values["potential.tilt"] = own[1::2]
+    stay = set(kept.tolist())
+    for name, where in ((KINETIC, moving), (POTENTIAL, still)):
+        values[name] = tuple(float(x[i]) for i in where.tolist() if i in stay)
+    return _with(base, values), tuple(named[i] for i in kept.tolist()), float(r.square().mean().sqrt())
+
+
+def _with(base: Baseline, values: dict[str, tuple[float, ...]]) -> Baseline:
+    """The baseline with these starting values by parameter; its own three under their names."""
+    rest = {k: v for k, v in values.items() if v and k not in ("potential.stiffness", "potential.tilt", "damping.rate")}
+    return replace(
+        base, stiffness=values["potential.stiffness"], tilt=values["potential.tilt"],
+        rate=values.get("damping.rate", (0.0,))[0], start=rest,
+    )  # fmt: skip
