@@ -29,7 +29,8 @@ class FitConfig:
     level
         "conservative" (no damping), "linear" (one damping rate), "affine" (damping depends on position and velocity),
         "full" (on s as well; s at the start is unknown, so fit several seeds) or "forced" (one rate, and friction of
-        each joint). "auto": "forced" with dry friction where inputs u are recorded, else "linear".
+        each joint). "auto": "forced" with dry friction where inputs u are recorded, else "linear"; and for two or three
+        coordinates with an angle among them, where nothing is told, what the data say (`herglotz.training.structure`).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
         "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
@@ -78,7 +79,7 @@ class FitConfig:
         units in which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
     features
         What L may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, `"(q2 - q1)^4 + (q3 - q2)^4"`, or one
-        of the names chain, sites, central, pendulums, harmonics. Each has one coefficient, learned. See
+        of the names chain, sites, central, pendulums, harmonics, revolute. Each has one coefficient, learned. See
         `herglotz.models.features`.
     known
         What is known of L, the same way, with its numbers (the first mass is 1); nothing of it is learned.
