@@ -91,3 +91,9 @@ def check_alike(sets: Sequence[Trajectories]) -> None:
             raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
         if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
             raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")
+
+
+def leading_rows(data: Trajectories, lengths: Sequence[int]) -> Tensor:
+    """Rows of the first `lengths[b]` samples of every trajectory b."""
+    spans = [torch.arange(first, first + k) for first, k in zip(data.offsets, lengths, strict=True)]
+    return torch.cat(spans).to(data.t.device)

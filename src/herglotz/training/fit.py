@@ -16,6 +16,7 @@ from torch import Tensor
 import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes, without
+from herglotz.data.splits import leading_rows
 from herglotz.data.windows import Triples
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian
@@ -97,10 +98,13 @@ def fit(
     stages = Stages(progress, checkpoint, _key(data, config), resume)
     fitted = _fit_training_part(kept, base, config, stages, FREEDOM if suspect else None)
     fitted = replace(fitted, states=with_dropped(fitted, train, dropped))
+    if fitted.used is not None:
+        dropped[~dropped] = ~fitted.used
     states, status = states_everywhere(fitted, data, train.lengths, base.max_step)
     metrics = judge(fitted, data, train, dropped, states, base, config.robust != "off")
     metrics |= {
         "extrapolation_status": status,
+        "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
         "seconds": round(time.perf_counter() - started, 3),
         "seed": config.seed,
         "level": config.level,
@@ -195,7 +199,8 @@ def _fit_by_trajectory(
     held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
     notes = {"departure": found.departure, "held_out_rms": held_out, "reason": found.result.reason}
     notes |= {"robust": found.problem.freedom is not None, "segment_steps": found.problem.grid.longest}
-    return Fitted(model, _fitted_states(found), "trajectory", found.sigma, notes | {"follows_data": True})
+    notes["follows_data"] = True
+    return Fitted(model, _fitted_states(found), "trajectory", found.sigma, notes, found.problem.used)
 
 
 def _fitted_states(found: TrajectoryFit) -> Tensor:

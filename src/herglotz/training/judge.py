@@ -29,6 +29,7 @@ class Fitted:
     objective: str
     sigma: float
     notes: dict[str, Any]
+    used: Tensor | None = None  # (N_train,) samples that were not found to be outliers; None: all
 
 
 def with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ FREEDOM = 4.0  # ν: 96 % of the normal distribution's efficiency where the resi
 TAIL = 5.0  # residuals beyond so many robust standard deviations are outliers: 6e-7 of normal ones are
 SHARE = 3e-3  # share of outliers above which residuals count as heavy-tailed,
 FAR = 10.0  # or one that is so far out
+FEW = 0.05  # share of samples that may be left out one by one; more, and only a heavy-tailed loss is honest
 MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 
 
@@ -36,6 +37,11 @@ def root_weights(r: Tensor, freedom: float | None) -> Tensor:
 def scale_of(r: Tensor) -> float:
     """Standard deviation of the bulk of r, from its median absolute value."""
     return MAD * float(r.abs().median())
+
+
+def far_out(r: Tensor) -> Tensor:
+    """Which rows of r, (N, n), hold an outlier of the scale of all of it, (N,) bool."""
+    return (r.abs() > TAIL * scale_of(r)).any(-1)
 
 
 def heavy_tailed(r: Tensor) -> bool:

@@ -46,6 +46,8 @@ class ShootingProblem:
         Penalty on the parameters.
     freedom
         Degrees of freedom ν of Student's t for the residuals of data and joints (`robust`); None: least squares.
+    used
+        (N,) which samples have a say; all without it. The others are outliers that were found.
     s
         (N,) s at every sample in the model's unit, where it is known: trajectories start from it, not from about 0.
     chunk
@@ -61,6 +63,7 @@ class ShootingProblem:
         sigma: float,
         prior: Prior | None = None,
         freedom: float | None = None,
+        used: Tensor | None = None,
         s: Tensor | None = None,
         chunk: int = 4096,
     ):
@@ -71,6 +74,8 @@ class ShootingProblem:
         self.n = data.dof
         u = step_inputs(model, data)
         self.u = None if u is None else u[grid.row]  # (S, K, m)
+        self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
+        self.weight = self.used[grid.sample].to(data.q)[:, None]  # (N', 1)
         # s is an unknown only where the positions depend on it.
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
         self.P = len(self.flat.get())
@@ -135,7 +140,7 @@ class ShootingProblem:
         Z = self.sensitivities(theta, path)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
         cost = loss(fit, self.freedom) + loss(joints, self.freedom)
-        by_fit, by_joint = root_weights(fit, self.freedom), root_weights(joints, self.freedom)
+        by_fit, by_joint = self.weight * root_weights(fit, self.freedom), root_weights(joints, self.freedom)
         fit, joints = by_fit * fit, by_joint * joints
         S = grid.segments
         A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
@@ -162,22 +167,31 @@ class ShootingProblem:
         return cost, A, b
 
     def states_at(self, path: Path, samples: Tensor) -> Tensor:
-        """The fitted state (…, d) at recorded samples: where the segments of the next stage start."""
+        """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
+
+        At a joint it is the start of the later segment: across a broken one the end of the earlier is somewhere else.
+        """
         rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
         rows[self.grid.sample] = self.grid.node
+        first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
+        rows[self.grid.start_sample] = first
         return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
 
     def misfit(self, path: Path) -> Tensor:
         """q_model − q_data at every sample, (N', n), in units of q."""
         return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
 
+    def joint_residuals(self, path: Path) -> Tensor:
+        """End of each segment less the start of the next, (S, d), over the joint's weight."""
+        return self._residuals(path.x)[1]
+
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
 
-        With a robust loss both carry the square roots of the weights.
+        Both carry the square roots of the weights: those of a robust loss, and 0 for samples that are not used.
         """
         r = self.misfit(path) / self.sigma
-        by = root_weights(r, self.freedom)
+        by = self.weight * root_weights(r, self.freedom)
         Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] * (by / self.sigma)[..., None]
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
@@ -189,7 +203,8 @@ class ShootingProblem:
 
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
-        fit = (x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]) / self.sigma
+        miss = x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+        fit = self.weight * miss / self.sigma
         before = self.grid.joined_to.clamp_min(0)
         ends = x[before, self.grid.end[before], : self.d]
         joints = (ends - x[:, 0, : self.d]) / self.joint_weight

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -18,7 +19,7 @@ from herglotz.training.grid import segment_grid
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.lifted import Path
 from herglotz.training.prior import Prior
-from herglotz.training.robust import FREEDOM, MAD, heavy_tailed, root_weights, scale_of
+from herglotz.training.robust import FAR, FEW, FREEDOM, MAD, far_out, heavy_tailed, root_weights, scale_of
 from herglotz.training.shooting import ShootingProblem
 from herglotz.training.stages import Stages
 
@@ -51,8 +52,8 @@ class _Stage:
 
     @property
     def misfit(self) -> Tensor:
-        """Residuals of the data, (N', n), in units of q."""
-        return self.problem.misfit(self.path)
+        """Residuals of the data that are used, (N', n), in units of q."""
+        return self.problem.misfit(self.path)[self.problem.used[self.problem.grid.sample]]
 
     @property
     def noise(self) -> float:
@@ -115,10 +116,11 @@ def fit_trajectories(
     """Fit parameters and states to positions (or, `frozen`, the states alone).
 
     Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
-    the states of the one before. With `robust` "auto" the first stage is fitted with Student's t as well, and where
-    that leaves outliers it is the loss of all further stages (`herglotz.training.robust`). Then every
-    prior strength is fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted
-    with. The strongest prior whose held-out error is not beaten beyond its spread wins.
+    the states of the one before. With `robust` "auto" the first stage is fitted with Student's t as well. Where that
+    shows outliers, and they are few, they are left out and least squares go on with the rest; where the rest has
+    outliers still, or they are many, Student's t is the loss of all further stages (`herglotz.training.robust`). Then
+    every prior strength is fitted in turn, the weakest first: its residuals give the noise that all strengths are
+    fitted with. The strongest prior whose held-out error is not beaten beyond its spread wins.
 
     Returns
     -------
@@ -129,20 +131,22 @@ def fit_trajectories(
         departures = departures[:1]
     theta, exact = FlatModel(model).get(), 1e-6 * max(base.scale)
 
-    def stage(length: int, sigma: float, freedom: float | None, before: _Stage | None) -> _Stage | None:
+    def stage(
+        length: int, sigma: float, freedom: float | None, before: _Stage | None, used: Tensor | None = None
+    ) -> _Stage | None:
         grid = segment_grid(data, length, base.max_step)
         prior = make_prior(model, base, departures[0])
-        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, s=s)
+        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, used=used, s=s)
         if before is None:
             start, states = theta, _first_states(problem, theta)
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
-        name = f"segments of {length}" + (", robust" if freedom else "")
+        name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
         result, found = _optimise(problem, start, states, name, iterations, stages, frozen)
         path = problem.solve(problem.pack(found, result.x[-states.numel() :].reshape(states.shape)))
         return None if path is None or not math.isfinite(result.cost) else _Stage(found, problem, path, result)
 
-    freedom = FREEDOM if robust == "on" else None
+    freedom, used = (FREEDOM if robust == "on" else None), None
     lengths = segment_lengths(data)
     last = stage(lengths[0], sigma, freedom, None)
     if last is None:
@@ -150,18 +154,37 @@ def fit_trajectories(
     if robust == "auto" and not frozen:  # outliers stand out best where segments are short
         trial = stage(lengths[0], max(scale_of(last.misfit), 1e-3 * exact), FREEDOM, None)
         if trial is not None and heavy_tailed(trial.misfit):
-            last, freedom = trial, FREEDOM
+            rest = _without_outliers(trial, lambda sigma, used: stage(lengths[0], sigma, None, trial, used))
+            last, freedom, used = (trial, FREEDOM, None) if rest is None else (rest, None, rest.problem.used)
     best = last.noise
     for length in lengths[1:]:
         if not frozen:
             sigma = last.noise if freedom else max(sigma, last.noise)
-        longer = stage(length, sigma, freedom, last)
+        longer = stage(length, sigma, freedom, last, used)
         if longer is None or (not frozen and longer.noise > LOST * max(best, exact)):
             break  # no parameters follow the data for so long: chaos, or forces that the model does not know
         last, best = longer, min(best, longer.noise)
     if frozen:
         return TrajectoryFit(last.theta, last.problem, last.path, sigma, None, {}, last.result)
     return _choose_departure(model, data, base, departures, iterations, stages, last)
+
+
+def _without_outliers(trial: _Stage, again: Callable[[float, Tensor], _Stage | None]) -> _Stage | None:
+    """The same segments by least squares without the samples far from the robust fit; None if outliers remain.
+
+    A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least squares,
+    Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
+    """
+    problem = trial.problem
+    out = far_out(trial.misfit)
+    if float(out.double().mean()) > FEW:
+        return None
+    used = torch.ones_like(problem.used)
+    used[problem.grid.sample[out]] = False
+    rest = again(trial.noise, used)
+    if rest is None or heavy_tailed(rest.misfit) or float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR:
+        return None
+    return rest
 
 
 def _choose_departure(
@@ -183,7 +206,9 @@ def _choose_departure(
     for number, departure in enumerate([weakest, *sorted(departures, reverse=True)]):
         sigma = _noise(previous.problem, previous.path) if number <= 1 else previous.sigma
         prior = make_prior(model, base, departure)
-        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=last.problem.freedom)
+        problem = ShootingProblem(
+            model, data, grid, sigma=sigma, prior=prior, freedom=last.problem.freedom, used=last.problem.used
+        )
         problem.path = previous.path
         states = problem.states_at(previous.path, grid.start_sample)
         name = f"prior {departure:g}" if number else "noise"
@@ -261,6 +286,6 @@ def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 def _noise(problem: ShootingProblem, path: Path) -> float:
     """Scale of the residuals, in units of q: their RMS, weighted where the loss is robust."""
-    misfit = problem.misfit(path)
+    misfit = problem.misfit(path)[problem.used[problem.grid.sample]]
     weighted = misfit * root_weights(misfit / problem.sigma, problem.freedom)
     return float(weighted.square().mean().sqrt())

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes, without
+from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
@@ -25,7 +26,8 @@ from herglotz.training.lifted import Path
 from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run
 from herglotz.training.shooting import ShootingProblem
-from herglotz.training.trajectory_fit import make_prior
+from herglotz.training.stages import Stages
+from herglotz.training.trajectory_fit import fit_trajectories, make_prior
 
 
 @dataclass(frozen=True)
@@ -75,16 +77,20 @@ class Laplace:
     def __init__(self, run: Run):
         self.run = run
         data = run.data.unwrapped()
-        train = _first(data, run.train_lengths)
+        rows = leading_rows(data, run.train_lengths)
+        out = torch.zeros(data.samples, dtype=torch.bool)
+        out[run.metrics.get("outlier_samples", [])] = True
+        train, out = _first(data, run.train_lengths), out[rows]
         if run.config.robust != "off":
-            train = without(train, spikes(train))
+            lone = spikes(train)
+            train, out = without(train, lone), out[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
         self.base = estimate_baseline(train, outliers=found)
         self.sigma = float(run.metrics["sigma"])
         departure = run.metrics.get("departure") or run.config.departures[-1]
         self.prior = make_prior(run.model, self.base, departure)
-        self.problem, self.path = self._solved(train, _starts(run))
+        self.problem, self.path = self._solved(train, _starts(run), ~out)
         self.theta = self.problem.flat.get()
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         _, A, _ = self.problem.normal_equations(x)
@@ -98,16 +104,56 @@ class Laplace:
 
         First order in the unknowns: dq_k = Z_k d(θ, start), with Z through every implicit step.
         """
-        data = self.run.data.unwrapped()
-        whole, path = self._solved(data, self.path.x[:, 0])
+        data, P, d = self.run.data.unwrapped(), len(self.theta), self.problem.d
+        own = [torch.cat([torch.arange(P), torch.arange(P + b * d, P + (b + 1) * d)]) for b in range(len(data))]
+        return self._bands(data, self.path.x[:, 0], [self.covariance[i[:, None], i[None, :]] for i in own])
+
+    def predict(self, data: Trajectories, seen: int) -> Bands:
+        """Bands on trajectories that the fit has not seen: their first `seen` samples give the start, the rest follows.
+
+        The start x of each is fitted to those samples with θ held. With JᵀJ of that fit in blocks, and C the covariance
+        of θ, x has the derivative G = −A_xx⁻¹ A_xθ by θ, and (θ, x) the covariance [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
+
+        Parameters
+        ----------
+        data
+            Trajectories of the same system (coordinates, units, inputs), each of more than `seen` samples.
+        seen
+            Samples at the beginning of each that are used, 3 or more; bands there are those of a fit.
+
+        Raises
+        ------
+        InputError
+            If a trajectory is shorter, or the model cannot follow its beginning.
+        """
+        data, where = data.unwrapped(), data.source or "data"
+        if data.angles != self.run.data.angles:
+            raise InputError(f"{where}: {data.dof} coordinate(s) with angles {data.angles}; the run's are other ones")
+        if not 3 <= seen < min(data.lengths):
+            raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
+        head = _first(data, (seen,) * len(data))
+        settings = self.run.config.departures[:1], 1, Stages(False, None, "", resume=False)
+        found = fit_trajectories(self.run.model, head, self.base, self.sigma, *settings, frozen=True)
+        if found is None or found.problem.grid.segments > len(data):
+            raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
+        problem, P, d = found.problem, len(self.theta), self.problem.d
+        start = found.path.x[:, 0]
+        _, A, _ = problem.normal_equations(problem.pack(self.theta, start[:, :d]))
+        C, joint = self.covariance[:P, :P], []
+        for own in torch.arange(P, len(A)).split(d):
+            inverse = torch.linalg.pinv(A[own[:, None], own[None, :]].double(), hermitian=True)
+            G = torch.cat([torch.eye(P).to(C), -inverse @ A[own, :P].double()])
+            S = G @ C @ G.T
+            S[P:, P:] += inverse * self.inflation**2
+            joint.append(S)
+        return self._bands(data, start, joint)
+
+    def _bands(self, data: Trajectories, start: Tensor, joint: list[Tensor]) -> Bands:
+        """Runs from `start`, (B, 2n+1), with a covariance of (θ, start) for each, (P + d, P + d)."""
+        whole, path = self._solved(data, start)
         with torch.no_grad():
             Z = whole.sensitivities(self.theta, path)[..., : whole.n, :].double()  # (B, K+1, n, P + d)
-            P, d = len(self.theta), whole.d
-            variance = Z.new_zeros(Z.shape[:-1])
-            for b in range(len(Z)):
-                own = torch.cat([torch.arange(P), torch.arange(P + b * d, P + (b + 1) * d)])
-                C = self.covariance[own[:, None], own[None, :]]
-                variance[b] = ((Z[b] @ C) * Z[b]).sum(-1)
+            variance = torch.stack([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
         grid = whole.grid
         q, std = data.q.new_empty(data.q.shape), data.q.new_empty(data.q.shape)
         q[grid.sample] = path.x[..., : whole.n].flatten(0, 1)[grid.node]
@@ -145,10 +191,12 @@ class Laplace:
             found.append(Direction(float(reductions[k].clamp(0, 1).sqrt()), parts))
         return found
 
-    def _solved(self, data: Trajectories, start: Tensor) -> tuple[ShootingProblem, Path]:
+    def _solved(self, data: Trajectories, start: Tensor, used: Tensor | None = None) -> tuple[ShootingProblem, Path]:
         """Each trajectory as one segment, solved from its start state (B, 2n+1)."""
         grid = segment_grid(data, max(data.lengths), self.base.max_step)
-        problem = ShootingProblem(self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom)
+        problem = ShootingProblem(
+            self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom, used=used
+        )
         theta = problem.flat.get()
         path = problem.solve(problem.pack(theta, start[:, : problem.d]))
         if path is None:
@@ -161,11 +209,12 @@ def laplace(run: Run) -> Laplace:
     return Laplace(run)
 
 
-def ensemble_bands(runs: Sequence[Run]) -> Bands:
+def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: int = 20) -> Bands:
     """The mean prediction of fits from several seeds to the same data, with their spread.
 
     By the law of total variance the variance of the position is the mean of the fits' Laplace variances plus the
     variance of their predictions: what one posterior sees around its own minimum, and how far apart the minima are.
+    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`).
 
     Raises
     ------
@@ -176,7 +225,7 @@ def ensemble_bands(runs: Sequence[Run]) -> Bands:
         raise InputError(f"an ensemble needs two runs or more, got {len(runs)}; fit other seeds")
     if len({(run.data.digest(), run.train_lengths) for run in runs}) > 1:
         raise InputError("the runs of an ensemble must be fits to the same data; only their seeds may differ")
-    bands = [laplace(run).bands() for run in runs]
+    bands = [laplace(run).bands() if data is None else laplace(run).predict(data, seen) for run in runs]
     q, std = torch.stack([b.q for b in bands]), torch.stack([b.std for b in bands])
     sigma = (sum(b.sigma**2 for b in bands) / len(bands)) ** 0.5
     return Bands(q.mean(0), (std.square().mean(0) + q.var(0)).sqrt(), sigma)
@@ -184,7 +233,7 @@ def ensemble_bands(runs: Sequence[Run]) -> Bands:
 
 def _first(data: Trajectories, lengths: tuple[int, ...]) -> Trajectories:
     """The leading samples of each trajectory."""
-    index = torch.cat([torch.arange(f, f + k) for f, k in zip(data.offsets, lengths, strict=True)])
+    index = leading_rows(data, lengths)
     u = None if data.u is None else data.u[index]
     return replace(data, t=data.t[index], q=data.q[index], s=None, p=None, u=u, lengths=lengths)
 

@@ -91,6 +91,46 @@ def test_more_noise_means_wider_bands():
     assert 3 < widths[1] / widths[0] < 30
 
 
+def test_prediction_from_the_beginning_is_the_posterior(posteriors):
+    # fails if the start's dependence on the parameters is left out or has the wrong sign: with what the fit has seen,
+    # the two blocks of the posterior come back by the inverse of a block matrix
+    run, posterior, _ = posteriors[0]
+    (trained,) = set(run.train_lengths)
+    own, again = posterior.bands(), posterior.predict(run.data, trained)
+    torch.testing.assert_close(again.q, own.q, rtol=0, atol=0.03 * NOISE)  # the fit stops at 1e-4 of its cost
+    torch.testing.assert_close(again.std, own.std, rtol=0.01, atol=0)
+
+
+def test_what_cannot_be_predicted_is_named(posteriors):
+    # fails if nothing is left to predict, or another system is taken for the run's
+    run, posterior, _ = posteriors[0]
+    with pytest.raises(InputError, match="seen must be from 3 to 90 samples, got 91"):
+        posterior.predict(run.data, 91)
+    other = simulate(scene("damped_oscillator"), trajectories=1, steps=40, h=0.2, seed=0)
+    with pytest.raises(InputError, match="the run's are other ones"):
+        posterior.predict(other, 20)
+
+
+@pytest.mark.slow
+def test_bands_cover_held_out_trajectories():
+    # fails if bands from unseen starts are too narrow or too wide, for a sample or for the true position
+    shares = []
+    for seed in range(5):
+        data = simulate(scene("damped_pendulum"), trajectories=12, steps=60, h=0.2, noise=NOISE, seed=seed)
+        posterior = laplace(fit(data, FitConfig(train_fraction=1.0, seed=seed), progress=False))
+        noisy, clean = (
+            simulate(
+                scene("damped_pendulum"), trajectories=20, steps=119, h=0.2, noise=noise, seed=seed + 500
+            ).unwrapped()
+            for noise in (NOISE, 0.0)
+        )
+        bands, ahead = posterior.predict(noisy, 20), torch.arange(noisy.samples) % 120 >= 20
+        low, high = bands.interval(0.9, measured=False)
+        true = (clean.q >= low) & (clean.q <= high)
+        shares.append([float(x[ahead].double().mean()) for x in (bands.inside(noisy.q), true)])
+    assert all(0.80 <= share <= 0.97 for seed in shares for share in seed), shares
+
+
 def test_the_level_is_checked(posteriors):
     # fails if a percentage is taken for a share
     with pytest.raises(InputError, match="between 0 and 1"):
