@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 DESCRIPTION = """\
 Measure how far a run can be trusted: standard deviations of its physical parameters, bands on its prediction with the
-share of held-out samples that really lie inside, and the parameter combinations that the data do not determine.
+share of held-out samples that really lie inside, and the parameters that the data cannot tell apart.
 Draws bands.png in RUN.
 
 examples:
@@ -22,7 +22,6 @@ examples:
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
-PHYSICAL = ("kinetic.", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag", "force")
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -41,7 +40,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, draw, report."""
-    from herglotz.training import ensemble_bands, laplace, load_run
+    from herglotz.training import ensemble_bands, laplace, load_run, traded
 
     result = load_run(arguments.source)
     folder = arguments.out or arguments.source
@@ -64,8 +63,11 @@ def run(arguments: argparse.Namespace) -> int:
         "not_determined": [
             {"reduction": d.reduction, "parts": dict(d.parts)}
             for d in posterior.least_identified()
-            if d.reduction > 0.9
+            if d.reduction > UNKNOWN
         ],
+        "traded": [{"index": t.index, "parts": dict(t.parts), "words": str(t)} for t in traded(posterior)],
+        "effective_parameters": posterior.effective_parameters(),
+        "all_parameters": len(posterior.theta),
     }
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(plot_bands(result, bands, arguments.level), folder / "bands.png")
@@ -79,6 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
 def _physical(posterior: Laplace, result: Run) -> dict[str, list[list[float]]]:
     """Value and standard deviation of every entry of the parameters that have a meaning of their own."""
     import torch
+
+    from herglotz.training.identifiability import PHYSICAL
 
     std = posterior.standard_deviations()
     return {
@@ -97,10 +101,13 @@ def _report(numbers: dict[str, Any], figure: Path) -> None:
     rows.append(("noise of a sample", f"{numbers['noise']:.3g}; held-out blocks of time miss {worse} times as much"))
     for name, entries in numbers["parameters"].items():
         rows.append((name, ", ".join(f"{value:.5g} ± {std:.2g}" for value, std in entries)))
+    worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
+    rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
     print_table(rows)
-    lost = numbers["not_determined"]
-    if lost:
-        print(f"Not determined by these data: {len(lost)} or more directions, mostly of")
-        for direction in lost:
-            print("  " + ", ".join(f"{name} ({100 * share:.0f} %)" for name, share in direction["parts"].items()))
+    if numbers["traded"]:
+        print("What these data cannot tell apart (record other motions, or give one of them):")
+        for trade in numbers["traded"]:
+            print(f"  {trade['words']}")
+    else:
+        print("Each parameter above is determined on its own: none can be traded for another.")
     print(f"Figure: {figure}")

@@ -3,6 +3,7 @@
 from herglotz.training.adam import adam
 from herglotz.training.config import FitConfig
 from herglotz.training.fit import fit
+from herglotz.training.identifiability import Trade, traded
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.prior import Prior
 from herglotz.training.residual import ResidualProblem
@@ -25,6 +26,7 @@ __all__ = [
     "ShootingProblem",
     "Smoothed",
     "SupervisedProblem",
+    "Trade",
     "adam",
     "ensemble_bands",
     "fit",
@@ -34,4 +36,5 @@ __all__ = [
     "save_run",
     "select",
     "smooth",
+    "traded",
 ]

@@ -29,6 +29,8 @@ from herglotz.training.shooting import ShootingProblem
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import fit_trajectories, make_prior
 
+NULL = 1e-13  # eigenvalue, relative to the largest, that rounding leaves of a null direction
+
 
 @dataclass(frozen=True)
 class Bands:
@@ -97,7 +99,8 @@ class Laplace:
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         held_out = float(errors.square().mean().sqrt())
         self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
-        self.covariance = torch.linalg.pinv(A.double(), hermitian=True) * self.inflation**2
+        self.information = A.double()  # prior included
+        self.covariance = _inverse(self.information) * self.inflation**2
 
     def bands(self) -> Bands:
         """The run's prediction at every sample with its standard deviation, held-out part included.
@@ -165,6 +168,18 @@ class Laplace:
         P = len(self.theta)
         return self.problem.flat.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
 
+    def names(self) -> list[str]:
+        """Every entry of the parameters θ by name: `damping.rate`, `potential.network.weights.0[3]`."""
+        flat = self.problem.flat
+        every = zip(flat.names, flat.sizes, strict=True)
+        return [name if size == 1 else f"{name}[{i}]" for name, size in every for i in range(size)]
+
+    def effective_parameters(self) -> float:
+        """How many of the parameters the data determine: P − tr(C A_prior) (MacKay 1992)."""
+        P = len(self.theta)
+        _, prior, _ = self.prior.normal_equations(self.theta)
+        return P - float((self.covariance[:P, :P] / self.inflation**2 * prior.double()).sum())
+
     def least_identified(self, count: int = 5) -> list[Direction]:
         """The parameter combinations that the data determine least, the worst first.
 
@@ -177,12 +192,7 @@ class Laplace:
         root = vectors * values.clamp_min(values.max() * 1e-14).sqrt()  # prior = root rootᵀ
         posterior = self.covariance[:P, :P] / self.inflation**2
         reductions, directions = torch.linalg.eigh(root.T @ posterior @ root)
-        names = [
-            name if size == 1 else f"{name}[{i}]"
-            for name, size in zip(self.problem.flat.names, self.problem.flat.sizes, strict=True)
-            for i in range(size)
-        ]
-        found = []
+        names, found = self.names(), []
         for k in reversed(range(max(0, P - count), P)):
             share = (torch.linalg.pinv(root.T) @ directions[:, k]).square()
             share = share / share.sum()
@@ -202,6 +212,16 @@ class Laplace:
         if path is None:
             raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")
         return problem, path
+
+
+def _inverse(A: Tensor) -> Tensor:
+    """A⁻¹ of a matrix that may have null directions: very large along them, where a pseudo-inverse would have 0.
+
+    Scaled to a unit diagonal, so that no unit decides what is a null direction.
+    """
+    size = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
+    values, vectors = torch.linalg.eigh(A / size[:, None] / size)
+    return (vectors / values.clamp_min(NULL * float(values[-1]))) @ vectors.T / size[:, None] / size
 
 
 def laplace(run: Run) -> Laplace:

@@ -225,4 +225,8 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
     value, std = found["parameters"]["damping.rate"][0]
     assert 0 < std < 1
     assert value == load_run(tiny_run).metrics["rate"]
+    assert found["traded"] == []
+    assert 1 < found["effective_parameters"] < found["all_parameters"]
+    assert main(["trust", str(tiny_run), "--out", str(tmp_path)]) == 0
+    assert "each parameter above is determined on its own" in capsys.readouterr().out.lower()
     assert (tmp_path / "bands.png").stat().st_size > 10_000

@@ -1,0 +1,97 @@
+"""What the data leave open among the parameters that have a meaning: combinations that can be traded for one another.
+
+With A = JᵀJ of the fit, prior included, the information that the data hold on the parameters φ of interest, whatever
+the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Scaled to a
+unit diagonal it has no units, and a small eigenvalue λ is a combination that moves the prediction √(λ_max/λ) times
+less than the best determined one: the condition index of Belsley, Kuh & Welsch (1980), who call 30 harmful. Its
+eigenvector says which parameters are traded.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from herglotz.training.uncertainty import Laplace
+
+PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag",
+            "friction.")  # fmt: skip
+HARMFUL = 30.0  # condition index from which parameters count as traded
+LARGEST = 1e7  # condition index that rounding leaves of an exact null direction
+PART = 0.05  # least share of a combination that is named
+WORDS = {
+    "kinetic.log_diagonal": "the mass",
+    "kinetic.off_diagonal": "the coupling of masses",
+    "potential.stiffness": "the stiffness k of the potential",
+    "potential.tilt": "the tilt b of the potential (a constant force at q = 0)",
+    "damping.rate": "the damping rate γ",
+    "damping.drag": "the drag",
+    "friction.viscous": "viscous friction",
+    "friction.coulomb": "dry friction",
+    "friction.breakaway": "the excess of dry friction at breakaway",
+    "friction.log_smooth": "the speed below which dry friction is smooth",
+    "friction.log_stribeck": "the speed over which breakaway fades",
+    "friction.input_map": "the map from inputs to forces",
+    "friction.input_zero": "the zero of the input's sensor",
+}
+
+
+@dataclass(frozen=True)
+class Trade:
+    """Parameters of which the data determine some combination, and not each one alone."""
+
+    index: float  # condition index: how many times less the combination moves the prediction than the best known one
+    parts: tuple[tuple[str, float], ...]  # parameters and their shares of the combination, the largest first
+
+    def __str__(self) -> str:
+        names = [in_words(name) for name, _ in self.parts]
+        if len(names) == 1:
+            return f"{names[0]} has next to no effect on these data: its value is the prior's, not a measurement"
+        listed = ", ".join(names[:-1]) + " and " + names[-1]
+        how = "cannot be told apart at all" if self.index >= LARGEST else f"are hard to tell apart ({self.index:.0f}:1)"
+        return f"{listed} {how}: change one, the others make up for it, and the prediction stays the same"
+
+
+def in_words(name: str) -> str:
+    """A parameter's name, `friction.viscous[1]`, as a newcomer may read it."""
+    stem, _, entry = name.partition("[")
+    return WORDS.get(stem, stem) + (f", entry {int(entry[:-1]) + 1}" if entry else "")
+
+
+def traded(posterior: Laplace, index: float = HARMFUL) -> list[Trade]:
+    """The combinations of physical parameters that these data do not determine, the worst first; [] if there is none.
+
+    Parameters
+    ----------
+    posterior
+        Of a fit (`herglotz.training.laplace`).
+    index
+        Condition index from which a combination is told.
+    """
+    A, P = posterior.information, len(posterior.theta)
+    names = posterior.names()
+    own = torch.tensor([name.startswith(PHYSICAL) for name in names])
+    rows = own.nonzero()[:, 0]
+    rest = torch.cat([(~own).nonzero()[:, 0], torch.arange(P, len(A))])
+    _, prior, _ = posterior.prior.normal_equations(posterior.theta)
+    inverse = torch.linalg.pinv(A[rest[:, None], rest], hermitian=True)
+    M = A[rows[:, None], rows] - A[rows[:, None], rest] @ inverse @ A[rest[:, None], rows]
+    M = M - prior.double()[rows[:, None], rows]
+    # A parameter of no effect has a diagonal of rounding size, of either sign.
+    alone = A.diagonal()[rows]
+    seen = M.diagonal() > alone / LARGEST**2
+    found = [Trade(LARGEST, ((names[i], 1.0),)) for i in rows[~seen].tolist()]
+    rows, M = rows[seen], M[seen][:, seen]
+    if not len(rows):
+        return found
+    size = M.diagonal().sqrt()
+    values, vectors = torch.linalg.eigh(M / size[:, None] / size)
+    for value, vector in zip(values, vectors.T, strict=True):  # ascending
+        condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
+        if condition < index:
+            break
+        share = vector.square()
+        order = [k for k in share.argsort(descending=True).tolist() if share[k] >= PART]
+        found.append(Trade(condition, tuple((names[rows[k]], float(share[k])) for k in order)))
+    return found

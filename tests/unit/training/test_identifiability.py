@@ -1,0 +1,85 @@
+"""What the data leave open, where the answer is known."""
+
+from typing import Any
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+from herglotz.training import FitConfig, Run, laplace, traded
+from herglotz.training.identifiability import HARMFUL, LARGEST, in_words
+from herglotz.training.run import box_of
+
+NOISE, H = 1e-3, 0.2
+
+
+def recorded(*, angle=False, driven=True, torque=1.0, count=3, steps=40):
+    """A run at the very parameters that made its data: a joint with damping, under a random torque or free."""
+    make = torch.Generator().manual_seed(0)
+    draw = lambda *shape: torch.randn(*shape, generator=make, dtype=torch.float64)  # noqa: E731
+    force: dict[str, Any] = {"level": "forced", "inputs": 1, "input_zero": True} if driven else {"level": "linear"}
+    sizes: dict[str, Any] = {"scale": (2.0,), "speed": (2.0,), "stiffness": (1.0,), "tilt": (0.1,)}
+    model: Any = ContactLagrangian(ModelConfig(rate=0.1, potential_width=0, angles=(angle,), **force, **sizes))
+    u = torque * draw(count, steps + 1, 1) if driven else None
+    with torch.no_grad():
+        if driven:
+            model.friction.viscous.fill_(0.1)
+            model.friction.input_map.fill_(0.7)
+        inputs = None if u is None else u[:, :-1]
+        x = Stepper(model).rollout(draw(count, 1), draw(count, 1), h=H, steps=steps, inputs=inputs)
+    states = State(x.q.flatten(0, 1), x.p.flatten(0, 1), x.s.flatten())
+    t = (H * torch.arange(steps + 1, dtype=torch.float64)).repeat(count)
+    data = Trajectories.of(
+        t, states.q + NOISE * draw(*states.q.shape), (steps + 1,) * count, angles=(angle,),
+        u=None if u is None else u.flatten(0, 1),
+    )  # fmt: skip
+    config, metrics = FitConfig(level=model.config.level), {"sigma": NOISE, "departure": None}
+    return Run(model, config, metrics, data, data.lengths, states, H, box_of(*states), [])
+
+
+def test_two_names_for_one_force():
+    # fails if the prior's information counts as the data's, or exact null directions are lost in a pseudo-inverse: on a
+    # straight joint a constant force is a tilt or the sensor's zero, and one joint's damping is γ or viscous friction
+    posterior = laplace(recorded())
+    first, second, *others = traded(posterior)
+    assert {name for name, _ in first.parts} == {"potential.tilt", "friction.input_zero"}
+    assert first.index > LARGEST / 100
+    assert "cannot be told apart" in str(first) or "hard to tell apart" in str(first)
+    assert {name for name, _ in second.parts} == {"damping.rate", "friction.viscous"}
+    assert second.index > HARMFUL
+    assert not others
+    std = posterior.standard_deviations()
+    assert float(std["potential.tilt"]) > 10
+    assert float(std["potential.stiffness"]) < 1e-3
+
+
+def test_gravity_tells_the_zero_of_the_sensor():
+    # fails if a well determined pair is called traded: gravity turns with the angle, the sensor's zero does not
+    for trade in traded(laplace(recorded(angle=True))):
+        assert "friction.input_zero" not in dict(trade.parts)
+
+
+def test_a_free_motion_leaves_nothing_open():
+    # fails if there is always something to report
+    posterior = laplace(recorded(driven=False))
+    assert traded(posterior) == []
+    assert 2.5 < posterior.effective_parameters() < 3.01  # stiffness, tilt, rate
+
+
+def test_what_never_acted_is_named():
+    # fails if a parameter without effect is taken for a determined one
+    posterior = laplace(recorded(angle=True, torque=0.0))
+    assert all(bool(std.isfinite().all()) for std in posterior.standard_deviations().values())
+    assert 3.5 < posterior.effective_parameters() < 5.01
+    trades = traded(posterior)
+    lone = [trade for trade in trades if len(trade.parts) == 1]
+    assert [trade.parts[0][0] for trade in lone] == ["friction.input_map"]
+    assert "the map from inputs to forces has next to no effect" in str(lone[0])
+
+
+def test_names_in_words():
+    # fails if an entry is counted from 0, or an unknown name is lost
+    assert in_words("friction.viscous[1]") == "viscous friction, entry 2"
+    assert in_words("damping.rate") == "the damping rate γ"
+    assert in_words("new.thing") == "new.thing"
