@@ -256,6 +256,9 @@ def test_simplest_not_beaten():
     same = torch.tensor([1.0, 1.2, 0.9, 1.1, 1.0])
     assert simplest_not_beaten({0.1: same, 1.0: same + torch.tensor([0.1, -0.2, 0.1, -0.1, 0.0])}) == 0.1
     assert simplest_not_beaten({0.1: same + 0.5, 1.0: same}) == 1.0
+    # certain but tiny: every fold is better by one part in thirty, or by one in ten
+    assert simplest_not_beaten({0.1: same * 31 / 30, 1.0: same}) == 0.1
+    assert simplest_not_beaten({0.1: same * 1.1, 1.0: same}) == 1.0
 
 
 def test_baseline_finds_stiffness_tilt_and_rate():
