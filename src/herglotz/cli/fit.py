@@ -68,10 +68,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "recorded (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--restarts", type=count, default=1, metavar="R",
-        help="one-step fits from so many draws of the weights, the best kept (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
         "--every", type=count, default=1, metavar="M",
         help="use every M-th sample only; inputs are averaged over the steps (default %(default)s)",
     )  # fmt: skip
@@ -121,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = FitConfig(
         level=arguments.level, objective=arguments.objective, optimiser=arguments.optimiser,
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
-        robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts,
+        robust=arguments.robust, supervision=arguments.supervision,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
         coupled=arguments.coupled, order=arguments.order,

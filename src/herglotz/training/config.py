@@ -46,8 +46,6 @@ class FitConfig:
     iterations
         Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
         fitting takes 40 at the most.
-    restarts
-        Fits of the one-step objective from so many draws of the initial weights; the least cost is kept.
     departures
         Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
         value fixes it.
@@ -111,7 +109,6 @@ class FitConfig:
     coulomb: bool = False
     robust: str = "auto"
     supervision: str = "q"
-    restarts: int = 1
     use_inputs: bool = True
     input_map: tuple[float, ...] = ()
     features: tuple[str, ...] = ()
@@ -139,8 +136,6 @@ class FitConfig:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
             raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
-        if self.restarts < 1:
-            raise InputError(f"restarts must be >= 1, got {self.restarts}")
         if self.iterations < 1:
             raise InputError(f"iterations must be >= 1, got {self.iterations}")
         if not self.departures or min(self.departures) <= 0:

@@ -39,8 +39,8 @@ from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, ma
 
 PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
-RESTART = 7919  # between the seeds of one fit's restarts
 DRAWS, HEAT = 4, 30  # draws of a single layer's weights, and the iterations after which the best of them is taken
+APART = 7919  # between the seeds of the draws
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
@@ -149,28 +149,12 @@ def _fit_training_part(
             )
             return _fit_by_trajectory(rigid, train, base, config, stages, sigma or rigid_rms / 6**0.5)
     metric = "raw" if objective == "raw" else "position"
-    network = "plain" if metric == "raw" else "correction" if expected is None else "covered"
-    model = model if expected is None else build_model(base, config, network)
-    heat = min(HEAT, config.iterations // 10) if network == "covered" else 0
-    tried, draws = [], DRAWS if heat else 1
-    for k in range(config.restarts):
-        name = "one-step error" + (f", restart {k}" if k else "")
-        heats = []
-        for j in range(draws):
-            if k or j:
-                model = build_model(base, replace(config, seed=config.seed + (k * draws + j) * RESTART), network)
-            if heat:
-                draw = _fit_residual(
-                    model, train, base, config, stages, f"{name}, draw {j}", heat, exact, metric, expected=expected
-                )
-                heats.append((draw[0].cost, j, model))
-        if heats:
-            model = min(heats)[2]
-        left = config.iterations - heat * len(heats)
-        tried.append(
-            (model, *_fit_residual(model, train, base, config, stages, name, left, exact, metric, expected=expected))
-        )
-    model, result, rms = min(tried, key=lambda one: one[1].cost)
+    iterations = config.iterations
+    if expected is not None:
+        model, iterations = _best_draw(train, base, config, stages, exact, expected)
+    result, rms = _fit_residual(
+        model, train, base, config, stages, "one-step error", iterations, exact, metric, expected=expected
+    )
     noise = max(rms / 6**0.5, exact) if metric == "position" else exact
     # The states are fitted too (parameters held), so that the free run does not start from two noisy samples.
     notes, s = {"iterations": result.iterations, "reason": result.reason}, None
@@ -228,6 +212,25 @@ def _states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
     out[i + 1, n : 2 * n] = p
     out[first, n : 2 * n] = p_first
     return out
+
+
+def _best_draw(
+    train: Trajectories,
+    base: Baseline,
+    config: FitConfig,
+    stages: Stages,
+    sigma: float,
+    expected: tuple[Triples, float],
+) -> tuple[ContactLagrangian, int]:
+    """The single layer that is ahead after a short race of a few draws, and the iterations left: some draws stall."""
+    heat = min(HEAT, config.iterations // 10)
+    raced = []
+    for draw in range(DRAWS if heat else 1):
+        model = build_model(base, replace(config, seed=config.seed + draw * APART), "covered")
+        name = f"one-step error, draw {draw}"
+        result, _ = _fit_residual(model, train, base, config, stages, name, heat, sigma, expected=expected)
+        raced.append((result.cost, draw, model))
+    return min(raced)[2], config.iterations - heat * len(raced)
 
 
 def _fit_residual(

@@ -18,7 +18,7 @@ FREEDOM = 4.0  # ν: 96 % of the normal distribution's efficiency where the resi
 TAIL = 5.0  # residuals beyond so many robust standard deviations are outliers: 6e-7 of normal ones are
 SHARE = 3e-3  # share of outliers above which residuals count as heavy-tailed,
 FAR = 10.0  # or one that is so far out
-FEW = 0.05  # share of samples that may be left out one by one; more, and only a heavy-tailed loss is honest
+FEW = 0.1  # share of samples that may be left out one by one; more, and only a heavy-tailed loss is honest
 MAD = 1.4826  # standard deviation over median absolute deviation, of a normal distribution
 
 

@@ -88,21 +88,6 @@ def test_the_full_level_is_reliable_with_s(seed):
     assert errors["full"] < 0.3 * errors["affine"], errors
 
 
-def test_restarts_keep_the_least_cost():
-    # fails if the last restart is kept, or all start from the same weights
-    data = pendulum(1.0, trajectories=3, steps=20, h=0.2, seed=1)
-    settings = {"supervision": "qs", "level": "full", "iterations": 6, "correction_width": 0, "action_width": 1}
-    runs = [fit(data, FitConfig(**settings, restarts=k), progress=False) for k in (1, 3)]
-    last = [{row["stage"]: row["cost"] for row in run.history if "one-step" in row["stage"]} for run in runs]
-    assert len(last[1]) == 3
-    assert len(set(last[1].values())) == 3
-    assert last[1]["one-step error"] == pytest.approx(last[0]["one-step error"], rel=1e-6)
-    problem = SupervisedProblem(runs[1].model, runs[1].data, momenta=False)
-    assert torch.isfinite(problem.residuals(problem.start())).all()
-    with pytest.raises(InputError, match="restarts must be >= 1, got 0"):
-        FitConfig(restarts=0)
-
-
 def test_what_is_not_recorded_is_named():
     # fails if a fit without s falls back on positions without a word, or with an objective that ignores s
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=12, h=0.2)
