@@ -85,8 +85,8 @@ def simulated(seed: int, folder: Path) -> dict[str, Any]:  # noqa: ARG001  one s
     if seed == 0:
         bands, first = every["laplace"], slice(0, SEEN + AHEAD)
         lines = {"t": test.t, "q": test.q[:, 0], "model": bands.q[:, 0], "std": bands.std[:, 0]}
-        found["example"] = {name: [float(f"{v:.6g}") for v in x[first].tolist()] for name, x in lines.items()}
-        found["example"]["sigma"] = bands.sigma
+        rounded = {name: [float(f"{v:.6g}") for v in x[first].tolist()] for name, x in lines.items()}
+        found["example"] = {**rounded, "sigma": bands.sigma}
     return found
 
 
@@ -132,6 +132,6 @@ def draw(rows: dict[str, Any], path: Path) -> None:
                 entries += [(name, color)] if k == 0 else []
         for line, entry in enumerate(entries):
             captions(right, [entry], row=line)
-        label(right, NOMINAL, LOW, f"target at {NOMINAL:g}", ACCENT, ha="right", va="top")
+        label(right, NOMINAL, LOW, f"target at {NOMINAL:g}", ACCENT, ha="center", va="top", xytext=(0, -4))
         right.set(xlabel="nominal", ylabel="share of held-out samples inside", title="Every line a seed")
         save_figure(figure, path)
