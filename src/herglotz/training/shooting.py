@@ -169,12 +169,14 @@ class ShootingProblem:
     def states_at(self, path: Path, samples: Tensor) -> Tensor:
         """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
 
-        At a joint it is the start of the later segment: across a broken one the end of the earlier is somewhere else.
+        At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
+        later one, because the end of the earlier is somewhere else.
         """
         rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
         rows[self.grid.sample] = self.grid.node
-        first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
-        rows[self.grid.start_sample] = first
+        if self.freedom is not None:
+            first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
+            rows[self.grid.start_sample] = first
         return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
 
     def misfit(self, path: Path) -> Tensor:
