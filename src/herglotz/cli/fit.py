@@ -68,6 +68,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "recorded (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
+        "--restarts", type=count, metavar="R",
+        help="draws of the weights that race for a part of the one-step fit's iterations (default: 4 for a correction "
+        "of one layer, else 1)",
+    )  # fmt: skip
+    parser.add_argument(
         "--every", type=count, default=1, metavar="M",
         help="use every M-th sample only; inputs are averaged over the steps (default %(default)s)",
     )  # fmt: skip
@@ -117,7 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = FitConfig(
         level=arguments.level, objective=arguments.objective, optimiser=arguments.optimiser,
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
-        robust=arguments.robust, supervision=arguments.supervision,
+        robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
         coupled=arguments.coupled, order=arguments.order,

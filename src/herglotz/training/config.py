@@ -46,6 +46,9 @@ class FitConfig:
     iterations
         Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
         fitting takes 40 at the most.
+    restarts
+        Draws of the initial weights that the one-step objective races for a part of its iterations; the one ahead goes
+        on. None: 4 where the correction is a single layer (`baseline_motion`), else 1.
     departures
         Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
         value fixes it.
@@ -109,6 +112,7 @@ class FitConfig:
     coulomb: bool = False
     robust: str = "auto"
     supervision: str = "q"
+    restarts: int | None = None
     use_inputs: bool = True
     input_map: tuple[float, ...] = ()
     features: tuple[str, ...] = ()
@@ -136,6 +140,8 @@ class FitConfig:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
             raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
+        if self.restarts is not None and self.restarts < 1:
+            raise InputError(f"restarts must be >= 1, got {self.restarts}")
         if self.iterations < 1:
             raise InputError(f"iterations must be >= 1, got {self.iterations}")
         if not self.departures or min(self.departures) <= 0:

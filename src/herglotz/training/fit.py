@@ -39,8 +39,8 @@ from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, ma
 
 PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
-DRAWS, HEAT = 4, 30  # draws of a single layer's weights, and the iterations after which the best of them is taken
-APART = 7919  # between the seeds of the draws
+COVERED, HEAT = 4, 30  # restarts of a single layer, and the iterations after which the best of them goes on
+APART = 7919  # between the seeds of the restarts
 EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
@@ -150,8 +150,10 @@ def _fit_training_part(
             return _fit_by_trajectory(rigid, train, base, config, stages, sigma or rigid_rms / 6**0.5)
     metric = "raw" if objective == "raw" else "position"
     iterations = config.iterations
-    if expected is not None:
-        model, iterations = _best_draw(train, base, config, stages, exact, expected)
+    restarts = config.restarts or (1 if expected is None else COVERED)
+    if restarts > 1 or expected is not None:
+        network = "plain" if metric == "raw" else "correction" if expected is None else "covered"
+        model, iterations = _race(network, restarts, train, base, config, stages, exact, metric, expected)
     result, rms = _fit_residual(
         model, train, base, config, stages, "one-step error", iterations, exact, metric, expected=expected
     )
@@ -214,23 +216,26 @@ def _states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
     return out
 
 
-def _best_draw(
+def _race(
+    network: str,
+    restarts: int,
     train: Trajectories,
     base: Baseline,
     config: FitConfig,
     stages: Stages,
     sigma: float,
-    expected: tuple[Triples, float],
+    metric: str,
+    expected: tuple[Triples, float] | None,
 ) -> tuple[ContactLagrangian, int]:
-    """The single layer that is ahead after a short race of a few draws, and the iterations left: some draws stall."""
-    heat = min(HEAT, config.iterations // 10)
+    """The model that is ahead after a short fit from each draw of the weights, and the iterations left: some stall."""
+    heat = min(HEAT, config.iterations // (2 * restarts))
     raced = []
-    for draw in range(DRAWS if heat else 1):
-        model = build_model(base, replace(config, seed=config.seed + draw * APART), "covered")
-        name = f"one-step error, draw {draw}"
-        result, _ = _fit_residual(model, train, base, config, stages, name, heat, sigma, expected=expected)
-        raced.append((result.cost, draw, model))
-    return min(raced)[2], config.iterations - heat * len(raced)
+    for k in range(restarts):
+        model = build_model(base, replace(config, seed=config.seed + k * APART), network)
+        name = f"one-step error, start {k + 1}"
+        result, _ = _fit_residual(model, train, base, config, stages, name, heat, sigma, metric, expected=expected)
+        raced.append((result.cost, k, model))
+    return min(raced)[2], config.iterations - heat * restarts
 
 
 def _fit_residual(
