@@ -8,7 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from herglotz.export import export_c
+from herglotz.errors import InputError
+from herglotz.export import export_c, load_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
 
@@ -251,3 +252,48 @@ def test_the_cmake_lines_of_the_docs(tmp_path):
         assert done.returncode == 0, done.stdout + done.stderr
     done = subprocess.run([tmp_path / "build" / "example"], capture_output=True, text=True, check=True)
     assert len(done.stdout.splitlines()) == 100
+
+
+TERMS = {
+    "explicit": {"potential_width": 3},
+    "viscous": {"level": "forced", "inputs": 1},
+    "dry": {"level": "forced", "coulomb": True},
+    "features": {"potential_width": 0, "features": ("cos(q1 - q2)", "sin(2q1)")},
+    "affine": {"level": "affine", "damping_width": 3, "correction_width": 3, "activation": "softplus"},
+    "full": {"level": "full", "action_width": 2, "mass_width": 3, "activation": "silu"},
+    "large": {"n": 17, "correction_width": 3},
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("terms", TERMS)
+@pytest.mark.parametrize("flags", [("-O2",), FAST, ("-O2", "-Wshadow")], ids=["O2", "fast-math", "shadow"])
+@pytest.mark.parametrize("language", [("-std=c99",), ("-x", "c++")], ids=["C", "C++"])
+@pytest.mark.parametrize("compiler", COMPILERS)
+def test_every_compiler_is_silent(tmp_path, compiler, language, flags, terms):
+    # fails if a term's lines are no clean C99 or C++ to one of the compilers, or -ffast-math makes it warn
+    settings = dict(TERMS[terms])
+    made = model(settings.pop("n", 2), **settings)
+    (tmp_path / "use.c").write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
+    for dtype in ("float64", "float32"):
+        export_c(made, tmp_path / "stepper.h", h=0.1, dtype=dtype)
+        command = [compiler, *language, "-Wall", "-Wextra", "-Wpedantic", "-Werror", *flags]
+        done = subprocess.run(
+            [*command, "-c", str(tmp_path / "use.c"), "-o", "/dev/null"], capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, (dtype, done.stderr[:2000])
+
+
+def test_a_tolerance_is_what_newton_stops_at(tmp_path):
+    # fails if `tolerance` is recorded and not used, or one that rounding cannot reach is taken
+    made = model(2, correction_width=6)
+    fine, loose = (export_c(made, tmp_path / f"{i}.h", h=0.1, tolerance=x) for i, x in enumerate((None, 1e-4)))
+    x = torch.linspace(-1, 1, 5, dtype=torch.float64)
+    runs = [load_c(path).rollout(x[:2], x[2:4], x[4], h=0.1, steps=40) for path in (fine, loose)]
+    assert [load_c(path).metadata["newton_tolerance"] for path in (fine, loose)] == [16 * 2.0**-52, 1e-4]
+    assert bool((runs[0].residual <= 1e-14).all())
+    assert 1e-10 < float(runs[1].residual.max()) <= 1e-4 * float(runs[1].q.abs().max())
+    assert 0 < float((runs[0].q - runs[1].q).abs().max()) < 1e-3
+    for bad in (1e-16, 0.0, 1.0, float("nan")):
+        with pytest.raises(InputError, match="tolerance must be"):
+            export_c(made, tmp_path / "bad.h", h=0.1, tolerance=bad)

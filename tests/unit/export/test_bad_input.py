@@ -1,0 +1,123 @@
+"""What no format steps from: every wrong argument is an error in one line, whatever file it is given to."""
+
+import shutil
+from typing import Any
+
+import pytest
+import torch
+from test_pt2 import model_of, states_of
+
+import herglotz
+from herglotz.errors import InputError
+from herglotz.export import CompiledStepper, export_aoti, export_c, export_onnx, export_pt2, load_exported
+from herglotz.stepping import State
+
+needs_compiler = pytest.mark.skipif(
+    not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
+)
+FORMATS = [
+    "pt2",
+    "onnx",
+    pytest.param("h", marks=needs_compiler),
+    pytest.param("compile", marks=needs_compiler),
+    pytest.param("aoti", marks=pytest.mark.slow),
+]
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.fixture(scope="module", params=FORMATS)
+def stepper(request, tmp_path_factory) -> Any:
+    """The same explicit model, through each format."""
+    form, folder, model = request.param, tmp_path_factory.mktemp("bad"), model_of(2, "linear")
+    more: dict[str, Any] = {"h": 0.1, "metadata": {"h_range": [0.01, 0.5]}}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(folder))
+        if form == "compile":
+            yield herglotz.compile(model)
+        elif form == "h":
+            yield load_exported(export_c(model, folder / "a.h", h=0.1, h_range=(0.01, 0.5)))
+        elif form == "onnx":
+            pytest.importorskip("onnx")
+            pytest.importorskip("onnxruntime")
+            yield load_exported(export_onnx(model, folder / "a.onnx", **more))
+        else:
+            yield load_exported({"pt2": export_pt2, "aoti": export_aoti}[form](model, folder / "a.pt2", **more))
+
+
+q, p, s = states_of(2, 3)
+STATES = {
+    "too few coordinates": State(q[:, :1], p[:, :1], s),
+    "q and p of two batches": State(q, p[:2], s),
+    "s with an axis too many": State(q, p, s[:, None]),
+    "a number for q": State(s[0], s[0], s[0]),
+    "no samples": State(q[:0], p[:0], s[:0]),
+    "float32": State(q.float(), p.float(), s.float()),
+    "p in float32": State(q, p.float(), s),
+    "integers": State(q.long(), p.long(), s.long()),
+    "NaN in q": State(q * NAN, p, s),
+    "one NaN in p": State(q, p.clone().index_fill_(0, torch.tensor(1), NAN), s),
+    "an infinite s": State(q, p, s + INF),
+}
+STEPS = {"zero": 0.0, "negative": -0.1, "NaN": NAN, "infinite": INF, "of two samples": torch.tensor([0.1, 0.1])}
+
+
+@pytest.mark.parametrize("name", STATES)
+def test_a_wrong_state_is_refused(stepper, name):
+    # fails if a format reads other memory, another dtype, or steps from what is no number
+    with pytest.raises(InputError):
+        stepper.step(STATES[name], 0.1)
+    with pytest.raises(InputError):
+        stepper.rollout(*STATES[name], h=0.1, steps=2)
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_wrong_step_is_refused(stepper, name):
+    # fails if a step backwards, or none, or one for other samples is taken
+    with pytest.raises(InputError):
+        stepper.step(State(q, p, s), STEPS[name])
+    if name != "of two samples":
+        with pytest.raises(InputError):
+            stepper.rollout(q, p, s, h=STEPS[name], steps=2)
+
+
+def test_other_arguments_are_refused(stepper):
+    # fails if a file steps where it was not fitted, loses a step, or takes an input for one that it has not
+    if "h_range" in stepper.metadata and stepper.metadata["h_range"] is not None:
+        with pytest.raises(InputError, match="h must lie in"):
+            stepper.step(State(q, p, s), 0.6)
+    name = "inputs" if isinstance(stepper, CompiledStepper) else "u"
+    with pytest.raises(InputError, match="takes no inputs"):
+        stepper.rollout(q, p, s, h=0.1, steps=2, **{name: torch.zeros(3, 2, 1, dtype=torch.float64)})
+    for steps in (0, None):
+        with pytest.raises(InputError):
+            stepper.rollout(q, p, s, h=0.1, steps=steps)
+    with pytest.raises(InputError):
+        stepper.rollout(q, p, s, h=torch.full((3,), 0.1, dtype=torch.float64), steps=2)
+
+
+def test_strides_are_no_error(stepper):
+    # fails if memory is read in the order in which it lies: transposed, reversed, repeated and overlapping states
+    rows = torch.arange(12, dtype=torch.float64).reshape(2, 6)[:, ::2] / 12
+    views = State(rows.T, torch.full((1, 1), 0.2, dtype=torch.float64).expand(3, 2), rows[0].flip(0))
+    plain = State(*(x.clone(memory_format=torch.contiguous_format) for x in views))
+    for a, b in zip(stepper.step(views, 0.1).state, stepper.step(plain, 0.1).state, strict=True):
+        assert torch.equal(a, b)
+    ours, other = (stepper.rollout(*x, h=0.1, steps=3) for x in (views, plain))
+    assert torch.equal(ours.q, other.q)
+    assert torch.equal(ours.s, other.s)
+
+
+def test_a_file_by_itself_has_a_status_for_what_is_no_number(stepper):
+    # fails if a NaN passes a file's own loop with status 0, or spreads to its neighbours
+    programs = getattr(stepper, "programs", None)
+    if programs is None:
+        pytest.skip("C is tested by programs in C: test_c_program.py")
+    h = torch.full((2, 3), 0.1, dtype=torch.float64)
+    fine = programs["rollout"](q, p, s, h)
+    h_bad = h.clone()
+    h_bad[:, 2] = NAN
+    found = programs["rollout"](q, p.clone().index_fill_(0, torch.tensor(1), NAN), s, h_bad)
+    assert (found[5][:, 1:] != 0).all()
+    assert found[0][:, 1:].isnan().all()
+    assert torch.equal(found[0][:, 0], fine[0][:, 0])
+    assert not found[5][:, 0].any()
