@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import platform
 import resource
@@ -199,6 +200,34 @@ def other_formats(quick: bool) -> list[Row]:
     return rows
 
 
+def other_levels(quick: bool) -> list[Row]:
+    """The levels whose steps cost more, as ONNX against C: what couples all samples' Jacobians, forces, flows of s."""
+    from herglotz.export import export_onnx, load_onnx
+
+    rows = []
+    for level in ("affine", "forced", "full", "mass"):
+        model = model_of(2, 16, level)
+        ours = compile_c(model, h=H)
+        try:
+            with tempfile.TemporaryDirectory() as folder:
+                loaded = load_onnx(export_onnx(model, Path(folder, "model.onnx"), h=H))
+        except (InputError, ImportError) as error:
+            rows.append(row(f"ONNX rollout / C, n=2, {level}", "", note=f"not available: {str(error)[:100]}"))
+            continue
+        for batch, most in ((1, 50.0), (1024, 2.5)):
+            steps = (8 if quick else 200) if batch == 1 else (4 if quick else 20)
+            state, more = start(2, batch, torch.float64), 20 if batch == 1 else 1
+            timed = alternate(
+                lambda o=ours, s=state, k=steps * more: o.rollout(*s, h=H, steps=k),
+                lambda o=loaded, s=state, k=steps: o.rollout(*s, h=H, steps=k),
+                3 if quick else 5,
+                (steps * more * batch, steps * batch),
+            )
+            met = lambda x, most=most: x <= most  # noqa: E731
+            rows.append(row(f"ONNX rollout / C, n=2, {level}, 16x2, float64, B={batch}", f"<= {most:g}", met, **timed))
+    return rows
+
+
 def _agreement_row(name: str, model: ContactLagrangian, form: Any, steps: int) -> Row:
     """The last state of a form of the model against that of the eager stepper."""
     state = start(2, 2, torch.float64)
@@ -289,6 +318,19 @@ def sizes(quick: bool) -> list[Row]:
                 eager_took = min(seconds(lambda e=eager, s=state: e.rollout(*s, h=H, steps=3)) for _ in range(2))
                 found["eager_us"] = 1e6 * eager_took / 3 / batch
             rows.append(found)
+    return rows
+
+
+def exponents(curve: list[Row]) -> list[Row]:
+    """The x of time ~ B^x for each n, by least squares over B >= 256, where the cost of a call is nothing."""
+    rows = []
+    for n in sorted({r["n"] for r in curve}):
+        mine = [(math.log(r["B"]), math.log(r["B"] * r["c_us"])) for r in curve if r["n"] == n and r["B"] >= 256]
+        if len(mine) > 1:
+            x = statistics.linear_regression(*zip(*mine, strict=True)).slope
+            largest = max(r["B"] for r in curve if r["n"] == n)
+            what = f"C, time ~ B^x from B=256 to {largest}, n={n}: x"
+            rows.append(row(what, "0.9 … 1.1", lambda x: 0.9 <= x <= 1.1, value=x))
     return rows
 
 
@@ -403,7 +445,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="folder for stepper.json, .md and .png, e.g. benchmarks/results")
     arguments = parser.parse_args()
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-    parts = [against_hand, against_jax, long_rollout, other_formats, eager_rows, agreement, gpu]
+    parts = [against_hand, against_jax, long_rollout, other_formats, other_levels, eager_rows, agreement, gpu]
     chosen = [p for p in parts if not arguments.only or p.__name__ in arguments.only]
     begin, found, rows = time.perf_counter(), conditions(), []
     bar = tqdm(chosen)
@@ -411,6 +453,7 @@ def main() -> None:
         bar.set_description(part.__name__)
         rows += part(arguments.quick)
     curve = sizes(arguments.quick) if not arguments.only or "sizes" in arguments.only else []
+    rows += exponents(curve)
     found["machine"]["load_after"] = os.getloadavg()
     text = table(rows)
     print(text)
