@@ -22,7 +22,7 @@ from herglotz.models.mass import PositionKinetic
 from herglotz.models.network import Network
 from herglotz.models.terms import AffineDamping, Kinetic
 
-MAX_WIDE = 16  # beyond, a register of n x n matrices leaves the cache
+MAX_WIDE = 32  # beyond, registers of n x n matrices ask for megabytes of stack
 
 _POTENTIAL = """
 /* V(q) and V'(q). */

@@ -261,7 +261,8 @@ TERMS = {
     "features": {"potential_width": 0, "features": ("cos(q1 - q2)", "sin(2q1)")},
     "affine": {"level": "affine", "damping_width": 3, "correction_width": 3, "activation": "softplus"},
     "full": {"level": "full", "action_width": 2, "mass_width": 3, "activation": "silu"},
-    "large": {"n": 17, "correction_width": 3},
+    "lanes of large matrices": {"n": 17, "correction_width": 3},
+    "too large for lanes": {"n": 33, "correction_width": 3},
 }
 
 
