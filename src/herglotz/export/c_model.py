@@ -22,7 +22,7 @@ from herglotz.models.mass import PositionKinetic
 from herglotz.models.network import Network
 from herglotz.models.terms import AffineDamping, Kinetic
 
-MAX_WIDE = 32  # beyond, registers of n x n matrices ask for megabytes of stack
+MAX_WIDE = 24  # beyond, registers of n x n matrices outgrow the half megabyte of stack that some threads have
 
 _POTENTIAL = """
 /* V(q) and V'(q). */

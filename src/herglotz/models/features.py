@@ -14,6 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from inspect import signature
 from itertools import combinations, product
 
 from herglotz.errors import InputError
@@ -67,8 +68,10 @@ def expand(names: Sequence[str], angles: Sequence[bool]) -> list[str]:
         library = LIBRARIES.get(word)
         if library is None:
             out.append(name)
+        elif argument and len(signature(library).parameters) == 1:
+            raise InputError(f"feature '{name}': this library takes no number; write '{word}'")
         elif argument and not argument.strip().isdigit():
-            raise InputError(f"feature '{name}': a library takes one whole number, as '{word} 2' does")
+            raise InputError(f"feature '{name}': this library takes one whole number, as '{word} 2' does")
         else:
             out += library(angles, *([int(argument)] if argument else []))
     return list(dict.fromkeys(out))

@@ -262,7 +262,7 @@ TERMS = {
     "affine": {"level": "affine", "damping_width": 3, "correction_width": 3, "activation": "softplus"},
     "full": {"level": "full", "action_width": 2, "mass_width": 3, "activation": "silu"},
     "lanes of large matrices": {"n": 17, "correction_width": 3},
-    "too large for lanes": {"n": 33, "correction_width": 3},
+    "too large for lanes": {"n": 25, "correction_width": 3},
 }
 
 

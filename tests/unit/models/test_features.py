@@ -108,7 +108,8 @@ def test_mistakes_in_texts_are_named():
         "3": "a constant moves nothing at the level 'linear'",
         "q1 v1 + q2^2": "some products hold velocities and some do not",
         "r^2 v1": "powers of r join the potential",
-        "chain two": "a library takes one whole number, as 'chain 2' does",
+        "chain two": "this library takes one whole number, as 'chain 2' does",
+        "pendulums 2": "this library takes no number; write 'pendulums'",
     }
     for text, words in wrong.items():
         with pytest.raises(InputError, match=words):
