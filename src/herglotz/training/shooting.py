@@ -68,7 +68,6 @@ class ShootingProblem:
         chunk: int = 4096,
     ):
         self.freedom = freedom
-        self.held = False  # the parameters are not fitted: derivatives by them are left out (as 0)
         self.flat, self.grid, self.data = FlatModel(model), grid, data
         self.sigma, self.prior, self.chunk = sigma, prior, chunk
         self.n = data.dof
@@ -129,15 +128,15 @@ class ShootingProblem:
         cost = loss(fit, self.freedom) + loss(joints, self.freedom) + anchor.square().sum() / 2
         return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
 
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(cost, JᵀJ, Jᵀr); remembers the trajectory for the next solve."""
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: derivatives by θ are left out, as 0."""
         theta, _ = self.unpack(x)
         path = self.solve(x)
         if not everywhere(path is not None) or path is None:
             return x.new_full((), torch.inf), x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
         self.path = path
         grid, n, d, P = self.grid, self.n, self.d, self.P
-        Z = self.sensitivities(theta, path)  # (S, K+1, d, P + d)
+        Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
         cost = loss(fit, self.freedom) + loss(joints, self.freedom)
         by_fit, by_joint = self.weight * root_weights(fit, self.freedom), root_weights(joints, self.freedom)
@@ -249,11 +248,11 @@ class ShootingProblem:
         guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
         return solve_path(self.flat, theta, start, self.grid.h, guess, tol, u=self.u)
 
-    def sensitivities(self, theta: Tensor, path: Path) -> Tensor:
+    def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
         S, K = self.grid.h.shape
         d = self.d
-        B = theta.new_zeros(S, K, d, self.P) if self.held else self._parameter_derivatives(theta, path)[..., :d, :]
+        B = theta.new_zeros(S, K, d, self.P) if held else self._parameter_derivatives(theta, path)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         Z = [torch.cat([theta.new_zeros(S, d, self.P), eye], -1)]
         pad = theta.new_zeros(S, d, d)

@@ -66,7 +66,6 @@ class StatesOnly:
 
     def __init__(self, problem: ShootingProblem, theta: Tensor):
         self.problem, self.theta = problem, theta
-        problem.held = True
 
     def full(self, states: Tensor) -> Tensor:
         """All unknowns of the shooting problem."""
@@ -78,7 +77,7 @@ class StatesOnly:
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """See `LeastSquares`."""
-        cost, A, b = self.problem.normal_equations(self.full(x))
+        cost, A, b = self.problem.normal_equations(self.full(x), held=True)
         P = len(self.theta)
         return cost, A[P:, P:], b[P:]
 

@@ -144,7 +144,7 @@ def _models(
             h = m * run.h
             bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
             before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
-            start = widened(own, width, max(run.model.config.correction_depth, 1))
+            start = widened(own, width, max(run.model.config.correction_depth, 2))
             model, _ = distil(start, before, after, h, iterations=config.iterations)
             model.requires_grad_(False)
             yield (m, width), model
