@@ -173,15 +173,18 @@ class ResidualProblem:
             cost = cost + prior_cost
         return cost, A, b
 
-    def pieces(self) -> Iterator[Callable[[Tensor], Tensor]]:
-        """r/σ by chunks, those of this process, as functions of the parameters; for models whose motion has no s."""
+    def pieces(self) -> Iterator[tuple[Tensor, Callable[[Tensor], Tensor]]]:
+        """The triples of each of this process's chunks, and their r/σ as a function of the parameters.
+
+        For models whose motion has no s.
+        """
         t, scale, (_, processes) = self.triples, self.scale, world()
         zero = torch.zeros_like(t.h0)
         chunk = min(self.chunk, -(-len(t) // processes))
         for part in own_share(torch.arange(len(t), device=zero.device).split(chunk)):
             rows = (t.q0[part], t.q1[part], t.q2[part], zero[part], t.h0[part], t.h1[part])
             rows += self._inputs(t.index[part])
-            yield lambda theta, rows=rows, by=scale[part]: (self._local(theta, *rows) / by).reshape(-1)
+            yield part, lambda theta, rows=rows, by=scale[part]: (self._local(theta, *rows) / by).reshape(-1)
 
     def _split(self, x: Tensor) -> tuple[Tensor, Tensor]:
         P = len(x) - self.latents

@@ -14,8 +14,12 @@ import sys
 import torch
 from herglotz.data import simulate
 from herglotz.systems import scene
-from herglotz.training import FitConfig, fit
+from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.build import build_model
 from herglotz.training.distributed import is_first, process_group
+from herglotz.training.matrix_free import MatrixFree
+from herglotz.training.trajectory_fit import make_prior
 
 torch.set_num_threads(1)
 found = {}
@@ -32,13 +36,22 @@ with process_group():
         run = fit(data, settings, progress=False)
         found[objective] = torch.nn.utils.parameters_to_vector(run.model.parameters()).detach()
         found[objective + " cost"] = torch.tensor([row["cost"] for row in run.history], dtype=torch.float64)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
+    base = estimate_baseline(data)
+    model = build_model(base, FitConfig(correction_width=5, level="linear"), "correction")
+    problem = MatrixFree(ResidualProblem(model, data, sigma=1e-3, prior=make_prior(model, base, None)))
+    x = problem.problem.start()
+    cost, curvature, b = problem.normal_equations(x)
+    step = curvature.solve(-b, 0.3 * curvature.diagonal(), tol=1e-13)
+    found["products"] = torch.cat([cost[None], b, curvature.diagonal(), curvature @ step, step])
+    found["search by products"] = levenberg_marquardt(problem, x, max_iterations=4).x
     if is_first():
         torch.save(found, sys.argv[1])
 """
 
 
 def result(tmp_path, processes):
-    """Parameters and costs of three fits on so many processes."""
+    """Parameters and costs of the fits on so many processes."""
     script, out = tmp_path / "work.py", tmp_path / f"{processes}.pt"
     script.write_text(WORK)
     command = [sys.executable, str(script), str(out)]
@@ -59,9 +72,10 @@ def test_two_processes_find_what_one_finds(tmp_path):
     # fails if a process's share is left out or counted twice (prior included), or processes take different decisions
     one, two = result(tmp_path, 1), result(tmp_path, 2)
     assert one.keys() == two.keys()
-    assert len(one) == 6
+    assert len(one) == 8
     for name, value in one.items():
-        torch.testing.assert_close(two[name], value, rtol=1e-9, atol=1e-9, msg=lambda m, name=name: f"{name}: {m}")
+        tol = 1e-5 if name == "search by products" else 1e-9  # of a solution that is cut short, rounding decides more
+        torch.testing.assert_close(two[name], value, rtol=tol, atol=tol, msg=lambda m, name=name: f"{name}: {m}")
 
 
 @pytest.mark.slow
