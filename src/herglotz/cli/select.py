@@ -28,8 +28,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument(
         "--levels",
-        help=f"levels to compare, with commas, of {', '.join(LEVELS)} (default: all but full; with recorded inputs u: "
-        "forced)",
+        help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
+        "but full, and auto for joints; with recorded inputs u: forced",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     parser.add_argument("--seed", type=count, default=0, help="the first of them (default %(default)s)")

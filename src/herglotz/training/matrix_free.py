@@ -3,8 +3,8 @@
 Products JᵀJ v come from backward derivatives of the residuals, chunk by chunk and shared by the processes; the damped
 equations are solved by conjugate gradients. J. Martens, "Deep learning via Hessian-free optimization", ICML 2010.
 
-A loose solution costs more than it saves: solved to 1e-2 only, the search needs more than twice the steps on exact data;
-solved to 1e-4 it takes as many as with a matrix.
+A loose solution costs more than it saves: solved to 1e-2 only, the search on exact data needs more than twice the
+steps; solved to 1e-4 it takes as many as with a matrix.
 """
 
 from __future__ import annotations

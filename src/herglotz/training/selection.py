@@ -19,9 +19,11 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
+from herglotz.training.structure import nothing_told
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
+LADDER = (*LEVELS, "auto")  # what `fit` does where no level is told comes last: for joints it is the richest
 BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
 TIMED_STEPS = 20
 
@@ -126,8 +128,8 @@ def select(
     data
         Trajectories of positions.
     levels
-        Which levels, of `herglotz.models.LEVELS`; tried and preferred in the ladder's order. None: all but the full one
-        or, where inputs are recorded and used, those that can take them.
+        Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried and preferred in this
+        order. None: those of `levels_for`.
     seeds
         Fits a level, with seeds config.seed, config.seed + 1, …
     config
@@ -143,17 +145,16 @@ def select(
         If a level is unknown or nothing is held out, or no level has a finite held-out error.
     """
     config = config or FitConfig()
-    if levels is None:
-        levels = ("forced",) if data.u is not None and config.use_inputs else CANDIDATES
-    unknown = [level for level in levels if level not in LEVELS]
+    levels = levels_for(data, config) if levels is None else levels
+    unknown = [level for level in levels if level not in LADDER]
     if unknown or not levels:
-        raise InputError(f"unknown level {unknown or 'list'}; choose some of {', '.join(LEVELS)}")
+        raise InputError(f"unknown level {unknown or 'list'}; choose some of {', '.join(LADDER)}")
     if seeds < 1:
         raise InputError(f"seeds must be >= 1, got {seeds}")
     if config.train_fraction == 1:
         raise InputError("train fraction 1 holds nothing out to compare levels on; use 0.667, say")
     candidates = []
-    for level in (level for level in LEVELS if level in levels):
+    for level in (level for level in LADDER if level in levels):
         runs = []
         for seed in range(config.seed, config.seed + seeds):
             folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
@@ -164,6 +165,17 @@ def select(
         errors = torch.stack([block_errors(run) for run in runs])
         candidates.append(Candidate(level, tuple(runs), errors, _step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))
+
+
+def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
+    """The levels that are compared where none is named.
+
+    All but the full one; where inputs are recorded and used, those that can take them; and "auto" where that is none
+    of these: for joints (`herglotz.training.structure`).
+    """
+    if data.u is not None and config.use_inputs:
+        return ("forced",)
+    return (*CANDIDATES, "auto") if nothing_told(data, replace(config, level="auto")) else CANDIDATES
 
 
 def block_errors(run: Run) -> Tensor:

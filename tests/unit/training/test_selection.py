@@ -15,7 +15,7 @@ from herglotz.plots import plot_selection, save_figure
 from herglotz.systems import scene
 from herglotz.training import FitConfig, select
 from herglotz.training.run import Run
-from herglotz.training.selection import Candidate, Selection, _simplest, block_errors
+from herglotz.training.selection import Candidate, Selection, _simplest, block_errors, levels_for
 
 
 def candidate(level, *seeds):
@@ -75,6 +75,25 @@ def test_blocks_are_the_held_out_time():
     assert len(errors) == 6
     torch.testing.assert_close(errors[:3], torch.full((3,), 0.5, dtype=torch.float64))
     assert errors[3:].isinf().all()
+
+
+def test_joints_are_offered_what_fit_does():
+    # fails if select compares levels only where fit finds the structure of joints, or fits one level twice
+    scenes = ("damped_pendulum", "double_pendulum")
+    one, two = (simulate(scene(name), trajectories=1, steps=10, h=0.1) for name in scenes)
+    assert levels_for(two, FitConfig()) == (*levels_for(one, FitConfig()), "auto")
+    assert "auto" not in levels_for(two, FitConfig(features=("pendulums",)))
+    assert levels_for(replace(two, u=torch.zeros_like(two.q)), FitConfig()) == ("forced",)
+
+
+@pytest.mark.slow
+def test_joints_are_chosen_as_fit_finds_them():
+    # fails if the level fitted is not the default of fit, or its model is not preferred where it predicts better
+    data = simulate(scene("double_pendulum"), trajectories=12, steps=49, h=0.02, seed=0)
+    found = select(data, ("linear", "auto"), 1, FitConfig(iterations=40), progress=False)
+    assert found.chosen.level == "auto"
+    assert found.run.config.features
+    assert found.chosen.error < 0.1 * found.candidates[0].error
 
 
 @pytest.mark.parametrize(
