@@ -118,6 +118,23 @@ def test_triples_spread_out():
 
 
 @pytest.mark.slow
+def test_an_interrupted_fit_finds_the_same_structure(tmp_path):
+    # fails if the structure found again is another one, or a stage that was finished is run again from elsewhere
+    data, told = double_pendulum(), FitConfig(iterations=20)
+    whole = fit(data, told, out=tmp_path, progress=False)
+    stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    name, first = next(iter(stored["stages"].items()))
+    assert len(stored["stages"]) > 1
+    torch.save({"key": stored["key"], "stages": {name: first}}, tmp_path / "checkpoint.pt")
+    resumed = fit(data, told, out=tmp_path, progress=False, resume=True)
+    assert resumed.config == whole.config
+    assert resumed.config.features
+    one, other = (torch.nn.utils.parameters_to_vector(run.model.parameters()) for run in (whole, resumed))
+    torch.testing.assert_close(other, one, rtol=1e-12, atol=1e-12)
+    assert resumed.metrics["train_rms"] == pytest.approx(whole.metrics["train_rms"], rel=1e-3)
+
+
+@pytest.mark.slow
 def test_default_fit_of_the_double_pendulum():
     # fails if the default falls back to a constant mass: its error is then 1e-1
     run = fit(double_pendulum(steps=49), FitConfig(train_fraction=1.0), progress=False)
