@@ -76,10 +76,10 @@ def told(**settings: Any) -> FitConfig:
 LINKS: dict[str, Any] = {"features": ("pendulums",), "order": 4}
 CENTRAL = told(level="linear", features=("central",), alike=True, order=4)
 SPRINGS = told(level="linear", features=("chain",), alike=True, order=4)
-PLAIN = told(level="forced", iterations=100)
+PLAIN = told()
 JOINTS = told(level="forced", coupled=True, **LINKS)
 ROWS = [
-    Row("double pendulum, hinges, nothing told", hinged, 0.02, 20, 50, PLAIN, 50, False, 1e-4, 1),
+    Row("double pendulum, hinges, nothing told", hinged, 0.02, 20, 50, PLAIN, 50, False, 1e-4),
     Row("double pendulum, hinges, 20 × 50", hinged, 0.02, 20, 49, JOINTS, 50, False, 1e-4),
     Row("double pendulum, hinges, 100 × 100", hinged, 0.02, 100, 99, JOINTS, 50, False, 1e-4, 3),
     Row("double pendulum, one rate, 20 × 50", lambda: scene("double_pendulum"), 0.02, 20, 49,
@@ -141,7 +141,11 @@ def falling(seed: int) -> dict:
 
 
 def braking(seed: int) -> dict:
-    """Quadratic drag alone at the affine level: the coefficient λ and the position after 200 steps, relative errors."""
+    """Quadratic drag alone at the affine level: the coefficient λ and the position after 200 steps, relative errors.
+
+    The coefficient is that of the rule of order 2 at this step, apart from λ by O(h²): the rest of the error is not
+    the search's, which ends at a one-step error of 4e-9.
+    """
     of, h = scene("quadratic_drag"), 0.05
     data = simulate(of, trajectories=10, steps=120, h=h, seed=seed)
     began = time.process_time()
