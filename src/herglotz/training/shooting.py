@@ -129,36 +129,38 @@ class ShootingProblem:
         return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
 
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Tensor, Tensor]:
-        """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: derivatives by θ are left out, as 0."""
+        """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
         theta, _ = self.unpack(x)
         path = self.solve(x)
         if not everywhere(path is not None) or path is None:
-            return x.new_full((), torch.inf), x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+            unknowns = len(x) - self.P * held
+            return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
         self.path = path
-        grid, n, d, P = self.grid, self.n, self.d, self.P
+        grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
         Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
         cost = loss(fit, self.freedom) + loss(joints, self.freedom)
         by_fit, by_joint = self.weight * root_weights(fit, self.freedom), root_weights(joints, self.freedom)
         fit, joints = by_fit * fit, by_joint * joints
         S = grid.segments
-        A, b = x.new_zeros(len(x), len(x)), x.new_zeros(len(x))
+        A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
         segment = grid.node // (grid.h.shape[1] + 1)
         rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.sigma)[..., None]  # (N', n, P + d)
         for k in range(S):
             own = segment == k
-            self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, x))
+            self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
         for k in (grid.joined_to >= 0).nonzero()[:, 0].tolist():
             before = int(grid.joined_to[k])
             J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
-            columns = torch.cat([self._columns(before, x), self._columns(k, x)[P:]])
+            columns = torch.cat([self._columns(before, P), self._columns(k, P)[P:]])
             self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
-        anchored = self._anchored()
-        anchor = self._anchor(x)
+        anchored, anchor = self._anchored() - self.P + P, self._anchor(x)
         A[anchored, anchored] += 1 / self._anchor_weight**2
         b[anchored] += anchor / self._anchor_weight
         cost = cost + anchor.square().sum() / 2
-        if self.prior is not None:
+        if self.prior is not None and held:
+            cost = cost + self.prior.cost(theta)
+        elif self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
             A[:P, :P] += prior_A
             b[:P] += prior_b
@@ -228,10 +230,11 @@ class ShootingProblem:
         first = (self.grid.joined_to < 0).nonzero()[:, 0]
         return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
-    def _columns(self, segment: int, x: Tensor) -> Tensor:
-        """Columns of the unknowns that a segment's trajectory depends on: parameters, then its own state."""
-        own = torch.arange(self.P + segment * self.d, self.P + (segment + 1) * self.d, device=x.device)
-        return torch.cat([torch.arange(self.P, device=x.device), own])
+    def _columns(self, segment: int, P: int) -> Tensor:
+        """Columns of the unknowns that a segment's trajectory depends on: P parameters, then its own state."""
+        device = self.data.q.device
+        own = torch.arange(P + segment * self.d, P + (segment + 1) * self.d, device=device)
+        return torch.cat([torch.arange(P, device=device), own])
 
     @staticmethod
     def _add(A: Tensor, b: Tensor, J: Tensor, r: Tensor, columns: Tensor) -> None:
@@ -249,12 +252,12 @@ class ShootingProblem:
         return solve_path(self.flat, theta, start, self.grid.h, guess, tol, u=self.u)
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
-        """dX_k/d(θ, own start), shape (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]."""
+        """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
         d = self.d
-        B = theta.new_zeros(S, K, d, self.P) if held else self._parameter_derivatives(theta, path)[..., :d, :]
+        B = theta.new_zeros(S, K, d, 0) if held else self._parameter_derivatives(theta, path)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
-        Z = [torch.cat([theta.new_zeros(S, d, self.P), eye], -1)]
+        Z = [torch.cat([torch.zeros_like(B[:, 0]), eye], -1)]
         pad = theta.new_zeros(S, d, d)
         for k in range(K):
             Z.append(path.A[:, k, :d, :d] @ Z[-1] + torch.cat([B[:, k], pad], -1))

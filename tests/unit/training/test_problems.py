@@ -56,6 +56,16 @@ def shooting_problem(level, n=1):
     return problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], velocity))
 
 
+@pytest.mark.parametrize("level", ["linear", "affine"])
+def test_held_parameters_leave_the_equations_of_the_states(level):
+    # fails if the columns of the states are not moved to where they stand without the parameters
+    problem, x = shooting_problem(level)
+    cost, A, b = problem.normal_equations(x)
+    held = problem.normal_equations(x, held=True)
+    for one, other in zip(held, (cost, A[problem.P :, problem.P :], b[problem.P :]), strict=True):
+        torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("make", [residual_problem, shooting_problem])
 @pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("linear", 2)])
 def test_gradients_match_finite_differences(make, level, n):
@@ -217,8 +227,8 @@ class Weighted(ShootingProblem):
         fit, joints = super()._residuals(x)
         return fit * self.weights[:, None], joints
 
-    def sensitivities(self, theta, path):
-        Z = super().sensitivities(theta, path)
+    def sensitivities(self, theta, path, *, held=False):
+        Z = super().sensitivities(theta, path, held=held)
         flat = Z.flatten(0, 1).clone()
         flat[self.grid.node] = flat[self.grid.node] * self.weights[:, None, None]
         return flat.reshape(Z.shape)
