@@ -109,7 +109,7 @@ def study(name: str, seeds: int, quick: bool, say: Callable[[str], None]) -> dic
     """Every seed's learned and neural settings and the classical ones, timed together; the ratios of each seed."""
     setup: Setup = SETUPS[name]
     if name == "double_pendulum":
-        setup = replace(setup, fit={**setup.fit, "mass_width": 0, **TOLD})
+        setup = replace(setup, fit={**setup.fit, **TOLD})
     timed: list[Timed] = []
     seconds = []
     for seed in range(seeds):

@@ -14,7 +14,8 @@ from herglotz.stepping import State
 from herglotz.systems import scene
 
 CHECKS = 4  # times at which errors are taken
-TOLD = {"features": ("pendulums",), "order": 4, "correction_width": 0}  # what a user knows of two links
+# What a user knows of two links.
+TOLD = {"features": ("pendulums",), "order": 4, "correction_width": 0, "mass_width": 0}
 
 
 @dataclass(frozen=True)
@@ -147,7 +148,6 @@ SETUPS = {
                 "no input": {"use_inputs": False},
                 "no correction": {"correction_width": 0},
                 "correction 6 × 2": {"correction_width": 6},
-                "correction 12 × 1": {"correction_depth": 1},
             },
         ),
         Setup(
