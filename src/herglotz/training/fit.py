@@ -228,7 +228,7 @@ def _race(
     expected: tuple[Triples, float] | None,
 ) -> tuple[ContactLagrangian, int]:
     """The model that is ahead after a short fit from each draw of the weights, and the iterations left: some stall."""
-    heat = min(HEAT, config.iterations // (2 * restarts))
+    heat = min(HEAT, config.iterations // (3 * restarts))
     raced = []
     for k in range(restarts):
         model = build_model(base, replace(config, seed=config.seed + k * APART), network)
