@@ -9,7 +9,8 @@ learned model eager, as ONNX and under torch.compile. Needs scipy.
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
 Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn; rules in
 PyTorch: of 4 motions at once, one round), the same in steps of C leapfrog, evaluations and flops beside it.
-Written: OUT.json after each scene, OUT.md, OUT.png.
+Written: OUT.json after each scene, OUT.md, OUT.png. The two scenes of the headline over several training seeds:
+`work_precision_headline.py`.
 """
 
 from __future__ import annotations
@@ -30,7 +31,6 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from work_precision_analytic import analytic
 from work_precision_cases import prepare
-from work_precision_headline import WANTED, study, study_table
 from work_precision_learned import points
 from work_precision_report import add_leapfrog_unit, draw, front, headline, markdown, spread_of
 from work_precision_scenes import SETUPS
@@ -44,7 +44,6 @@ def main(argv: list[str] | None = None) -> dict:
     parser.add_argument("--quick", action="store_true", help="small fits, few settings")
     parser.add_argument("--scenes", default=None, help="with commas (default: all)")
     parser.add_argument("--resume", action="store_true", help="keep the scenes that OUT.json already holds")
-    parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5; 0: none)")
     parser.add_argument("--only", choices=("analytic", "learned"), help="one half of the settings")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "work_precision.json")
     arguments = parser.parse_args(argv)
@@ -77,10 +76,6 @@ def main(argv: list[str] | None = None) -> dict:
             notes |= {"T": SETUPS[name].T, "h": SETUPS[name].h, "spread": spread_of(found)}
             result["notes"][name] = {**notes, "total_seconds": time.process_time() - began}
             _write(result, arguments.out)
-    for name in (n for n in WANTED if n in names and arguments.seeds and arguments.only is None):
-        if name not in result["study"]:
-            result["study"][name] = study(name, arguments.seeds, arguments.quick, lambda what, n=name: print(n, what))
-            _write(result, arguments.out)
     for name in names:
         print(f"{name}: the front")
         for p in front(result["scenes"][name]):
@@ -93,11 +88,11 @@ def _begun(arguments: argparse.Namespace) -> dict[str, Any]:
     machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
     result: dict[str, Any] = {
         "commit": commit.strip(), "machine": machine, "torch": torch.__version__, "quick": arguments.quick,
-        "scenes": {}, "headline": {}, "notes": {}, "study": {},
+        "scenes": {}, "headline": {}, "notes": {},
     }  # fmt: skip
     if arguments.resume and arguments.out.exists():
         old = json.loads(arguments.out.read_text())
-        result |= {k: old[k] for k in ("scenes", "headline", "notes", "study") if k in old}
+        result |= {k: old[k] for k in ("scenes", "headline", "notes")}
     return result
 
 
@@ -108,8 +103,7 @@ def _write(result: dict[str, Any], out: Path) -> None:
     partial = out.with_suffix(".part")
     partial.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
     partial.replace(out)
-    tables = [line for name, found in result["study"].items() for line in study_table(name, found)]
-    out.with_suffix(".md").write_text(markdown(result) + "\n".join([*tables, ""]))
+    out.with_suffix(".md").write_text(markdown(result))
     draw(order, out.with_suffix(".png"))
 
 

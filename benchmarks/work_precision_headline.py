@@ -1,4 +1,7 @@
-"""The two scenes of the headline with several training seeds: learned kicks, and a learned equation.
+"""The two scenes of the headline, several training seeds: `python benchmarks/work_precision_headline.py --seeds 5`.
+
+Learned kicks on the damped pendulum, a learned equation on the double pendulum, beside neural ODEs trained on the same
+motions and what is best on the true equations, all in C.
 
 A seed draws the training motions, the first weights of every network and of every neural ODE. Of each starting set the
 first half chooses a setting, the second half judges it; what it is compared with is the cheapest rival that is as
@@ -7,14 +10,23 @@ accurate on the judging half itself, a choice no user can make.
 
 from __future__ import annotations
 
+import argparse
+import json
+import os
+import platform
 import statistics
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
 from work_precision_cases import TIMED, Case, Timed, costs, motions_of, prepare, repeated, rolled
 from work_precision_native import FLOPS, Native
 from work_precision_report import RIVALS
@@ -26,6 +38,7 @@ from herglotz.tune.distil import pairs_of
 from herglotz.tune.kicks import can_kick, fit_kicks
 from herglotz.tune.kicks_c import CompiledKicks
 
+ROOT = Path(__file__).resolve().parents[1]
 WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}
 
 
@@ -178,3 +191,42 @@ def study_table(name: str, result: dict[str, Any]) -> list[str]:
             cells = [middle([r[k] for r in found]) for k in ("error", "us_per_time", *names)]
             lines.append(f"| {row['wanted']:g} | {len(found)} of {result['seeds']} | {' | '.join(cells)} |")
     return lines
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Measure, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small fits, few settings")
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds (default 5)")
+    parser.add_argument("--scenes", default=",".join(WANTED), help="with commas (default %(default)s)")
+    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "headline.json")
+    arguments = parser.parse_args(argv)
+    torch.set_num_threads(1)
+    names = arguments.scenes.split(",")
+    if unknown := [n for n in names if n not in WANTED]:
+        parser.error(f"unknown scenes {', '.join(unknown)}; choose from {', '.join(WANTED)}")
+    result = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"scenes": {}}
+    for name in names:
+        found = study(name, arguments.seeds, arguments.quick, lambda what, n=name: print(n, what, flush=True))
+        result["scenes"][name] = found | {"measured": _where()}
+        write(result, arguments.out)
+
+
+def _where() -> dict[str, Any]:
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
+    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    return {"commit": commit.strip(), "torch": torch.__version__, "machine": machine}
+
+
+def write(result: dict[str, Any], out: Path) -> None:
+    """OUT.json and OUT.md."""
+    out.parent.mkdir(parents=True, exist_ok=True)
+    partial = out.with_suffix(".part")
+    partial.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
+    partial.replace(out)
+    tables = [line for name, found in result["scenes"].items() for line in study_table(name, found)]
+    out.with_suffix(".md").write_text("\n".join(["# Cost of the others over the learned stepper's", *tables, ""]))
+
+
+if __name__ == "__main__":
+    main()
