@@ -28,7 +28,10 @@ LIMIT = 1e-3  # every scene's own model misses it at twice its step
 def run_of(name):
     level, h = SCENES[name]
     data = simulate(scene(name), trajectories=6, steps=24, h=h, seed=0)
-    settings = FitConfig(level=level, train_fraction=1.0, objective="residual", iterations=8, departures=(2e-3,))
+    iterations = 40 if name == "damped_pendulum" else 8  # one wide layer is rough at first, and rough is hard to follow
+    settings = FitConfig(
+        level=level, train_fraction=1.0, objective="residual", iterations=iterations, departures=(2e-3,)
+    )
     return fit(data, settings, progress=False)
 
 
@@ -47,7 +50,8 @@ def test_promise_holds_on_held_out_starts(name, monkeypatch):
         return [Cost(1.0, 0.0) for _ in timed]
 
     monkeypatch.setattr("herglotz.tune.search.measure_costs", by_count)
-    found = tune(run_of(name), max_error=LIMIT, config=QUICK, progress=False)
+    longer = replace(QUICK, iterations=80, pairs=500) if name == "damped_pendulum" else QUICK
+    found = tune(run_of(name), max_error=LIMIT, config=longer, progress=False)
     plain = found.candidates[1]
     assert (plain.setting.multiple, plain.setting.width) == (2, None)
     assert plain.median > LIMIT
