@@ -7,8 +7,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, count, finite, print_json, print_table
-from herglotz.errors import InputError
+from herglotz.cli.common import count, finite, print_json, print_table
+from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, parse_angles
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -19,7 +19,6 @@ ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
 OPTIMISERS = ("lm", "adam")
-DTYPES = ("float64", "float32")
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
@@ -36,8 +35,7 @@ example:
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("fit", help="train a model on measured positions", description=DESCRIPTION)
-    parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
-    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
+    add_run_flags(parser)
     parser.add_argument(
         "--level", choices=("auto", *LEVELS), default="auto",
         help="auto: forced with dry friction where inputs u are recorded, else linear. conservative: no damping. "
@@ -52,10 +50,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--optimiser", choices=OPTIMISERS, default="lm",
         help="lm: Levenberg–Marquardt. adam: for residual and raw only (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--train-fraction", type=finite, default=0.667, metavar="F",
-        help="part of every trajectory, in time, to train on, 0 < F <= 1 (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--robust", choices=ROBUST, default="auto",
@@ -96,25 +90,15 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--order", type=int, choices=(2, 4), default=2,
         help="of the rule; 4: from the features alone, without networks (default %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=count, default=0, help="of the initial weights (default %(default)s)")
-    parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default %(default)s)")
-    parser.add_argument(
-        "--angles", metavar="NAMES",
-        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad)",
-    )  # fmt: skip
-    parser.add_argument("--resume", action="store_true", help="go on from the checkpoint that an interrupted fit left")
-    parser.add_argument("--json", action="store_true", help="print the metrics as JSON, and nothing else")
     parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
+    add_machine_flags(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, check the output, train, save, draw, report."""
     out: Path = arguments.out
-    check_output_folder(out)
-    if (out / "model.pt").exists() and not arguments.resume:
-        raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
+    check_run_folder(out, arguments.resume)
 
     from herglotz.data import load
     from herglotz.training import FitConfig, fit, load_run, save_run
@@ -146,13 +130,6 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         report(result, out, drawn)
     return 0
-
-
-def parse_angles(text: str | None) -> list[str] | None:
-    """`none` → [], `a,b` → [a, b], nothing → None: what the file says."""
-    if text is None:
-        return None
-    return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
 
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:

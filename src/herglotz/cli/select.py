@@ -6,9 +6,9 @@ import argparse
 import json
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder, count, finite, print_json
-from herglotz.cli.fit import LEVELS, parse_angles
-from herglotz.errors import InputError
+from herglotz.cli.common import count, print_json
+from herglotz.cli.fit import LEVELS
+from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, parse_angles
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -24,34 +24,21 @@ examples:
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("select", help="fit the ladder, keep the simplest level", description=DESCRIPTION)
-    parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
-    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
+    add_run_flags(parser)
     parser.add_argument(
         "--levels",
         help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
         "but full, and auto for joints; with recorded inputs u: forced",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
-    parser.add_argument("--seed", type=count, default=0, help="the first of them (default %(default)s)")
-    parser.add_argument(
-        "--train-fraction", type=finite, default=0.667, metavar="F",
-        help="part of every trajectory, in time, to train on, 0 < F < 1 (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--angles", metavar="NAMES",
-        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad)",
-    )  # fmt: skip
-    parser.add_argument("--resume", action="store_true", help="go on after an interruption")
-    parser.add_argument("--json", action="store_true", help="print the table as JSON, and nothing else")
+    add_machine_flags(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read, check the output, fit the ladder, save the chosen run, report."""
     out: Path = arguments.out
-    check_output_folder(out)
-    if (out / "model.pt").exists() and not arguments.resume:
-        raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
+    check_run_folder(out, arguments.resume)
 
     from herglotz.data import load
     from herglotz.data.files import write_atomically
@@ -59,7 +46,9 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.training import FitConfig, save_run, select
 
     data = load(arguments.data, angles=parse_angles(arguments.angles))
-    config = FitConfig(train_fraction=arguments.train_fraction, seed=arguments.seed)
+    config = FitConfig(
+        train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device
+    )
     levels = None
     if arguments.levels is not None:
         levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]

@@ -11,6 +11,7 @@ import torch
 import herglotz
 import herglotz.cli
 import herglotz.cli.fit
+import herglotz.cli.flags
 import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.data import load
@@ -59,8 +60,8 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 
 
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
-    fit = herglotz.cli.fit
-    assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, fit.DTYPES)
+    fit, flags = herglotz.cli.fit, herglotz.cli.flags
+    assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
     assert (ROBUST, SUPERVISION) == (fit.ROBUST, fit.SUPERVISION)
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
@@ -209,11 +210,13 @@ def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  
     assert "--resume" in capsys.readouterr().err
 
 
-def test_select(capsys, tiny_csv, tmp_path):  # fails if the chosen run, the table or the figure is missing
+def test_select(capsys, tiny_csv, tmp_path):  # fails if run, table or figure is missing, or --dtype does not arrive
     out = tmp_path / "selected"
-    code, found = run_json(capsys, "select", tiny_csv, "--out", out, "--levels", "linear", "--seeds", 1)
+    arguments = ["select", tiny_csv, "--out", out, "--levels", "linear", "--seeds", 1, "--dtype", "float32"]
+    code, found = run_json(capsys, *arguments)
     assert code == 0
     assert found["chosen"] == "linear"
+    assert load_run(out).config.dtype == "float32"
     assert found["levels"][0]["held_out_rms"] == pytest.approx(load_run(out).metrics["extrapolation_rms"], rel=0.05)
     assert (out / "selection.png").stat().st_size > 10_000
 

@@ -1,0 +1,48 @@
+"""Flags of every command that trains, and the two that write a run, and how they are read."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from herglotz.cli.common import check_output_folder, count, finite
+from herglotz.errors import InputError
+
+DTYPES = ("float64", "float32")  # a copy, so that help does not import PyTorch; a test compares
+
+
+def add_run_flags(parser: argparse.ArgumentParser) -> None:
+    """Add DATA, --out and --resume, and how the data are read: --angles, --train-fraction."""
+    parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
+    parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
+    parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
+    parser.add_argument(
+        "--train-fraction", type=finite, default=0.667, metavar="F",
+        help="part of every trajectory, in time, to train on, 0 < F <= 1 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--angles", metavar="NAMES",
+        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad)",
+    )  # fmt: skip
+
+
+def add_machine_flags(parser: argparse.ArgumentParser) -> None:
+    """Add --seed, --device, --dtype and --json."""
+    parser.add_argument("--seed", type=count, default=0, help="of the initial weights (default %(default)s)")
+    parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
+    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default %(default)s)")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
+
+
+def check_run_folder(out: Path, resume: bool) -> None:
+    """Raise unless a run can be written there: nothing in the way, and no finished run that would be lost."""
+    check_output_folder(out)
+    if (out / "model.pt").exists() and not resume:
+        raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
+
+
+def parse_angles(text: str | None) -> list[str] | None:
+    """`none` → [], `a,b` → [a, b], nothing → None: what the file says."""
+    if text is None:
+        return None
+    return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
