@@ -48,6 +48,9 @@ def _one(product: Product, weight: float, dof: int, dtype: str) -> list[str]:
             *(f"V->slope[{i}] += slope * q[{i}];" for i in range(dof)),
         ]
     form = [(i, w) for i, w in enumerate(product.form) if w]
+    if not form:  # the feature `1`, which moves s alone
+        constant = {"cos": 1.0, "sin": 0.0, "power": float(product.power == 0)}[product.function]
+        return [f"V->value += {number(weight * constant, dtype)};"]
     y = " + ".join(f"{number(w, dtype)} * q[{i}]" for i, w in form)
     value, bend, slope = {
         "cos": ("COS(y)", -weight, "SIN(y)"),

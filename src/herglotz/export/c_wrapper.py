@@ -225,7 +225,8 @@ def _compile(words: list[str], header: str, loops: str) -> bytes:
                 raise InputError(f"{words[0]}: cannot be run ({error}); set CC to a C compiler") from None
             if done.returncode == 0:
                 return library.read_bytes()
-            message = (done.stderr.strip().splitlines() or ["no message"])[0]
+            lines = done.stderr.strip().splitlines() or ["no message"]
+            message = next((x.strip() for x in lines if "error" in x.lower()), lines[0])  # the first names the files
     raise InputError(f"{words[0]}: does not compile the header ({message[:200]}); export the model again")
 
 

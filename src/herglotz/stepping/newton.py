@@ -23,7 +23,8 @@ class Status(IntEnum):
     SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
     DIVERGED = 3  # a value stopped being finite
     STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
-    UNRESOLVED = 5  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
+    BAD_INPUT = 5  # h is no step, or a number is not finite: of exported files only, a stepper raises
+    UNRESOLVED = 6  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
 
 
 @runtime_checkable
