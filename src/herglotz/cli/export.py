@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import KICKS, check_output_file, print_json
+from herglotz.cli.common import KICKS, check_output_file, positive, print_json
 
 # Extension of each format, and what may be said of the next thing to do.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
@@ -35,6 +35,10 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2, .onnx or (C) .h"
     )
     parser.add_argument("--format", choices=tuple(SUFFIX), default="pt2", help="of the file (default %(default)s)")
+    parser.add_argument(
+        "--h-range", type=positive, nargs=2, metavar=("LOW", "HIGH"),
+        help="steps h that the file may take (default: those of the data); others are flagged, or refused in Python",
+    )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
 
@@ -61,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
         "time_unit": result.data.time_unit,
         "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s)},
         "metrics": result.metrics,
+        "h_range": list(arguments.h_range or result.h_range),
     }
     described: dict[str, Any] = {"h": result.h, "box": result.box, "units": result.data.units, "metadata": metadata}
     write(result.model, arguments.out, **described)
@@ -76,9 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
         if kicks.is_file():
             print(f"The kicks that tune chose exist in C only (--format c); {arguments.out} is the model behind them")
         if arguments.format == "c":
-            print(f"Next: the example at the top of {arguments.out}, with cc -O3 -march=native")
-        else:
-            print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
+            print(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
+        print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
     return 0
 
 

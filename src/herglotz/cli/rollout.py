@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from inspect import signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +26,7 @@ trained on, or from --q0 and --p0. The model's mass is 1 (first coordinate), so 
 examples:
   herglotz rollout runs/pendulum --steps 200 --out future.csv
   herglotz rollout runs/driven --steps 200 --inputs torque.csv --out motion.csv
-  herglotz rollout pendulum.pt2 --steps 200 --h 0.05 --q0 1.2 --p0 0 --out motion.csv
+  herglotz rollout runs/pendulum --steps 200 --h 0.05 --q0 1.2 --p0 0 --out motion.csv
 """
 
 
@@ -44,6 +45,7 @@ class Source:
     units: tuple[str, ...]
     angles: tuple[bool, ...]
     time_unit: str
+    box: Callable[..., torch.Tensor] | None  # (q, p, s): whether a state lies outside of what the model was fitted to
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -92,11 +94,13 @@ def run(arguments: argparse.Namespace) -> int:
     u, h = _inputs(arguments, source, start.q.dtype)
     began = time.perf_counter()
     with torch.no_grad():
-        found = source.stepper.rollout(*start, h=h, steps=arguments.steps, **u)
+        found = source.stepper.rollout(*start, h=h, steps=arguments.steps, inputs=u)
     seconds = time.perf_counter() - began
     h_all = h.double() if isinstance(h, torch.Tensor) else torch.full((arguments.steps,), h, dtype=torch.float64)
     h = float(h_all.mean())
     _check(found, h)
+    outside = None if source.box is None else source.box(found.q, found.p, found.s)
+    left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
     motion = Trajectories.of(
         t0 + torch.cat([h_all.new_zeros(1), h_all.cumsum(0)]), found.q.double(), names=source.names,
         units=source.units, angles=source.angles, s=found.s.double(), p=found.p.double(), time_unit=source.time_unit,
@@ -110,6 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
         "h": h,
         "seconds": seconds,
         "largest_residual": float(found.residual.max()),
+        "outside_from_step": left,
         "final": {"q": last.q.tolist(), "p": last.p.tolist(), "s": float(last.s), "sigma": float(found.sigma[-1])},
     }
     if arguments.json:
@@ -118,6 +123,9 @@ def run(arguments: argparse.Namespace) -> int:
         end = ", ".join(f"{name} = {float(x):.6g}" for name, x in zip(source.names, last.q, strict=True))
         per_step = 1e6 * seconds / arguments.steps
         print(f"{arguments.out}: {arguments.steps} steps of {h:g} {source.time_unit}, {per_step:.0f} µs each; {end}")
+    if left is not None:
+        text = f"from step {left} on, the motion is not always among the states the model was fitted to (q, p, s)"
+        print(f"herglotz: note: {text}", file=sys.stderr)
     return 0
 
 
@@ -131,6 +139,7 @@ def read_source(path: Path, trajectory: int) -> Source:
     """
     import torch
 
+    from herglotz.export.box import Box
     from herglotz.stepping import State
 
     if path.is_dir() or path.suffix.lower() not in SUFFIXES:
@@ -140,7 +149,8 @@ def read_source(path: Path, trajectory: int) -> Source:
         run_, data = (found := load_run(path)), found.data
         start = last_fitted(run_, trajectory)
         t0 = float(data.t[data.offsets[trajectory] + max(run_.train_lengths[trajectory], 1) - 1])
-        return Source(run_.stepper, start, t0, run_.h, data.names, data.units, data.angles, data.time_unit)
+        box = Box(run_.box, data.angles, start.q.dtype)
+        return Source(run_.stepper, start, t0, run_.h, data.names, data.units, data.angles, data.time_unit, box)
 
     from herglotz.export import load_exported
 
@@ -151,7 +161,8 @@ def read_source(path: Path, trajectory: int) -> Source:
     names = tuple(m.get("names") or (["q"] if n == 1 else [f"q{i}" for i in range(n)]))
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
-    return Source(stepper, start, 0.0, stepper.h, names, units, angles, m.get("time_unit", "s"))
+    box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype)
+    return Source(stepper, start, 0.0, stepper.h, names, units, angles, m.get("time_unit", "s"), box)
 
 
 def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
@@ -175,15 +186,15 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
     return State(*(torch.tensor(x, dtype=dtype) for x in values)), 0.0
 
 
-def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -> tuple[dict[str, Any], Any]:
-    """The keyword that hands the inputs to `rollout`, and the steps: one size, or the recorded ones, (K,)."""
+def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -> tuple[torch.Tensor | None, Any]:
+    """The inputs (K, m), and the steps: one size, or the recorded ones, (K,)."""
     import torch
 
     from herglotz.data import load
 
     h = source.h if arguments.h is None else arguments.h
     if arguments.u is None and arguments.inputs is None:
-        return {}, h
+        return None, h
     if arguments.u is not None and arguments.inputs is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
     steps = arguments.steps
@@ -198,8 +209,7 @@ def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -
             raise InputError(f"--inputs {arguments.inputs}: {steps} steps need more than {recorded.samples} samples")
         u = recorded.u[:steps].to(dtype)
         h = recorded.t.diff()[:steps].to(dtype) if arguments.h is None else h
-    name = "inputs" if "inputs" in signature(source.stepper.rollout).parameters else "u"
-    return {name: u}, h
+    return u, h
 
 
 def _check(found: Rollout, h: float) -> None:

@@ -14,7 +14,8 @@ DESCRIPTION = """\
 Measure every identity that a discrete contact Lagrangian must satisfy on a scene, a run or an exported file, and
 compare each with its tolerance. The exit code is 0 when all pass and 1 when one fails. Of a file without derivatives
 (ONNX, aoti, C) they are measured by differences of order 8, with wider tolerances.
-With --against RUN a file is also stepped beside the run's own stepper: 1, 7 and 4096 samples over 1000 steps.
+A file is also stepped beside the run it was exported from, 1, 7 and 4096 samples over 1000 steps: the one that
+--against names, or a folder with the same weights beside the file, here, or in runs/ of either.
 
 examples:
   herglotz verify damped_oscillator
@@ -35,7 +36,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--steps", type=count, default=8, help="steps of the checks along motions (default %(default)s)"
     )
     parser.add_argument("--seed", type=count, default=0, help="of the states (default %(default)s)")
-    parser.add_argument("--against", type=Path, metavar="RUN", help="run that a file was exported from")
+    parser.add_argument(
+        "--against", type=Path, metavar="RUN", help="run that a file was exported from (default: looked for)"
+    )
     parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
     parser.set_defaults(run=run)
 
@@ -44,17 +47,22 @@ def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
     if arguments.samples < 1 or arguments.steps < 2:
         raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
-    target = arguments.target
+    target, path = arguments.target, None
     if Path(target).is_file():
         from herglotz.export import load_exported
 
-        target = load_exported(target)
+        path, target = Path(target), load_exported(target)
+        if arguments.against is None:
+            arguments.against = _exported_from(target, path)
     elif arguments.against is not None:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
+    from herglotz.training import load_run
     from herglotz.verify import verify
 
-    report = verify(target, h=arguments.h, samples=arguments.samples, steps=arguments.steps, seed=arguments.seed)
+    settings = {name: getattr(arguments, name) for name in ("h", "samples", "steps", "seed")}
+    model = None if arguments.against is None else load_run(arguments.against).model.to(target.dtype)
+    report = verify(target, model=model, **settings)
     agreement = None if arguments.against is None else _agreement(target, arguments)
     passed = report.passed and (agreement is None or agreement["passed"])
     if arguments.json:
@@ -63,7 +71,24 @@ def run(arguments: argparse.Namespace) -> int:
         print(report.table())
         if agreement is not None:
             print(_table(agreement, arguments.against))
+        elif path is not None:
+            print("not compared with its model: no run with these weights is near; name it with --against RUN")
     return 0 if passed else 1
+
+
+def _exported_from(exported: Any, file: Path) -> Path | None:
+    """A run near the file, or near here, that holds its weights."""
+    from herglotz.export import weights_digest
+    from herglotz.training import load_run
+
+    for folder in dict.fromkeys((file.parent, file.parent / "runs", Path(), Path("runs"))):
+        for model in sorted(folder.glob("*/model.pt")):
+            try:
+                if weights_digest(load_run(model.parent).model) == exported.metadata["weights_sha256"]:
+                    return model.parent
+            except InputError:  # a folder of something else
+                continue
+    return None
 
 
 def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:

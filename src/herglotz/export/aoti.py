@@ -46,7 +46,8 @@ def export_aoti(
     Parameters
     ----------
     model, path, h, box, units, metadata, newton_iterations
-        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside.
+        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside,
+        plus 2 where h is outside an `h_range` in the metadata.
 
     Returns
     -------

@@ -139,7 +139,8 @@ def export_c(
     dtype
         "float64" (C double) or "float32" (C float).
     h_range
-        Smallest and largest step the model was fitted for: steps outside are flagged in the status. Default: any h > 0.
+        Smallest and largest step the model was fitted for: steps outside are flagged in the status. Default: that of
+        the metadata, or any h > 0.
     tolerance
         Of Newton, relative to the size of q: where the model is no more exact than this, fewer iterations serve as
         well. Default: 16 machine epsilons.
@@ -243,7 +244,7 @@ def _entries(
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
         raise InputError(f"dtype must be 'float64' or 'float32', got {dtype!r}")
-    span = None if h_range is None else [float(x) for x in h_range]
+    span = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     entries = describe(model, h, box, units, MAX_ITERATIONS, {**extra, "h_range": span})
     torch_dtype = getattr(torch, dtype)
     bad = [key for key, value in model.state_dict().items() if not bool(torch.isfinite(value.to(torch_dtype)).all())]

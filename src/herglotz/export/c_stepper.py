@@ -15,7 +15,7 @@ from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
 from herglotz.export.c_wrapper import build
-from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
+from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Rollout, State, Status, Step, step_sizes
 
@@ -97,7 +97,8 @@ class CompiledStepper:
         self._check(q, p, s)
         h = spread_h(self._checked_h(h), s)[..., None]
         out = self._rollout(q, p, s, h, None if u is None else u.expand(*s.shape, u.shape[-1])[..., None, :])
-        return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS)
+        outside = None if out.outside is None else out.outside[..., 0]
+        return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS, outside)
 
     def rollout(
         self,
@@ -112,7 +113,6 @@ class CompiledStepper:
         events: Sequence[Any] = (),
         checkpoint: int | None = None,
         chunk: int = 1024,
-        u: Tensor | None = None,
     ) -> Rollout:
         """Step K times from (q, p, s); everything after a failed step is NaN.
 
@@ -125,8 +125,7 @@ class CompiledStepper:
         steps
             K; needed for a scalar h without inputs only.
         inputs
-            (K, m) or (..., K, m): u_k of each step, for a model with inputs. `u` is the same by the name that the other
-            exported steppers have for it.
+            (K, m) or (..., K, m): u_k of each step, for a model with inputs; None: no input acts.
         every
             Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
         events
@@ -140,7 +139,6 @@ class CompiledStepper:
             As `step`, and if lengths disagree.
         """
         del checkpoint, chunk
-        inputs = u if inputs is None else inputs
         if events:
             raise InputError("a compiled stepper has no events; use herglotz.Stepper")
         s = torch.zeros_like(q[..., 0]) if s is None else s
@@ -148,10 +146,8 @@ class CompiledStepper:
         if inputs is not None and inputs.ndim > 1 and steps is None and torch.as_tensor(h).ndim == 0:
             steps = inputs.shape[-2]
         h = step_sizes(self._checked_h(h), steps)
-        if every < 1 or h.shape[-1] % every:
-            raise InputError(f"every must divide the number of steps, got {every} and {h.shape[-1]}")
-        out = self._rollout(q, p, s, h, inputs)
-        return out if every == 1 else _decimated(out, every)
+        check_every(every, h.shape[-1])
+        return decimated(self._rollout(q, p, s, h, inputs), every)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
@@ -163,6 +159,7 @@ class CompiledStepper:
         """
         if self.metadata["box"] is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
+        self._check(*state, finite=False)
         out = torch.zeros(state.s.shape, dtype=torch.uint8)
         self._call("herglotz_outside_box", state.s.numel(), *(x.contiguous() for x in state), out)
         return out.bool()
@@ -182,7 +179,11 @@ class CompiledStepper:
         h_stride, u_stride = 0 if shared else steps, 0 if common else steps * self.inputs
         outputs = (q_out, p_out, s_out, sigma, status, residual)
         self._call("herglotz_rollouts", s.numel(), steps, *starts, h, h_stride, 1, u, u_stride, *outputs)
-        return Rollout(q_out, p_out, s_out, sigma, status, residual)
+        outside = None
+        if self.metadata["box"] is not None:
+            there = self.outside_box(State(q_out, p_out, s_out))
+            outside = (there[..., 1:] | there[..., :-1]).to(torch.uint8)
+        return Rollout(q_out, p_out, s_out, sigma, status, residual, outside=outside)
 
     def _inputs(self, u: Tensor | None, shape: tuple[int, ...]) -> Tensor | None:
         """Inputs (*shape, m), checked; None where there are none."""
@@ -203,26 +204,13 @@ class CompiledStepper:
         )
         getattr(self._library, function)(*converted)
 
-    def _check(self, q: Tensor, p: Tensor, s: Tensor) -> None:
-        check_state(q, p, s, self.dof, self.dtype)
+    def _check(self, q: Tensor, p: Tensor, s: Tensor, finite: bool = True) -> None:
+        check_state(q, p, s, self.dof, self.dtype, finite=finite)
         for name, x in (("q", q), ("p", p), ("s", s)):
             if x.device.type != "cpu" or x.requires_grad:
                 raise InputError(
                     f"{name} must be on the CPU and without gradient; use Stepper, or {name}.detach().cpu()"
                 )
-
-
-def _decimated(rollout: Rollout, every: int) -> Rollout:
-    """Each m-th state, with the worst status and residual of the steps before it."""
-    groups = (-1, every)
-    return Rollout(
-        q=rollout.q[..., ::every, :],
-        p=rollout.p[..., ::every, :],
-        s=rollout.s[..., ::every],
-        sigma=rollout.sigma[..., ::every],
-        status=rollout.status.unflatten(-1, groups).amax(-1),
-        residual=rollout.residual.unflatten(-1, groups).amax(-1),
-    )
 
 
 def load_c(path: PathLike) -> CompiledStepper:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from inspect import signature
 from typing import Any
 
 import torch
@@ -58,7 +57,6 @@ def compare(
     size_of_step = float(exported.h) if h is None else h
     make = torch.Generator().manual_seed(seed)
     inputs = getattr(stepper.L_d, "inputs", 0)
-    name = "inputs" if "inputs" in signature(exported.rollout).parameters else "u"
     per_batch = {}
     for size in batches:
         few = min(size, DISTINCT)
@@ -67,13 +65,12 @@ def compare(
         if size > few:
             order = torch.cat([order, torch.randint(few, (size - few,), generator=make)])
         with torch.no_grad():
-            driven: dict[str, Any] = {}
-            driven_eager: dict[str, Any] = {}
+            u = None
             if inputs:
                 u = 2 * torch.rand(few, steps, inputs, generator=make, dtype=torch.float64).to(start[0]) - 1
-                driven, driven_eager = {name: u[order]}, {"inputs": u}
-            ours = exported.rollout(*(x[order] for x in start), h=size_of_step, steps=steps, **driven)
-            eager = stepper.rollout(*start, h=size_of_step, steps=steps, **driven_eager)
+            mine = None if u is None else u[order]
+            ours = exported.rollout(*(x[order] for x in start), h=size_of_step, steps=steps, inputs=mine)
+            eager = stepper.rollout(*start, h=size_of_step, steps=steps, inputs=u)
         per_batch[int(size)] = _difference(ours, eager, order)
     worst: dict[str, Any] = {key: max(one[key] for one in per_batch.values()) for key in ("q", "p", "s", "c")}
     totals = {key: sum(one[key] for one in per_batch.values()) for key in ("status", "failed")}

@@ -1,4 +1,4 @@
-"""What every exported stepper checks before it steps: shapes, dtype, finite values and h > 0."""
+"""What exported steppers share: checks of shapes, dtype, values and h before they step, and decimation after it."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.stepping import Rollout
 
 
 def check_state(
@@ -17,6 +18,7 @@ def check_state(
     dof: int,
     dtype: torch.dtype,
     names: tuple[str, str, str] = ("q", "p", "s"),
+    finite: bool = True,
 ) -> None:
     """Refuse a state that the file was not written for.
 
@@ -28,6 +30,8 @@ def check_state(
         n and the dtype of the file.
     names
         What the caller calls the three.
+    finite
+        Whether every value has to be.
 
     Raises
     ------
@@ -42,7 +46,7 @@ def check_state(
     for name, x in zip(names, (q, p, s), strict=True):
         if x.dtype != dtype:
             raise InputError(f"{name} must be {dtype}, got {x.dtype}; convert it with .to({dtype})")
-        if not bool(torch.isfinite(x).all()):
+        if finite and not bool(torch.isfinite(x).all()):
             raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
 
 
@@ -61,7 +65,10 @@ def check_range(h: Tensor, span: Sequence[float] | None) -> None:
     slack = 4 * torch.finfo(h.dtype).eps
     if float(h.min()) < span[0] * (1 - slack) or float(h.max()) > span[1] * (1 + slack):
         found = f"{float(h.min()):g} … {float(h.max()):g}"
-        raise InputError(f"h must lie in [{span[0]:g}, {span[1]:g}], where the model was fitted; got {found}")
+        raise InputError(
+            f"h must lie in [{span[0]:g}, {span[1]:g}], where the model was fitted; got {found}. "
+            "Export it with another --h-range (h_range in Python) to step elsewhere"
+        )
 
 
 def spread_h(h: Tensor, like: Tensor) -> Tensor:
@@ -78,13 +85,32 @@ def spread_h(h: Tensor, like: Tensor) -> Tensor:
     return h.expand(like.shape)
 
 
-def check_inputs(u: Tensor | None, count: int, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+def check_inputs(u: Tensor, count: int, shape: tuple[int, ...], dtype: torch.dtype) -> None:
     """Refuse inputs u that the model does not take: shape (*shape, m), finite, of the file's dtype."""
-    if u is None:
-        if count:
-            raise InputError(f"the model takes {count} input(s) u a step; give u")
-        return
     if count == 0:
         raise InputError("the model takes no inputs; leave u out")
     if u.shape != (*shape, count) or u.dtype != dtype or not bool(torch.isfinite(u).all()):
         raise InputError(f"u needs {count} finite number(s) a step in {dtype}, got {tuple(u.shape)} in {u.dtype}")
+
+
+def check_every(every: int, steps: int) -> None:
+    """Refuse a decimation that does not divide the number of steps."""
+    if every < 1 or steps % every:
+        raise InputError(f"every must divide the number of steps, got {every} and {steps}")
+
+
+def decimated(rollout: Rollout, every: int) -> Rollout:
+    """Each m-th state, with the worst status, residual and flag of the steps before it."""
+    if every == 1:
+        return rollout
+    worst = {
+        name: None if (x := getattr(rollout, name)) is None else x.unflatten(-1, (-1, every)).amax(-1)
+        for name in ("status", "residual", "outside")
+    }
+    return Rollout(
+        q=rollout.q[..., ::every, :],
+        p=rollout.p[..., ::every, :],
+        s=rollout.s[..., ::every],
+        sigma=rollout.sigma[..., ::every],
+        **worst,  # pyright: ignore[reportArgumentType]
+    )

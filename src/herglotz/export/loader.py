@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import zipfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from torch import Tensor
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.box import Box
-from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
+from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.export.metadata import METADATA, from_json
 from herglotz.export.pt2 import quiet
 from herglotz.stepping import Rollout, State, Step, step_sizes
@@ -85,7 +86,7 @@ class ExportedStepper:
         h
             Time step > 0, scalar or (...).
         u
-            (..., m) inputs, for a model that takes some.
+            (..., m) inputs, for a model that takes some; None: no input acts.
 
         Returns
         -------
@@ -105,10 +106,10 @@ class ExportedStepper:
             out = self.programs["model"](*flat)
         else:
             out = tuple(x[0] for x in self.programs["rollout"](*flat[:3], *(x[None] for x in flat[3:])))
-        q1, p1, s1, c, residual, status = out[:6]
+        q1, p1, s1, c, residual, status, *outside = out
         new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
-        c, residual, status = (x.reshape(s.shape) for x in (c, residual, status))
-        return Step(new, c, status, residual, self.metadata["newton_iterations"])
+        c, residual, status, *outside = (x.reshape(s.shape) for x in (c, residual, status, *outside))
+        return Step(new, c, status, residual, self.metadata["newton_iterations"], *outside)
 
     def rollout(
         self,
@@ -118,7 +119,8 @@ class ExportedStepper:
         *,
         h: Tensor | float,
         steps: int | None = None,
-        u: Tensor | None = None,
+        inputs: Tensor | None = None,
+        every: int = 1,
     ) -> Rollout:
         """Step K times from (q, p, s), inside the file; everything after a failed step is NaN. No derivatives.
 
@@ -129,9 +131,11 @@ class ExportedStepper:
         h
             A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
         steps
-            K; needed for a scalar h only.
-        u
-            (..., K, m) inputs, for a model that takes some.
+            K; needed for a scalar h without inputs only.
+        inputs
+            (K, m) or (..., K, m): u_k of each step, for a model that takes some; None: no input acts.
+        every
+            Keep each m-th state only; m divides K. Statuses, residuals and flags are the worst of the m steps.
 
         Raises
         ------
@@ -140,20 +144,25 @@ class ExportedStepper:
         """
         s = torch.zeros_like(q[..., 0]) if s is None else s
         self._check(q, p, s)
+        if inputs is not None and inputs.ndim < 2:
+            raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
+        if inputs is not None and steps is None and torch.as_tensor(h).ndim == 0:
+            steps = inputs.shape[-2]
         h_all = step_sizes(self._checked_h(h), steps)
         steps, size = h_all.shape[-1], s.numel()
+        check_every(every, steps)
         rows = [spread_h(h_all[..., k], s).reshape(-1) for k in range(steps)] if h_all.ndim > 1 else []
         h_rows = torch.stack(rows) if rows else h_all.reshape(-1, 1).expand(steps, size)
-        u_rows = None if u is None else u.expand(*s.shape, steps, u.shape[-1]).reshape(size, steps, -1).transpose(0, 1)
-        check_inputs(u_rows, self.inputs, (steps, size), self.dtype)
-        more = () if u_rows is None else (u_rows,)
+        more = tuple(x.reshape(size, steps, -1).transpose(0, 1) for x in self._inputs(inputs, (*s.shape, steps)))
         start = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1))
         with torch.no_grad():
             out = self.programs["rollout"](*(_plain(x) for x in (*start, h_rows, *more)))
-        q_all, p_all, s_all, c, residual, status = (x.movedim(0, 1).reshape(*s.shape, *_tail(x)) for x in out[:6])
+        q_all, p_all, s_all, c, *rest = (x.movedim(0, 1).reshape(*s.shape, *_tail(x)) for x in out)
+        status, residual, outside = rest[1], rest[0], (rest[2] if len(rest) > 2 else None)
         sigma = torch.cat([torch.ones_like(s)[..., None], c], -1).cumprod(-1)
         q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in ((q, q_all), (p, p_all), (s, s_all)))
-        return Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual)
+        found = Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual, outside=outside)
+        return decimated(found, every)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
@@ -184,9 +193,19 @@ class ExportedStepper:
         """(B, n), (B, n), (B,), (B,)[, (B, m)], each with its own storage in standard layout."""
         q, p, s = state
         flat = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1))
-        u = None if u is None else u.expand(*s.shape, u.shape[-1]).reshape(len(flat[2]), -1)
-        check_inputs(u, self.inputs, (len(flat[2]),), self.dtype)
-        return tuple(_plain(x) for x in (*flat, *(() if u is None else (u,))))
+        more = (x.reshape(len(flat[2]), -1) for x in self._inputs(u, s.shape))
+        return tuple(_plain(x) for x in (*flat, *more))
+
+    def _inputs(self, u: Tensor | None, shape: tuple[int, ...]) -> tuple[Tensor, ...]:
+        """(u,) of shape (*shape, m) for a model that takes inputs, those that do not act for None; () for another."""
+        if u is None:
+            idle = torch.tensor(self.metadata.get("input_zero") or [0.0] * self.inputs, dtype=self.dtype)
+            return (idle.expand(*shape, self.inputs),) if self.inputs else ()
+        if u.ndim and u.ndim <= len(shape) + 1:
+            with suppress(RuntimeError):  # left as it is, for the message below
+                u = u.expand(*shape, u.shape[-1])
+        check_inputs(u, self.inputs, shape, self.dtype)
+        return (u,)
 
 
 def load_pt2(path: PathLike) -> ExportedStepper:

@@ -55,6 +55,7 @@ def describe(
         "level": model.config.level,
         "dof": model.config.dof,
         "inputs": input_count(model),
+        "input_zero": _input_zero(model),
         "dtype": str(dtype).removeprefix("torch."),
         "h": float(h),
         "units": list(units),
@@ -70,6 +71,12 @@ def describe(
     if (span := entries.get("h_range")) is not None and not (len(span) == 2 and 0 < span[0] <= h <= span[1]):
         raise InputError(f"h_range must be (low, high) with 0 < low <= h = {h:g} <= high, got {list(span)}")
     return entries
+
+
+def _input_zero(model: ContactLagrangian) -> list[float]:
+    """The inputs that do not act: what a sensor shows where there is no force."""
+    zero = getattr(model.friction, "input_zero", None)
+    return [0.0] * input_count(model) if zero is None else zero.detach().double().tolist()
 
 
 def weights_digest(model: torch.nn.Module) -> str:

@@ -31,8 +31,8 @@ class StepModule(nn.Module):
         The discrete Lagrangian, copied; or its equations.
     iterations
         Bound on the Newton iterations, at least 2.
-    box
-        Adds the output `outside`, uint8: 1 where the step starts or ends outside.
+    box, h_range
+        Add the output `outside`, uint8: 1 where the step starts or ends outside the box, and 2 where h is outside.
     """
 
     def __init__(
@@ -40,6 +40,7 @@ class StepModule(nn.Module):
         model: ContactLagrangian | Equations,
         iterations: int = ITERATIONS,
         box: Mapping[str, Sequence[float]] | None = None,
+        h_range: Sequence[float] | None = None,
     ):
         super().__init__()
         if iterations < 2:
@@ -49,7 +50,7 @@ class StepModule(nn.Module):
         if not has_leapfrog(self.model):
             top = max(self.model.config.speed)
             self.newton, self.first_order = Newton(equations.slopes, iterations, top), equations.first_order
-        self.report = Report(Box.of(box, equations.model))
+        self.report = Report(Box.of(box, equations.model, h_range))
 
     def forward(
         self,
@@ -95,8 +96,8 @@ class RolloutModule(nn.Module):
         The discrete Lagrangian, copied; or its equations.
     iterations
         Bound on the Newton iterations of a step.
-    box
-        Adds the output `outside`, uint8: 1 where a step starts or ends outside.
+    box, h_range
+        As in `StepModule`.
     plan
         Of the attempt that Newton's loop stands behind.
     """
@@ -107,12 +108,13 @@ class RolloutModule(nn.Module):
         iterations: int = ITERATIONS,
         box: Mapping[str, Sequence[float]] | None = None,
         plan: Plan | None = None,
+        h_range: Sequence[float] | None = None,
     ):
         super().__init__()
         equations = Equations.of(model)
         self.one = OneStep(equations, iterations, plan)
         self.safe = SafeStep(equations.model)
-        self.report = Report(Box.of(box, equations.model))
+        self.report = Report(Box.of(box, equations.model, h_range))
 
     def forward(
         self,

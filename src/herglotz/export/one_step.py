@@ -59,7 +59,13 @@ class Report(nn.Module):
         found = torch.where((h > 0) & torch.isfinite(h), found, BAD_INPUT).to(torch.uint8)
         nan = torch.where(found == CONVERGED, 0.0, torch.nan).to(q1.dtype)
         new = (q1 + nan[..., None], p1 + nan[..., None], s1 + nan)
-        return *new, c + nan, residual.clone(), found, *outside(self.bounds if bounds is None else bounds, before, new)
+        return (
+            *new,
+            c + nan,
+            residual.clone(),
+            found,
+            *outside(self.bounds if bounds is None else bounds, h, before, new),
+        )
 
 
 class OneStep(nn.Module):

@@ -32,7 +32,8 @@ def rollout_graph(
     with torch.no_grad():
         plan = best_plan(equations.model, entries["h"], entries["box"])
         one = OneStep(equations, entries["newton_iterations"], plan, whole=False)
-        pieces = Pieces(one, Report(Box.of(entries["box"], equations.model)), equations.model, entries["h"])
+        box = Box.of(entries["box"], equations.model, entries.get("h_range"))
+        pieces = Pieces(one, Report(box), equations.model, entries["h"])
         writer = RolloutWriter(pieces, n, dtype)
         out = writer.write()
     inputs = {"q": ["B", n], "p": ["B", n], "s": ["B"], "h": ["K", "B"]} | ({"u": ["K", "B", m]} if m else {})

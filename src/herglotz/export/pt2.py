@@ -44,7 +44,7 @@ def export_pt2(
     herglotz, is one step (q, p, s, h) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state;
     `rollout` is K steps with both loops inside; `init` makes (p1, s1) from (q0, q1, s0, h). The batch size is free and
     every step h > 0 is accepted. A model with inputs takes u after h. With a box, outside is 1 where a step starts or
-    ends beyond it.
+    ends beyond it, plus 2 where h is beyond `h_range`.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ def export_pt2(
         Unit of each coordinate.
     metadata
         Further JSON-ready entries; they may not replace those written here. `h_range` = (low, high) makes the loaders
-        refuse other steps.
+        refuse other steps, and the file flag them.
     newton_iterations
         Bound on the Newton iterations of a step, at least 2.
 
@@ -79,7 +79,9 @@ def export_pt2(
     with quiet():
         equations, arguments = Equations.of(model), example(model, h)
         programs = {
-            "model": _program(StepModule(equations, newton_iterations, entries["box"]), arguments),
+            "model": _program(
+                StepModule(equations, newton_iterations, entries["box"], entries.get("h_range")), arguments
+            ),
             "rollout": rollout_program(equations, entries),
             "init": init_program(equations, entries),
         }
@@ -97,7 +99,7 @@ def rollout_program(model: ContactLagrangian | Equations, entries: Mapping[str, 
     arguments = example(equations.model, entries["h"])
     stacked = (x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in arguments[3:])
     plan = best_plan(equations.model, entries["h"], entries["box"])
-    module = RolloutModule(equations, entries["newton_iterations"], entries["box"], plan)
+    module = RolloutModule(equations, entries["newton_iterations"], entries["box"], plan, entries.get("h_range"))
     return _program(module, (*arguments[:3], *stacked), stacked=3)
 
 

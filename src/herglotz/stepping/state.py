@@ -34,6 +34,7 @@ class Step:
     status: Tensor  # (...) Status values
     residual: Tensor  # (...) |J⁻¹F|: what is left of the step equation, in units of q
     iterations: int
+    outside: Tensor | None = None  # (...) of an exported file: 1 where the step leaves the box it was fitted in
 
 
 @dataclass(frozen=True)
@@ -60,6 +61,7 @@ class Rollout:
     status: Tensor  # (..., K)
     residual: Tensor  # (..., K)
     events: tuple[Crossings, ...] = ()  # one for each event asked for
+    outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
 
     @classmethod
     def of(cls, states: list[State], steps: list[Step]) -> Rollout:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories, read_npz, write_npz
 from herglotz.data.files import write_atomically
+from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
@@ -48,6 +49,13 @@ class Run:
         """The state at the last sample of every trajectory, (B, n), (B, n), (B,): where to go on from."""
         last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
         return State(*(x[last] for x in self.states))
+
+    @property
+    def h_range(self) -> tuple[float, float]:
+        """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps."""
+        steps = self.data.steps().h
+        fitted = steps[steps <= GAP * self.h]
+        return float(fitted.min()) * (1 - 1e-6), float(fitted.max()) * (1 + 1e-6)
 
     @property
     def stepper(self) -> Stepper:

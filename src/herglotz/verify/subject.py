@@ -39,6 +39,7 @@ class Subject:
     L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
     scene: Scene | None = None
     run: Run | None = None
+    forced: bool = False  # whether it is a file of the forced level, which is no contact map
     differenced: bool = False  # whether autograd cannot enter the map, so that derivatives are differences
 
     @property
@@ -95,7 +96,8 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
         closed = not getattr(target, "differentiable", False)
         smooth = DifferencedStepper(target) if closed else target
         states, size = draw(target, samples, make), _step_size(h, target.h)
-        return Subject(target.path, kind, smooth.step, states, size, differenced=closed)
+        forced = target.metadata.get("level") == "forced"
+        return Subject(target.path, kind, smooth.step, states, size, forced=forced, differenced=closed)
     if isinstance(target, tuple) and len(target) == 2:
         return _pair(*target, h)
     raise InputError(

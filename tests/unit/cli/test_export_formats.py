@@ -1,6 +1,7 @@
 """`export`, `verify` and `rollout` on a file that is not `.pt2`."""
 
 import json
+import shutil
 
 import pytest
 import torch
@@ -39,6 +40,37 @@ def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):
     one, two = load(tmp_path / "a.npz"), load(tmp_path / "b.npz")
     torch.testing.assert_close(one.q, two.q, rtol=0, atol=1e-12)
     assert (one.names, one.units, one.angles, one.time_unit) == (two.names, two.units, two.angles, two.time_unit)
+
+
+@pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
+def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
+    # fails if an exported file steps at any h, the user cannot widen it, or a motion leaves the data in silence
+    out, motion = str(tmp_path / "a.h"), ["--steps", "3", "--out", str(tmp_path / "a.csv")]
+    assert main(["export", str(tiny_run), "--format", "c", "--out", out]) == 0
+    assert main(["rollout", out, *motion, "--h", "0.05"]) == 2
+    assert "h must lie in [0.2, 0.2], where the model was fitted; got 0.05" in capsys.readouterr().err
+    assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", "0.2"]) == 0
+    assert main(["rollout", out, *motion, "--h", "0.05", "--q0", "0.1", "--p0", "0"]) == 0
+    assert "note" not in capsys.readouterr().err
+    for source in (out, str(tiny_run)):
+        assert main(["rollout", source, *motion, "--q0", "0.1", "--p0", "30"]) == 0
+        assert "note: from step 0 on, the motion is not always among the states" in capsys.readouterr().err
+
+
+def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys):
+    # fails if a file is not compared with its model unless it is named, a run of other weights is taken for it, or the
+    # user is not told
+    monkeypatch.chdir(tmp_path)
+    few = ["verify", str(tiny_onnx), "--samples", "4", "--steps", "2"]
+    shutil.copytree(tiny_run, tmp_path / "runs" / "one")
+    stored = torch.load(tmp_path / "runs/one/model.pt", weights_only=True)
+    stored["parameters"] = {key: 2 * value for key, value in stored["parameters"].items()}
+    torch.save(stored, tmp_path / "runs/one/model.pt")
+    assert main(few) == 0
+    assert "not compared with its model" in capsys.readouterr().out
+    shutil.copytree(tiny_run, tmp_path / "runs" / "two")
+    assert main(few) == 0
+    assert "beside runs/two, 1000 steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("form", "name"), [("onnx", "a.pt2"), ("pt2", "a.onnx"), ("aoti", "a.h"), ("c", "a.pt2")])

@@ -135,13 +135,14 @@ def test_rollout_of_a_file_is_that_of_the_run(tiny_run, tiny_pt2, tmp_path):  # 
 @pytest.mark.parametrize("kind", ["tiny_run", "tiny_pt2"])
 def test_rollout_from_given_state(kind, tmp_path, request):  # fails if -1e-1 is taken for an option, or h is ignored
     source = str(request.getfixturevalue(kind))
-    state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", "0.05"]
+    h = 0.05 if kind == "tiny_run" else 0.2  # a file takes the steps of its data
+    state = ["--q0", "-1e-1", "--p0", "0.5", "--s0", "0.25", "--h", str(h)]
     assert main(["rollout", source, "--steps", "3", *state, "--out", str(tmp_path / "a.csv")]) == 0
     motion = load(tmp_path / "a.csv")
     assert motion.p is not None
     assert motion.s is not None
     assert (float(motion.q[0]), float(motion.p[0]), float(motion.s[0])) == (-0.1, 0.5, 0.25)
-    torch.testing.assert_close(motion.t, 0.05 * torch.arange(4, dtype=torch.float64))
+    torch.testing.assert_close(motion.t, h * torch.arange(4, dtype=torch.float64))
 
 
 def test_export(

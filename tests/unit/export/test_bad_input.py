@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_pt2 import model_of, states_of
+from test_pt2 import BOX, model_of, states_of
 
 import herglotz
 from herglotz.errors import InputError
@@ -29,13 +29,13 @@ NAN, INF = float("nan"), float("inf")
 def stepper(request, tmp_path_factory) -> Any:
     """The same explicit model, through each format."""
     form, folder, model = request.param, tmp_path_factory.mktemp("bad"), model_of(2, "linear")
-    more: dict[str, Any] = {"h": 0.1, "metadata": {"h_range": [0.01, 0.5]}}
+    more: dict[str, Any] = {"h": 0.1, "box": BOX, "metadata": {"h_range": [0.01, 0.5]}}
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(folder))
         if form == "compile":
             yield herglotz.compile(model)
         elif form == "h":
-            yield load_exported(export_c(model, folder / "a.h", h=0.1, h_range=(0.01, 0.5)))
+            yield load_exported(export_c(model, folder / "a.h", **more))
         elif form == "onnx":
             pytest.importorskip("onnx")
             pytest.importorskip("onnxruntime")
@@ -86,7 +86,7 @@ def test_other_arguments_are_refused(stepper):
         with pytest.raises(InputError, match="h must lie in"):
             stepper.step(State(q, p, s), 0.6)
     with pytest.raises(InputError, match="takes no inputs"):
-        stepper.rollout(q, p, s, h=0.1, steps=2, u=torch.zeros(3, 2, 1, dtype=torch.float64))
+        stepper.rollout(q, p, s, h=0.1, steps=2, inputs=torch.zeros(3, 2, 1, dtype=torch.float64))
     for steps in (0, None):
         with pytest.raises(InputError):
             stepper.rollout(q, p, s, h=0.1, steps=steps)
@@ -106,8 +106,23 @@ def test_strides_are_no_error(stepper):
     assert torch.equal(ours.s, other.s)
 
 
+def test_what_leaves_the_box_is_flagged(stepper):
+    # fails if a format forgets that it was fitted to some states only, or tells it of another step or sample
+    if stepper.metadata["box"] is None:
+        assert stepper.rollout(q, p, s, h=0.1, steps=2).outside is None
+        return
+    inside = State(0.3 * q / q.abs().max(), 0.3 * p / p.abs().max(), 0 * s)
+    out = stepper.rollout(*inside, h=0.1, steps=3)
+    assert not bool(out.outside.any())
+    far = inside._replace(p=inside.p.clone().index_fill_(0, torch.tensor(1), 1.5))
+    out = stepper.rollout(*far, h=0.1, steps=4, every=2)
+    assert out.outside.tolist() == [[0, 0], [1, 1], [0, 0]]
+    assert stepper.step(far, 0.1).outside.tolist() == [0, 1, 0]
+
+
 def test_a_file_by_itself_has_a_status_for_what_is_no_number(stepper):
-    # fails if a NaN passes a file's own loop with status 0, or spreads to its neighbours
+    # fails if a NaN passes a file's own loop with status 0, or spreads to its neighbours, or a step h that is not of
+    # the range has no flag
     programs = getattr(stepper, "programs", None)
     if programs is None:
         pytest.skip("C is tested by programs in C: test_c_program.py")
@@ -117,6 +132,8 @@ def test_a_file_by_itself_has_a_status_for_what_is_no_number(stepper):
     h_bad[:, 2] = NAN
     found = programs["rollout"](q, p.clone().index_fill_(0, torch.tensor(1), NAN), s, h_bad)
     assert (found[5][:, 1:] != 0).all()
+    assert found[6].tolist() == [[2 * (i == 2) + (i > 0 or bool(y)) for i, y in enumerate(row)] for row in fine[6]]
+    assert torch.equal(programs["rollout"](q, p, s, 6 * h)[6] & 2, torch.full((2, 3), 2, dtype=torch.uint8))
     assert found[0][:, 1:].isnan().all()
     assert torch.equal(found[0][:, 0], fine[0][:, 0])
     assert not found[5][:, 0].any()

@@ -43,8 +43,9 @@ def damped(level, dtype, inputs=0):
     """One coordinate, and motions that die out at rate 0.3 (at all levels but the conservative one)."""
     one, make = (1.0,), torch.Generator().manual_seed(1)
     config = ModelConfig(
-        (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs
-    )
+        (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs,
+        input_zero=inputs > 0,
+    )  # fmt: skip
     model = ContactLagrangian(config)
     with torch.no_grad():
         for parameter in model.parameters():
@@ -148,13 +149,17 @@ def test_the_graphs_of_every_level_step_like_the_model(level):
 
 
 def test_a_saved_file_takes_inputs(tmp_path):
-    # fails if u is lost in the file, or reaches another sample or step than its own
+    # fails if u is lost in the file, or reaches another sample or step than its own, or 0 stands for no input: the zero
+    # of a sensor is another number
     model = damped("forced", torch.float64, inputs=2)
     exported = load_pt2(export_pt2(model, tmp_path / "driven.pt2", h=0.1))
     q, p, s = states_of(1, 3)
     u = torch.linspace(-1, 1, 3 * 4 * 2, dtype=torch.float64).reshape(3, 4, 2)
     with torch.no_grad():
-        ours, eager = exported.rollout(q, p, s, h=0.1, steps=4, u=u), beside(model).rollout(q, p, s, h=0.1, inputs=u)
+        ours, eager = (
+            exported.rollout(q, p, s, h=0.1, inputs=u),
+            beside(model).rollout(q, p, s, h=0.1, inputs=u),
+        )
         one, first = exported.step(State(q, p, s), 0.1, u[:, 0]), beside(model).step(State(q, p, s), 0.1, u=u[:, 0])
         start, other = (
             exported.init(q, q + 0.1 * p, s, 0.1, u[:, 0]),
@@ -164,9 +169,14 @@ def test_a_saved_file_takes_inputs(tmp_path):
         torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(getattr(one.state, name), getattr(first.state, name), rtol=1e-12, atol=1e-12)
         torch.testing.assert_close(getattr(start, name), getattr(other, name), rtol=1e-12, atol=1e-12)
-    for bad in (None, u[..., :1], u.float(), u * torch.nan):
+    for bad in (u[..., :1], u.float(), u * torch.nan, u[:2], u[0, 0]):
         with pytest.raises(InputError, match=r"input|finite"):
-            exported.rollout(q, p, s, h=0.1, steps=4, u=bad)
+            exported.rollout(q, p, s, h=0.1, steps=4, inputs=bad)
+    shared = exported.rollout(q, p, s, h=0.1, inputs=u[1], every=2)
+    torch.testing.assert_close(shared.q[1], ours.q[1, ::2], rtol=1e-14, atol=0)
+    with torch.no_grad():
+        idle, other = exported.rollout(q, p, s, h=0.1, steps=4), beside(model).rollout(q, p, s, h=0.1, steps=4)
+    torch.testing.assert_close(idle.q, other.q, rtol=1e-12, atol=1e-12)
 
 
 def test_the_derivative_of_a_file_is_that_of_the_implicit_function_theorem(written):

@@ -60,6 +60,27 @@ def test_an_exported_file(tmp_path, dtype):
         assert by_map["regularity"].value == pytest.approx(by_L_d["regularity"].value, rel=0.5)
 
 
+def test_a_forced_file(tmp_path):
+    # fails if friction, which makes a step no contact map, fails the file, or an identity is dropped in silence
+    one = (1.0,)
+    config = ModelConfig((True,), "forced", one, one, one, (0.0,), rate=0.3, inputs=1, input_zero=True)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.1
+    path = export_pt2(model, tmp_path / "model.pt2", h=0.2, box=BOX)
+    alone = verify(path, samples=8, steps=4)
+    assert alone.passed, alone.table()
+    assert "the other checks need the model's forces" in alone["regularity"].note
+    report = verify(path, samples=8, steps=4, model=model)
+    assert report.passed, report.table()
+    assert report["contact"].statement.startswith("forced contact map")
+    assert model.friction is not None
+    with torch.no_grad():
+        model.friction.viscous.copy_(2 * model.friction.viscous)
+    assert not verify(path, samples=8, steps=4, model=model)["contact"].passed
+
+
 class _MapOnly:
     def __init__(self, exported):
         self.step = exported.step
