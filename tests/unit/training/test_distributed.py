@@ -44,7 +44,7 @@ with process_group():
     cost, curvature, b = problem.normal_equations(x)
     step = curvature.solve(-b, 0.3 * curvature.diagonal(), tol=1e-13)
     found["products"] = torch.cat([cost[None], b, curvature.diagonal(), curvature @ step, step])
-    found["search by products"] = levenberg_marquardt(problem, x, max_iterations=4).x
+    found["search by products"] = levenberg_marquardt(problem, x, max_iterations=8).x
     if is_first():
         torch.save(found, sys.argv[1])
 """
@@ -69,13 +69,13 @@ def result(tmp_path, processes):
 
 @pytest.mark.skipif(not torch.distributed.is_available(), reason="this PyTorch has no torch.distributed")
 def test_two_processes_find_what_one_finds(tmp_path):
-    # fails if a process's share is left out or counted twice (prior included), or processes take different decisions
+    # fails if a process's share is left out or counted twice (prior included), or processes take different decisions,
+    # or conjugate gradients lose their orthogonality: a solution cut short is then another one from 1e-6 on
     one, two = result(tmp_path, 1), result(tmp_path, 2)
     assert one.keys() == two.keys()
     assert len(one) == 8
     for name, value in one.items():
-        tol = 1e-5 if name == "search by products" else 1e-9  # of a solution that is cut short, rounding decides more
-        torch.testing.assert_close(two[name], value, rtol=tol, atol=tol, msg=lambda m, name=name: f"{name}: {m}")
+        torch.testing.assert_close(two[name], value, rtol=1e-9, atol=1e-9, msg=lambda m, name=name: f"{name}: {m}")
 
 
 @pytest.mark.slow

@@ -82,6 +82,14 @@ def test_the_step_lowers_the_cost_as_the_dense_one_does():
     assert gap(step) < 1e-4 * gap(torch.zeros_like(step))
 
 
+def test_the_search_does_not_hang_on_rounding():
+    # fails if the conjugate gradients lose their orthogonality: another order of the sums then moves x by 1e-6
+    one, other = (problem_of(6, chunk=chunk) for chunk in (4096, 60))
+    x, y = (levenberg_marquardt(MatrixFree(p), p.start(), max_iterations=6).x for p in (one, other))
+    assert float((x - one.start()).norm()) > 0.1
+    torch.testing.assert_close(y, x, rtol=0, atol=1e-10)
+
+
 def test_a_model_too_large_for_a_matrix_is_fitted():
     # fails if the search by products stalls after its first step
     problem = problem_of(70, trajectories=2)
