@@ -33,7 +33,7 @@ from herglotz.training.residual import ResidualProblem
 from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
 from herglotz.training.stages import Stages
-from herglotz.training.structure import ROWS, nothing_told, structured
+from herglotz.training.structure import ROWS, kept_structure, nothing_told
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, make_prior
 
@@ -92,10 +92,11 @@ def fit(
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())
     base = estimate_baseline(kept, outliers=suspect, drag=dragged(config))
-    if nothing_told(kept, told):
-        config, base = structured(kept, base, config, NOISY)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
-    stages = Stages(progress, checkpoint, _key(data, config), resume)
+    free = nothing_told(kept, told)
+    stages = Stages(progress, checkpoint, _key(data, told if free else config), resume)
+    if free:
+        config, base = kept_structure(kept, base, config, NOISY, stages)
     fitted = _fit_training_part(kept, base, config, stages, FREEDOM if suspect else None)
     fitted = replace(fitted, states=with_dropped(fitted, train, dropped))
     if fitted.used is not None:

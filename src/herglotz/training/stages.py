@@ -43,13 +43,21 @@ class Stages:
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
+        self.kept: dict[str, dict[str, Any]] = {}
         if resume and checkpoint is not None and checkpoint.exists():
             stored = _read(checkpoint)
             if stored["key"] != key:
                 raise InputError(
                     f"{checkpoint}: belongs to other data or settings; leave out --resume or choose another folder"
                 )
-            self.done = stored["stages"]
+            self.done, self.kept = stored["stages"], stored["kept"]
+
+    def keep(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+        """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
+        if name not in self.kept:
+            self.kept[name] = make()
+            self._write()
+        return self.kept[name]
 
     def run(
         self, name: str, x: Tensor, total: int, optimise: Callable[[Tensor, Callback], OptimiserResult]
@@ -84,16 +92,19 @@ class Stages:
             "history": r.history,
             "done": done,
         }
+        self._write()
+
+    def _write(self) -> None:
         if self.checkpoint is not None and is_first():
             buffer = BytesIO()
-            torch.save({"key": self.key, "stages": self.done}, buffer)
+            torch.save({"key": self.key, "stages": self.done, "kept": self.kept}, buffer)
             write_atomically(self.checkpoint, buffer.getvalue())
 
 
 def _read(checkpoint: Path) -> dict[str, Any]:
     try:
         stored = torch.load(checkpoint, weights_only=True)
-        return {"key": stored["key"], "stages": stored["stages"]}
+        return {"key": stored["key"], "stages": stored["stages"], "kept": stored.get("kept", {})}
     except Exception as error:  # torch raises many kinds for a damaged file
         raise InputError(
             f"{checkpoint}: cannot be read ({type(error).__name__}); delete it and fit from the start"

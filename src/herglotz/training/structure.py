@@ -9,6 +9,7 @@ short one-step fit then leaves out the features that the data do not need, and t
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -24,6 +25,7 @@ from herglotz.training.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.pruning import prune
 from herglotz.training.residual import ResidualProblem
+from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import make_prior
 
 MOST = 3  # coordinates: the dictionary's size grows as 3ⁿ n²
@@ -40,6 +42,20 @@ def nothing_told(data: Trajectories, told: FitConfig) -> bool:
     plain = told.order == 2 and told.objective != "raw" and told.supervision == "q" and told.optimiser == "lm"
     driven = data.u is not None and told.use_inputs
     return free and plain and not driven and 1 < data.dof <= MOST and any(data.angles)
+
+
+def kept_structure(
+    data: Trajectories, base: Baseline, config: FitConfig, noisy: float, stages: Stages
+) -> tuple[FitConfig, Baseline]:
+    """What `structured` finds, or what the checkpoint remembers of it."""
+    numbers = ("stiffness", "tilt", "rate", "start")
+
+    def search() -> dict[str, Any]:
+        found, start = structured(data, base, config, noisy)
+        return {"config": found.to_dict(), "base": {name: getattr(start, name) for name in numbers}}
+
+    found = stages.keep("structure", search)
+    return replace(FitConfig.from_dict(found["config"]), device=config.device), replace(base, **found["base"])
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: float) -> tuple[FitConfig, Baseline]:

@@ -1,5 +1,6 @@
 """The structure of joints, found from positions without a word about it."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -7,6 +8,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
+from herglotz.errors import InputError
 from herglotz.models.features import parse, revolute
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
@@ -118,20 +120,23 @@ def test_triples_spread_out():
 
 
 @pytest.mark.slow
-def test_an_interrupted_fit_finds_the_same_structure(tmp_path):
-    # fails if the structure found again is another one, or a stage that was finished is run again from elsewhere
+def test_an_interrupted_fit_keeps_its_structure(tmp_path, monkeypatch):
+    # fails if the structure is looked for again, or a stage that was finished is run again from elsewhere
     data, told = double_pendulum(), FitConfig(iterations=20)
     whole = fit(data, told, out=tmp_path, progress=False)
     stored = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
     name, first = next(iter(stored["stages"].items()))
     assert len(stored["stages"]) > 1
-    torch.save({"key": stored["key"], "stages": {name: first}}, tmp_path / "checkpoint.pt")
+    torch.save({**stored, "stages": {name: first}}, tmp_path / "checkpoint.pt")
+    monkeypatch.setattr(sys.modules["herglotz.training.structure"], "structured", None)
     resumed = fit(data, told, out=tmp_path, progress=False, resume=True)
     assert resumed.config == whole.config
     assert resumed.config.features
     one, other = (torch.nn.utils.parameters_to_vector(run.model.parameters()) for run in (whole, resumed))
     torch.testing.assert_close(other, one, rtol=1e-12, atol=1e-12)
     assert resumed.metrics["train_rms"] == pytest.approx(whole.metrics["train_rms"], rel=1e-3)
+    with pytest.raises(InputError, match="belongs to other data or settings"):
+        fit(data, replace(told, level="linear"), out=tmp_path, progress=False, resume=True)
 
 
 @pytest.mark.slow
