@@ -28,7 +28,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--levels",
         help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
-        "but full, and auto for joints; with recorded inputs u: forced",
+        "but full, and auto for joints; with recorded inputs u: forced and auto, which adds dry friction",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     add_machine_flags(parser)

@@ -23,7 +23,7 @@ from herglotz.training.structure import nothing_told
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
-LADDER = (*LEVELS, "auto")  # what `fit` does where no level is told comes last: for joints it is the richest
+LADDER = (*LEVELS, "auto")  # what `fit` does where no level is told comes last: it is the richest
 BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
 TIMED_STEPS = 20
 
@@ -170,10 +170,13 @@ def select(
 def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
     """The levels that are compared where none is named.
 
-    All but the full one; where inputs are recorded and used, those that can take them; and "auto" where that is none
-    of these: for joints (`herglotz.training.structure`).
+    All but the full one; the forced one alone where forces are told; where inputs are recorded and used, the forced one
+    and "auto", which adds dry friction to it; and "auto" where that is none of these: for joints
+    (`herglotz.training.structure`).
     """
-    if data.u is not None and config.use_inputs:
+    if data.u is not None and config.use_inputs and not config.coulomb:
+        return ("forced", "auto")
+    if config.coulomb or config.coupled or config.input_map:
         return ("forced",)
     return (*CANDIDATES, "auto") if nothing_told(data, replace(config, level="auto")) else CANDIDATES
 

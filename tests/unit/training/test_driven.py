@@ -13,7 +13,17 @@ from herglotz.errors import InputError
 from herglotz.export import compare, export_c, load_exported
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
-from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, fit, laplace, load_run, save_run
+from herglotz.training import (
+    FitConfig,
+    Prior,
+    ResidualProblem,
+    ShootingProblem,
+    fit,
+    laplace,
+    load_run,
+    save_run,
+    select,
+)
 from herglotz.training.grid import segment_grid
 from herglotz.training.inputs import step_inputs
 from herglotz.verify import verify
@@ -108,6 +118,17 @@ def test_noisy_data_with_gaps():
     assert friction.input_map.item() == pytest.approx(GAIN, rel=0.05)
     bands = laplace(run).bands()
     assert 0.7 < float(bands.inside(run.data.q).double().mean()) <= 1.0
+
+
+def test_select_compares_what_fit_does():
+    # fails if select fits driven data without the dry friction that fit gives them
+    data, settings = driven_data(), FitConfig(objective="residual", iterations=3, correction_width=0)
+    found = select(data, seeds=1, config=settings, progress=False)
+    plain, auto = found.candidates
+    assert (plain.level, auto.level) == ("forced", "auto")
+    assert auto.best.config == fit(data, settings, progress=False).config
+    assert auto.best.config.coulomb
+    assert not plain.best.config.coulomb
 
 
 def test_a_given_map_is_kept():

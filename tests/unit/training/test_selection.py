@@ -83,7 +83,17 @@ def test_joints_are_offered_what_fit_does():
     one, two = (simulate(scene(name), trajectories=1, steps=10, h=0.1) for name in scenes)
     assert levels_for(two, FitConfig()) == (*levels_for(one, FitConfig()), "auto")
     assert "auto" not in levels_for(two, FitConfig(features=("pendulums",)))
-    assert levels_for(replace(two, u=torch.zeros_like(two.q)), FitConfig()) == ("forced",)
+
+
+def test_forces_that_are_told_or_recorded_leave_the_forced_level():
+    # fails if a level that cannot take them is tried, or dry friction, which fit adds for inputs, is not compared
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=10, h=0.1)
+    driven = replace(data, u=torch.zeros_like(data.q))
+    assert levels_for(driven, FitConfig()) == ("forced", "auto")
+    assert levels_for(driven, FitConfig(input_map=(1.0,))) == ("forced", "auto")
+    assert levels_for(driven, FitConfig(coulomb=True)) == levels_for(data, FitConfig(coulomb=True)) == ("forced",)
+    assert levels_for(data, FitConfig(coupled=True)) == ("forced",)
+    assert "linear" in levels_for(driven, FitConfig(use_inputs=False))
 
 
 @pytest.mark.slow
