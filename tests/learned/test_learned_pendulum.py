@@ -123,9 +123,12 @@ def test_other_levels_and_precisions_end_finite(settings):
     assert run.metrics["extrapolation_rms"] < 0.02
 
 
-def test_adam_trains_too(exact_data):
-    # fails if the option is accepted and ignored
-    settings = FitConfig(train_fraction=1.0, objective="residual", optimiser="adam", iterations=100)
+@pytest.mark.parametrize(
+    "told", [{"optimiser": "adam", "iterations": 100}, {"optimiser": "adamw", "batch": 64, "iterations": 25}], ids=str
+)
+def test_adam_trains_too(exact_data, told):
+    # fails if an option is accepted and ignored
+    settings = FitConfig(train_fraction=1.0, objective="residual", **told)
     run = fit(exact_data.select(range(4)), settings)
     history = [h["cost"] for h in run.history if "one-step" in h["stage"]]
     assert history[-1] < 0.05 * history[0]

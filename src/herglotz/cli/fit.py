@@ -18,7 +18,7 @@ SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
-OPTIMISERS = ("lm", "adam")
+OPTIMISERS = ("lm", "adam", "adamw")
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
@@ -38,9 +38,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_run_flags(parser)
     parser.add_argument(
         "--level", choices=("auto", *LEVELS), default="auto",
-        help="auto: forced with dry friction where inputs u are recorded, else linear. conservative: no damping. "
-        "linear: one damping rate. affine: damping depends on position and velocity. full: on s as well. forced: one "
-        "rate, and friction of each joint (default %(default)s)",
+        help="auto: forced with dry friction where inputs u are recorded, else linear; for two or three joints what "
+        "the data show. conservative: no damping. linear: one damping rate. affine: damping depends on position and "
+        "velocity. full: on s as well. forced: one rate, and friction of each joint (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",
@@ -49,8 +49,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--optimiser", choices=OPTIMISERS, default="lm",
-        help="lm: Levenberg–Marquardt. adam: for residual and raw only (default %(default)s)",
+        help="lm: Levenberg–Marquardt. adam, adamw: for residual and raw only (default %(default)s)",
     )  # fmt: skip
+    parser.add_argument(
+        "--batch", type=count, metavar="B", help="triples of samples in a step of adam or adamw (default: all)"
+    )
     parser.add_argument(
         "--robust", choices=ROBUST, default="auto",
         help="a loss that outliers cannot pull, and spikes left out. auto: where the data show outliers "
@@ -106,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     config = FitConfig(
         level=arguments.level, objective=arguments.objective, optimiser=arguments.optimiser,
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
-        robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts,
+        robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
         coupled=arguments.coupled, order=arguments.order,

@@ -14,7 +14,7 @@ from herglotz.models.network import ACTIVATIONS
 from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "raw")
-OPTIMISERS = ("lm", "adam")
+OPTIMISERS = ("lm", "adam", "adamw")
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
@@ -36,7 +36,7 @@ class FitConfig:
         "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
         (always seen with Adam, at some seeds with Levenberg–Marquardt); for demonstration.
     optimiser
-        "lm" (Levenberg–Marquardt), or "adam" for the residual objectives.
+        "lm" (Levenberg–Marquardt), or "adam" or "adamw" for the residual objectives.
     train_fraction
         Part of every trajectory, in time, that is trained on; the rest tests. 1 trains on everything.
     seed
@@ -58,6 +58,8 @@ class FitConfig:
         equation of motion explains exact data and its motions fill their holes (`herglotz.training.baseline_motion`).
     learning_rate
         Of Adam.
+    batch
+        Triples of samples in one step of Adam; None: all. Levels whose motion has no s, or with s recorded.
     activation
         Of the networks: tanh, softplus or silu.
     mass_width
@@ -106,6 +108,7 @@ class FitConfig:
     damping_width: int = 6
     correction_width: int = 16
     learning_rate: float = 3e-3
+    batch: int | None = None
     activation: str = "tanh"
     mass_width: int = 0
     action_width: int = 4
@@ -146,14 +149,30 @@ class FitConfig:
             raise InputError(f"iterations must be >= 1, got {self.iterations}")
         if not self.departures or min(self.departures) <= 0:
             raise InputError(f"departures must be one or more positive numbers, got {self.departures}")
-        if self.optimiser == "adam" and self.objective not in ("residual", "raw"):
-            raise InputError(f"adam fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm")
+        if self.optimiser != "lm" and self.objective not in ("residual", "raw"):
+            raise InputError(
+                f"{self.optimiser} fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm"
+            )
+        self._check_batch()
         try:
             device = torch.device(self.device)
         except RuntimeError:
             raise InputError(f"unknown device '{self.device}'; use cpu or cuda") from None
         if device.type == "cuda" and not torch.cuda.is_available():
             raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
+
+    def _check_batch(self) -> None:
+        if self.batch is None:
+            return
+        if self.batch < 1:
+            raise InputError(f"batch must be >= 1, got {self.batch}")
+        if self.optimiser == "lm":
+            raise InputError("batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out")
+        if self.level in ("affine", "full") and self.supervision == "q":
+            raise InputError(
+                f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and "
+                "set supervision='qs'"
+            )
 
     def resolved(self, data: Trajectories) -> FitConfig:
         """The settings of a fit to these data, with the level decided.
@@ -166,7 +185,7 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            level = "forced" if driven or self.coulomb else "linear"
+            level = "forced" if driven or self.coulomb or self.coupled else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if driven and config.level != "forced":
             raise InputError(

@@ -20,7 +20,7 @@ from herglotz.data.splits import leading_rows
 from herglotz.data.windows import Triples
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian
-from herglotz.training.adam import adam
+from herglotz.training.adam import DECAY, adam
 from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.build import build_model, dragged
@@ -267,11 +267,15 @@ def _fit_residual(
         )
     large = isinstance(problem, ResidualProblem) and not problem.coupled and len(prior.start) > DENSE
     target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
-    if config.optimiser == "adam":
+    if config.optimiser != "lm":
         total = 20 * iterations
+        decay = DECAY if config.optimiser == "adamw" else 0.0
 
         def optimise(x: Tensor, callback):
-            return adam(problem, x, max_iterations=total, learning_rate=config.learning_rate, callback=callback)
+            return adam(
+                problem, x, max_iterations=total, learning_rate=config.learning_rate, decay=decay, batch=config.batch,
+                seed=config.seed, callback=callback,
+            )  # fmt: skip
     else:
         total = iterations
 

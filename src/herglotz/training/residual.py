@@ -116,17 +116,25 @@ class ResidualProblem:
         cost = loss(self._all(x) / self.scale, self.freedom)
         return cost if self.prior is None else cost + self.prior.cost(self._split(x)[0])
 
-    def cost_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(cost, ∂cost/∂x) without a Jacobian, for Adam."""
+    @property
+    def rows(self) -> int:
+        """Number of triples."""
+        return len(self.triples)
+
+    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(cost, ∂cost/∂x) without a Jacobian, for Adam; of some triples where the motion has no s."""
         if self.coupled:  # through the recurrence for s: the normal equations already hold its derivative
+            assert rows is None  # FitConfig checked
             cost, _, gradient = self.normal_equations(x)
             return cost, gradient
         t, (rank, processes) = self.triples, world()
-        own = slice(rank, None, processes)
+        own = (torch.arange(len(t)) if rows is None else rows)[rank::processes].to(x.device)
         theta = x.detach().requires_grad_()
         inputs, zero = self._inputs(t.index[own]), torch.zeros_like(t.h0[own])
         r = self._local(theta, t.q0[own], t.q1[own], t.q2[own], zero, t.h0[own], t.h1[own], *inputs)
         cost = loss(r / self.scale[own], self.freedom)
+        if rows is not None:
+            cost = cost * (len(t) / len(rows))
         if self.prior is not None and rank == 0:
             cost = cost + self.prior.cost(theta)
         (gradient,) = torch.autograd.grad(cost, theta)

@@ -98,9 +98,24 @@ class SupervisedProblem:
             cost = loss(self._local(x, *self._rows(slice(None))) / self.sigma, self.freedom)
         return cost if self.prior is None else cost + self.prior.cost(x[:-1])
 
-    def cost_and_gradient(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """(cost, ∂cost/∂x), for Adam."""
-        cost, _, gradient = self.normal_equations(x)
+    @property
+    def rows(self) -> int:
+        """Number of triples."""
+        return len(self.triples)
+
+    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(cost, ∂cost/∂x) of all triples or of some, for Adam."""
+        rank, processes = world()
+        own = (torch.arange(self.rows) if rows is None else rows)[rank::processes].to(x.device)
+        x = x.detach().requires_grad_()
+        cost = loss(self._local(x, *self._rows(own)) / self.sigma, self.freedom)
+        if rows is not None:
+            cost = cost * (self.rows / len(rows))
+        if self.prior is not None and rank == 0:
+            cost = cost + self.prior.cost(x[:-1])
+        (gradient,) = torch.autograd.grad(cost, x)
+        cost = cost.detach()
+        add_over_processes(cost, gradient)
         return cost, gradient
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
