@@ -26,6 +26,7 @@ FIGURES = {
     "hj_residual.png": plot_hamilton_jacobi_residual,
     "training.png": plot_training,
 }
+UNFORCED = {"momentum_vs_dS.png", "hj_residual.png"}  # of an action S^k, which a model with forces has not
 
 
 def save_figures(run: Run, folder: PathLike) -> list[Path]:
@@ -34,7 +35,8 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
     Returns
     -------
     list of Path
-        In the order of `FIGURES`. Nothing is written before all are drawn.
+        In the order of `FIGURES`, those of the action left out at the forced level. Nothing is written before all are
+        drawn.
 
     Raises
     ------
@@ -42,7 +44,8 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
         If the folder cannot be made or written to.
     """
     folder = Path(folder)
-    drawn = {name: plot(run) for name, plot in FIGURES.items()}
+    skipped = UNFORCED if run.model.friction is not None else ()
+    drawn = {name: plot(run) for name, plot in FIGURES.items() if name not in skipped}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:

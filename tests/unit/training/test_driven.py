@@ -175,6 +175,15 @@ def test_rollout_of_recorded_inputs(exact_run, tmp_path, capsys):
     assert json.loads(capsys.readouterr().out)["steps"] == 40
 
 
+def test_figures_of_a_driven_run(exact_run, tmp_path, capsys):
+    # fails if a fit of driven data ends in an error, because a figure is of an action that a model with forces has not
+    save_run(exact_run, tmp_path / "run")
+    assert main(["plot", str(tmp_path / "run")]) == 0
+    assert "error" not in capsys.readouterr().err
+    drawn = {path.name for path in (tmp_path / "run").glob("*.png")}
+    assert drawn == {"trajectory.png", "phase_portrait.png", "training.png"}
+
+
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
