@@ -15,6 +15,12 @@ LEVELS: dict[str, dict[str, Any]] = {
     "forced": {"level": "forced", "coulomb": True},
     "mass": {"mass_width": 4},
 }
+# What a user tells as text; two coordinates at least.
+TOLD: dict[str, dict[str, Any]] = {
+    "central": {"dof": 2, "angles": (False, False), "features": ("central",), "alike": True, "potential_width": 0},
+    "pendulums": {"dof": 2, "features": ("pendulums",), "potential_width": 0},
+    "order 4": {"dof": 2, "features": ("pendulums",), "potential_width": 0, "order": 4},
+}
 
 
 def build(noise=0.0, *, dtype=torch.float64, draw=0, dof=1, **settings: Any) -> Any:

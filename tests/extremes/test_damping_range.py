@@ -29,7 +29,7 @@ def test_damping_from_negative_to_stiff(gamma):
 
 
 @pytest.mark.parametrize("level", ["linear", "affine", "full", "forced"])
-@pytest.mark.parametrize("rate", [-1.0, 1e-12, 1e3, 1e6])
+@pytest.mark.parametrize("rate", [-1.0, 0.0, 1e-12, 2.0, 1e3, 1e6])  # 2: critical, both at q = 0 and of the baseline
 def test_every_level_over_the_range(level, rate):
     # fails if a level refuses small, negative or stiff damping while γh is moderate, or σ is not e^{−γt}
     h = 0.1 if abs(rate) < 100 else 1 / rate
@@ -41,15 +41,16 @@ def test_every_level_over_the_range(level, rate):
         assert float((out.q - 1.0).abs().max()) < 3 / rate
 
 
+@pytest.mark.parametrize(("dtype", "below"), [(torch.float64, 36.0), (torch.float32, 16.0)], ids=str)
 @pytest.mark.parametrize("level", ["linear", "affine", "full", "forced"])
-def test_a_factor_that_rounds_to_zero_is_refused(level):
-    # fails if c = 1 + D3 = 0 by rounding (γh > 36.7) gives a number; below, σ may be off by ε/c a step
-    model = build(level=level, rate=1e6, potential_width=0)
-    x = state([1.0], [0.5])
+def test_a_factor_that_rounds_to_zero_is_refused(level, dtype, below):
+    # fails if c = 1 + D3 = 0 by rounding (γh > 36.7, float32: 16.6) gives a number; below, σ may be off by ε/c a step
+    model = build(level=level, rate=1e6, potential_width=0, dtype=dtype)
+    x = state([1.0], [0.5], dtype=dtype)
     with torch.no_grad():
-        good, gone = (Stepper(model).step(x, h) for h in (36e-6, 38e-6))
+        good, gone = (Stepper(model).step(x, h) for h in (1e-6 * below, 1e-6 * (below + 2)))
     assert good.status.tolist() == [Status.CONVERGED]
-    assert float(good.c[0]) == pytest.approx(math.exp(-36.0), abs=EPS)
+    assert float(good.c[0]) == pytest.approx(math.exp(-below), abs=torch.finfo(dtype).eps)
     assert gone.status.tolist() == [Status.SINGULAR]
     assert bool(gone.state.q.isnan().all())
 

@@ -8,6 +8,7 @@ from extreme_cases import assert_nothing_silent, build, state
 
 from herglotz.errors import InputError
 from herglotz.export import compile_c
+from herglotz.mechanics import legendre_minus
 from herglotz.stepping import ContactSplitting, State, Status, Stepper, explain_step
 from herglotz.systems import scene
 from herglotz.tune import flag_unresolved
@@ -51,6 +52,40 @@ def test_both_sides_of_the_separatrix(extra, passes):
     assert (float(out.q.max()) > math.pi) == passes
     energy = out.p[..., 0] ** 2 / 2 + 1 - torch.cos(out.q[..., 0])
     assert float((energy - energy[:, :1]).abs().max()) < 1.5e-3  # h²/2: order 2, and bounded
+
+
+@pytest.mark.parametrize("extra", [-1e-6, 0.0, 1e-6])
+@pytest.mark.parametrize("settings", [{}, {"correction_width": 4}], ids=["explicit", "newton"])
+def test_on_the_separatrix(extra, settings):
+    # fails if a motion that may stay at the top for ever, or fall to either side, is not finite, drifts in energy
+    # beyond order 2, or passes the top faster than energy lets it
+    model = build(level="conservative", potential_width=0, **settings)
+    with torch.no_grad():
+        out = Stepper(model).rollout(*state([0.0], [2.0 + extra]), h=0.05, steps=1000)
+    assert bool(out.ok.all())
+    energy = out.p[..., 0] ** 2 / 2 + 1 - torch.cos(out.q[..., 0])
+    assert float((energy - energy[:, :1]).abs().max()) < 1.5e-3
+    top = (torch.cos(out.q[..., 0]) < -0.999).sum()
+    assert int(top) > 60  # ln of the rounding, or of what order 2 makes of it: 3 units of time at the least
+
+
+@pytest.mark.parametrize("coefficient", [0.999999, 1.0, 1.000001, 1.5])
+@pytest.mark.parametrize("order", [2, 4])
+def test_a_mass_that_features_make_singular_or_indefinite(coefficient, order):
+    # fails if a told mass, which no factorisation keeps positive, gives a number that is no solution: det M = 1 − a²
+    model = build(dof=2, features=("pendulums",), potential_width=0, order=order)
+    with torch.no_grad():
+        model.kinetic.sum.coefficient.fill_(coefficient)
+        start = state([[0.3, 0.3], [0.3, 0.31], [1.0, -0.5]], [[0.5, 0.5], [0.5, -0.5], [1.0, 0.2]])
+        out = Stepper(model).rollout(*start, h=0.05, steps=20)
+        assert_nothing_silent(out)
+        # What converged solves the discrete Herglotz equation, while p, which no energy bounds here, is of a size.
+        moderate = out.p.abs().amax(-1) < 1e3
+        there = (out.status == Status.CONVERGED).cummin(-1).values & moderate[:, :-1] & moderate[:, 1:]
+        assert int(there.sum()) > 3
+        before, after = out.q[:, :-1][there], out.q[:, 1:][there]
+        _, p0, _ = legendre_minus(model, before, after, out.s[:, :-1][there], 0.05)
+    assert float((p0 - out.p[:, :-1][there]).abs().max()) < 1e-9
 
 
 def test_the_inverted_pendulum_leaves_as_slowly_as_rounding_lets_it():

@@ -4,9 +4,11 @@ import math
 
 import pytest
 import torch
-from extreme_cases import LEVELS, assert_nothing_silent, build, starts, state
+from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts, state
 
 from herglotz.errors import InputError
+from herglotz.export import compile_c
+from herglotz.export.c_wrapper import compiler
 from herglotz.stepping import Status, Stepper, explain_step
 from herglotz.systems import scene
 
@@ -26,14 +28,37 @@ def test_the_guard_ends_what_hangs(bounded):
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
 @pytest.mark.parametrize("h", [1e-8, 1e-5, 1e-2, 1.0, 1e2])
-@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("level", [*LEVELS, *TOLD])
 def test_any_step_is_solved_or_says_why(level, h, dtype):
     # fails if a step without a solution is returned as a number, a small one is not solved, or the solver hangs
+    model = build(0.3, dtype=dtype, **{**LEVELS, **TOLD}[level])
     with torch.no_grad():
-        out = Stepper(build(0.3, dtype=dtype, **LEVELS[level])).rollout(*starts(12, dtype), h=h, steps=3)
+        out = Stepper(model).rollout(*starts(12, dtype, model.dof), h=h, steps=3)
     assert_nothing_silent(out)
     if h <= 1e-2:
         assert bool(out.ok.all())
+
+
+@pytest.mark.parametrize("dtype", ["float32", "float64"])
+@pytest.mark.parametrize("level", ["explicit", "affine", "mass"])
+def test_any_step_of_the_compiled_stepper_is_solved_or_says_why(level, dtype):
+    # fails if C, whose iterations and lanes are its own, returns what is not finite, or loses a small step
+    try:
+        compiler()
+    except InputError as error:
+        pytest.skip(str(error))
+    model = build(0.3, **LEVELS[level])
+    stepper, start = compile_c(model, dtype=dtype), starts(12)
+    for h in (1e-8, 1e-5, 1e-2, 1.0, 1e2):
+        out = stepper.rollout(*(x.to(stepper.dtype) for x in start), h=h, steps=3)
+        assert_nothing_silent(out)
+        if h <= 1e-2:
+            with torch.no_grad():
+                exact = Stepper(model).rollout(*start, h=float(torch.tensor(h, dtype=stepper.dtype)), steps=3)
+            assert bool(out.ok.all())
+            eps = torch.finfo(stepper.dtype).eps
+            bound = 64 * 3 * 3 * eps * (1 if dtype == "float32" else 1 + 1 / h)  # float32 steps in increments
+            assert float((out.p.double() - exact.p).abs().max()) < bound
 
 
 @pytest.mark.parametrize("h", [1e-8, 1e-6, 1e-4, 1e-2])

@@ -2,7 +2,7 @@
 
 import pytest
 import torch
-from extreme_cases import assert_nothing_silent, build, starts
+from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts
 
 import herglotz
 from herglotz.errors import InputError
@@ -46,6 +46,23 @@ def test_explain_names_every_failed_sample():
     lines = explain_step(model, start, 0.5)
     for i in failed.nonzero()[:, 0].tolist():
         assert any(line.startswith(f"sample ({i},), h = 0.5: ") for line in lines)
+
+
+@pytest.mark.parametrize("h", [1e-3, 0.5])
+@pytest.mark.parametrize("name", [*LEVELS, *TOLD])
+def test_every_kind_of_model_with_weights_a_hundred_times_too_large(name, h):
+    # fails if a level or a term has a way to a number that is not finite, or to a sum over the batch, of its own
+    model = build(100.0, draw=2, **{**LEVELS, **TOLD}[name])
+    start = starts(12, dof=model.dof)
+    with torch.no_grad():
+        out = Stepper(model, max_iterations=12).rollout(*start, h=h, steps=2)
+        assert_nothing_silent(out)
+        keep = [7, 2, 11, 5]  # other neighbours
+        alone = Stepper(model, max_iterations=12).rollout(*(x[keep] for x in start), h=h, steps=2)
+    assert torch.equal(alone.status, out.status[keep])
+    torch.testing.assert_close(alone.q, out.q[keep], rtol=0, atol=0, equal_nan=True)
+    if h == 1e-3 and name not in ("full", "order 4"):  # those find no way through; the others must
+        assert bool(out.ok.any())
 
 
 @pytest.mark.parametrize("level", ["affine", "full"])
