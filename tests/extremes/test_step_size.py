@@ -1,6 +1,9 @@
 """h from 1e-8 to 1e2, in float32 and float64, and through the steps at which a rule is not defined."""
 
 import math
+import subprocess
+import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -24,6 +27,22 @@ def test_the_guard_ends_what_hangs(bounded):
 
     with pytest.raises(TimeoutError, match=r"still running after 0.1 s"):
         hang()
+
+
+def test_the_guard_ends_what_hangs_in_c():
+    # fails if a loop that never comes back to Python, where a signal would be heard, may run for ever
+    program = """
+import itertools, sys
+sys.path.insert(0, sys.argv[1])
+from conftest import _bounded
+with _bounded(0.1, grace=0.2):
+    sum(itertools.repeat(0))
+"""
+    command = [sys.executable, "-c", program, str(Path(__file__).parent)]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=50)
+    assert ended.returncode == 1
+    assert "Timeout" in ended.stderr
+    assert "line 6 in <module>" in ended.stderr
 
 
 @pytest.mark.parametrize("dtype", DTYPES, ids=str)
