@@ -1,6 +1,7 @@
 """From one triple to a million samples, and the files that nobody wants."""
 
 import time
+from dataclasses import replace
 
 import pytest
 import torch
@@ -72,6 +73,23 @@ def test_steps_that_vary_by_ten_thousand():
     assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=0.01)
 
 
+@pytest.mark.slow
+def test_steps_that_vary_by_ten_thousand_are_fitted():
+    # fails if the fit, its segments or its free run are lost where the baseline is not
+    run = herglotz.fit(Trajectories.of(*motion(torch.cumsum(10 ** (-4 * seeded(300)), 0))), FitConfig(iterations=5))
+    assert run.metrics["extrapolation_rms"] < 2e-3
+    assert run.metrics["train_rms"] < 3e-3
+
+
+def test_noise_that_drowns_the_shortest_steps_is_reported():
+    # fails if a fit whose start is noise over h² passes for a good one: noise 1e-3, steps down to 1e-4
+    t, q = motion(torch.cumsum(10 ** (-4 * seeded(300)), 0))
+    noise = 1e-3 * torch.randn(300, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    run = herglotz.fit(Trajectories.of(t, q + noise), FitConfig(iterations=5))
+    with torch.no_grad():
+        assert not verify(run).passed
+
+
 def test_half_of_the_samples_missing():
     # fails if gaps are stepped over as if they were typical steps, or leave nothing to fit
     kept = seeded(400) < 0.5
@@ -109,3 +127,17 @@ def test_a_million_samples():
     assert time.perf_counter() - begin < 20
     assert base.rate == pytest.approx(RATE, rel=1e-6)
     assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=1e-6)
+
+
+def test_a_million_samples_are_fitted_thinned_or_not_at_all():
+    # fails if `fit` starts what ends in a killed process (a matrix of 10^11 numbers), or its advice does not help
+    data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
+    begin = time.perf_counter()
+    with pytest.raises(InputError, match=r"667000 samples to fit, at most 100000 .*--every 7,"):
+        herglotz.fit(data)
+    many = replace(data, t=torch.arange(100, dtype=torch.float64).repeat(10_000), lengths=(100,) * 10_000)
+    with pytest.raises(InputError, match=r"--every 5,"):  # many short trajectories are as many states
+        herglotz.fit(many, FitConfig(train_fraction=0.5))
+    assert time.perf_counter() - begin < 20
+    run = herglotz.fit(data.thinned(2000), FitConfig(iterations=5))
+    assert run.metrics["train_rms"] < 1e-3 * run.metrics["spread"]

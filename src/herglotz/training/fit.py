@@ -35,7 +35,7 @@ from herglotz.training.run import Run, box_of
 from herglotz.training.stages import Stages
 from herglotz.training.structure import ROWS, kept_structure, nothing_told
 from herglotz.training.supervision import SupervisedProblem
-from herglotz.training.trajectory_fit import TrajectoryFit, fit_trajectories, make_prior
+from herglotz.training.trajectory_fit import TrajectoryFit, check_size, fit_trajectories, make_prior
 
 PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
@@ -88,6 +88,7 @@ def fit(
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
     train = data if config.train_fraction == 1 else data.split_time(config.train_fraction)[0]
+    check_size(train)
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.errors import InputError
 from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
@@ -25,6 +26,7 @@ from herglotz.training.stages import Stages
 
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
 START = 8  # samples that a robust start state is read from
+MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 
 
@@ -95,6 +97,24 @@ def segment_lengths(data: Trajectories) -> list[int]:
         lengths.append(length)
         length *= 2
     return [*lengths, longest]
+
+
+def check_size(data: Trajectories) -> None:
+    """That the states of all segments can be solved for together, and a long trajectory be stepped through.
+
+    Raises
+    ------
+    InputError
+        Naming how many samples there are, how many can be, and which thinning leaves as many.
+    """
+    allowed = MOST * FIRST_SEGMENT // (2 * data.dof)
+    if data.samples <= allowed:
+        return
+    every = math.ceil(data.samples / allowed)
+    raise InputError(
+        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinate(s), for the states of all "
+        f"segments are solved for together; thin them (--every {every}, Trajectories.thinned) or take fewer"
+    )
 
 
 def fit_trajectories(
