@@ -115,6 +115,41 @@ def test_command_writes_the_kicks_that_win(pendulum_run, tmp_path, capsys):
     assert not (out / "kicks.h").exists()
 
 
+def test_export_takes_whatever_was_chosen(pendulum_run, tmp_path, capsys):
+    # fails if the header of a float32 choice is written in float64, or its tolerance or its step is another
+    try:
+        compiler()
+    except InputError as error:
+        pytest.skip(str(error))
+    config = replace(QUICK, widths=(), artefacts=("eager", "c"), tolerances=(None, 1e-7), starts=59, rounds=1)
+    found = tune(load_run(pendulum_run), max_error=1.0, horizon=0.4, config=config, progress=False)
+    assert len({c.setting for c in found.candidates}) == 8
+    for k, candidate in enumerate(found.candidates):
+        s, out, header = candidate.setting, tmp_path / f"{k}", tmp_path / f"{k}.h"
+        save_run(replace(found, chosen=candidate).tuned_run(), out)
+        assert main(["export", str(out), "--format", "c", "--out", str(header)]) == 0
+        written = read_metadata(header.read_text(), header)
+        assert written["h"] == pytest.approx(0.1 * s.multiple)
+        assert written["dtype"] == s.dtype
+        assert s.tol is None or written["newton_tolerance"] == s.tol
+        again = load_run(out)
+        assert (again.h, again.stepper.tol) == (pytest.approx(0.1 * s.multiple), s.tol)
+        assert next(again.model.parameters()).dtype == getattr(torch, s.dtype)
+    loose = next(k for k, c in enumerate(found.candidates) if c.setting.tol)
+    capsys.readouterr()
+    assert main(["export", str(tmp_path / f"{loose}"), "--out", str(tmp_path / "step.pt2")]) == 0
+    assert "tolerance 1e-07 that tune chose: PyTorch and C only" in capsys.readouterr().out
+
+
+def test_a_smaller_correction_is_tried_at_the_own_step_and_a_larger_one_is_not(pendulum_run):
+    # fails if sizes are compared by units alone: 48 in one layer are fewer numbers than 16 in two
+    run = load_run(pendulum_run)
+    assert (run.model.config.correction_width, run.model.config.correction_depth) == (48, 1)
+    config = replace(QUICK, multiples=(1,), widths=(4, 16), starts=59, iterations=1, pairs=50)
+    found = tune(run, max_error=10.0, horizon=0.4, config=config, progress=False)
+    assert [c.setting.width for c in found.candidates] == [None, 4]
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

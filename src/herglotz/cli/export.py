@@ -68,6 +68,9 @@ def run(arguments: argparse.Namespace) -> int:
         "h_range": list(arguments.h_range or result.h_range),
     }
     described: dict[str, Any] = {"h": result.h, "box": result.box, "units": result.data.units, "metadata": metadata}
+    tuned = result.setting
+    if tuned and arguments.format == "c":
+        described |= {"dtype": tuned["dtype"], "tolerance": tuned["tol"]}
     write(result.model, arguments.out, **described)
     if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
@@ -80,6 +83,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} coordinate(s), h {result.h:g}")
         if kicks.is_file():
             print(f"The kicks that tune chose exist in C only (--format c); {arguments.out} is the model behind them")
+        if arguments.format != "c" and tuned.get("tol"):
+            print(f"The tolerance {tuned['tol']:g} that tune chose: PyTorch and C only; this file solves to rounding")
         if arguments.format == "c":
             print(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
         print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")

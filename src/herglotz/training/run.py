@@ -58,9 +58,14 @@ class Run:
         return float(fitted.min()) * (1 - 1e-6), float(fitted.max()) * (1 + 1e-6)
 
     @property
+    def setting(self) -> dict[str, Any]:
+        """What `herglotz tune` chose for a run that it wrote: artefact, dtype, tol, …; empty for any other."""
+        return (self.metrics.get("tuned") or {}).get("chosen", {})
+
+    @property
     def stepper(self) -> Stepper:
-        """The trained time stepper."""
-        return Stepper(self.model)
+        """The trained time stepper, with Newton's tolerance as tuned."""
+        return Stepper(self.model, tol=self.setting.get("tol"))
 
 
 def save_run(run: Run, folder: str | Path) -> None:

@@ -139,12 +139,12 @@ def _models(
             yield (m, None), own
     for width in config.widths:
         for m in multiples:
-            if m < 1 or (m == 1 and config.reference == "own" and width >= run.model.config.correction_width):
+            start = widened(own, width, max(run.model.config.correction_depth, 2))
+            if m < 1 or (m == 1 and config.reference == "own" and _size(start) >= _size(own)):
                 continue  # nothing to gain: the run's own model is exact there, and no larger
             h = m * run.h
             bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
             before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
-            start = widened(own, width, max(run.model.config.correction_depth, 2))
             model, _ = distil(start, before, after, h, iterations=config.iterations)
             model.requires_grad_(False)
             yield (m, width), model
@@ -152,6 +152,10 @@ def _models(
             if not math.isfinite(bound) or (max_error is not None and bound > HOPELESS * max_error):
                 notes.append(f"width {width}: no step beyond h = {h:.4g}, where the bound is {bound:.2g}")
                 break
+
+
+def _size(model: ContactLagrangian) -> int:
+    return sum(p.numel() for p in model.parameters())
 
 
 def _forms(
