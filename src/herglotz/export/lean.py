@@ -1,8 +1,8 @@
 """The parts of a step in as few operations as they can be said: where each one costs, as in ONNX, the count decides.
 
 With features y = (s, c) of a position, s = sin q, c = cos q = sin(q + π/2), one matrix turns y into its derivative
-(c, −s). Coordinates that are no angles have s = q, and no c. A layer's t = tanh z has t′ = 1 − t², so the reverse
-sweep through the last one, (w ∘ t′) W, is one affine map of t².
+(c, −s), or the gradient in y by which that is multiplied. Coordinates that are no angles have s = q, and no c. A
+layer's t = tanh z has t′ = 1 − t², so the reverse sweep through the last one, (w ∘ t′) W, is one affine map of t².
 
 A step of constant c without drag has the equation, with κ = h/√c and m⁻¹ on the left,
 
@@ -70,12 +70,18 @@ class Features:
         return self.affine(q, self.spread, self.shift)
 
     def __call__(self, phase: Tensor) -> tuple[Tensor, Tensor]:
-        """Y and dy/dq."""
+        """Y, and what times `turned` of a gradient in y folds to the gradient in q: dy/dq, or y itself for angles."""
         if not self.any:
             return phase, self.slope.expand(phase.shape)
         y = phase.sin()
-        y = y if self.all else torch.where(self.mask, y, phase)
-        return y, self.affine(y, self.turn, None if self.all else self.slope)
+        if self.all:
+            return y, y
+        y = torch.where(self.mask, y, phase)
+        return y, self.affine(y, self.turn, self.slope)
+
+    def turned(self, g: Tensor) -> Tensor:
+        """For angles g_s c − g_c s = (−g_c) s + g_s c: constants are turned, and y is not; (..., 2n)."""
+        return g @ self.turn.T if self.all else g
 
 
 def first_layer(network: Network, angles: tuple[bool, ...], scale: tuple[float, ...]) -> tuple[Tensor, Tensor]:
@@ -154,9 +160,10 @@ class LeanField:
             V, slope = self.whole(q)
             return V[:, None], slope
         y, dy = self.features(self.features.phase(q))
-        V, g = self.affine.product(y, self.linear[:, None], self.offset.reshape(1)), self.linear
+        V, g = self.affine.product(y, self.linear[:, None], self.offset.reshape(1)), self.features.turned(self.linear)
         if self.tail is not None:
-            t, (g,) = self.tail(self.affine.product(y, self.read, self.bias), self.read.T, base=self.linear)
+            z = self.affine.product(y, self.read, self.bias)
+            t, (g,) = self.tail(z, self.features.turned(self.read.T), base=g)
             V = self.affine.product(t, self.tail.last[:, None], V)
         slope = self.affine(g * dy, self.features.fold)
         if not self.features.all:
@@ -217,7 +224,7 @@ class LeanEquation:
         if self.N is not None:
             y, dy = self.features(self.affine(x, self.features.spread / 2, self.phase))
             z = self.affine.product(y, self.read, self.affine(v, self.velocity, self.bias))
-            t, g = self.tail(z, self.read.T, -self.velocity.T @ self.inverse_mass)
+            t, g = self.tail(z, self.features.turned(self.read.T), -self.velocity.T @ self.inverse_mass)
             turned = g[0] * (dy * self.half)
             self.found = (t, turned)
             total = self.affine(turned, self.features.fold @ self.inverse_mass, g[1])

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from herglotz.export.attempt import HISTORY
+from herglotz.export.onnx_leap import MOVED, decided, reported
 from herglotz.export.onnx_ops import NUMPY, Constants, Writer, kind_of
 from herglotz.export.onnx_pieces import SOLVE, Pieces
 from herglotz.export.trace import Graph
@@ -27,21 +28,31 @@ class RolloutWriter:
         self.constants = Constants()
         self.main = Writer(self.constants, dtype, "x")
         self.bodies = 0
+        self.width, self.count = MOVED, BLOCK * MOVED
 
     def write(self) -> list[str]:
         """From q, p, s, h[, u] to the names of the outputs: q, p (K, B, n), the others (K, B)."""
         w, one = self.main, self.one
         shape, batch = w.emit("Shape", "h"), w.emit("Shape", "s")
         flat = w.emit("Reshape", "h", w.integers(-1))
-        table = self._table()
-        here = [] if self.pieces.start is None else w.write(self.pieces.start, ["q"])
+        leaps = self.pieces.leaps
+        h = self._h()
+        safe = self._safe(h)
+        fixed, begin = None if leaps is None else decided(w, leaps, safe), []
+        table = self._table(safe) if fixed is None else [fixed.loop]
         column = w.emit("Unsqueeze", "s", w.integers(1))
         zero = w.constant(0, NUMPY[self.dtype])
-        carry = ["q", "p", column, *here]
+        if leaps is not None and fixed is not None:
+            begin = w.write(leaps.start, ["q", "p", fixed.half])
+            carry = ["q", begin[0]]
+            if leaps.lost:
+                carry.append(w.emit("Expand", zero, w.emit("Shape", "q")))
+        else:
+            carry = ["q", "p", column, *([] if self.pieces.start is None else w.write(self.pieces.start, ["q"]))]
         if one.iterates:
             wide = w.emit("Concat", batch, w.integers(HISTORY * self.n), axis=0)
             carry.append(w.emit("Expand", zero, wide))
-        if self.pieces.lost:
+        if self.pieces.lost and leaps is None:
             carry += [w.emit("Expand", zero, w.emit("Shape", x)) for x in ("q", column)]
         steps, cut = w.emit("Shape", "h", start=0, end=1), w.integers(0)
         parts = []
@@ -53,6 +64,9 @@ class RolloutWriter:
                 size = w.emit("Concat", blocks, w.integers(BLOCK), w.emit("Shape", x, start=1), axis=0)
                 head = w.emit("Slice", x, w.integers(0), cut, w.integers(0))
                 whole.append(w.emit("Reshape", head, size, allowzero=1))
+            wide = w.emit("Concat", blocks, w.emit("Shape", table[0], start=1, end=2), w.integers(self.count), axis=0)
+            turned = w.emit("Transpose", whole[0], perm=[0, 2, 1, 3])
+            whole[0] = w.emit("Reshape", turned, wide, allowzero=1)  # (blocks, B, BLOCK · r): a block splits it once
             carry, found = self.loop(w, blocks, carry, whole, self.block)
             parts.append(found)
             table = [w.emit("Slice", x, cut, steps, w.integers(0)) for x in table]
@@ -61,7 +75,9 @@ class RolloutWriter:
         for *found, width in zip(*parts, self.widths, strict=True):
             size = w.emit("Concat", w.integers(-1), batch, w.integers(width), axis=0)
             rows.append(w.emit("Concat", *(w.emit("Reshape", x, size) for x in found), axis=0))
-        return self.report(rows, flat, shape)
+        if leaps is not None and fixed is not None:
+            rows = reported(w, leaps, fixed, [*begin, column], rows)
+        return self.report(rows, h, flat, shape)
 
     @property
     def blocked(self) -> bool:
@@ -70,33 +86,41 @@ class RolloutWriter:
             return False
         return len(self.pieces.parts[0][1].code.graph.nodes) <= LARGE
 
-    def _table(self) -> list[str]:
+    def _table(self, h: str) -> list[str]:
         """What h decides, (K, B, r), h itself first; and u, (K, B, m). Where all samples share their steps B is 1.
 
         A factor for all samples is multiplied in a tenth of the time that one for each takes.
         """
-        w = self.main
-        axis = w.integers(1)
-        extremes = [w.emit(kind, "h", axis, keepdims=0) for kind in ("ReduceMin", "ReduceMax")]
-        shared = w.emit("ReduceMin", w.emit("Equal", *extremes), w.integers(0), keepdims=1)
-        end = w.emit("Shape", "s")
-        if not self.one.iterates or self.one.attempt.plan.lean:  # others put what h decides beside what the state does
-            end = w.emit("Where", shared, axis, end)
-        h = w.emit("Slice", "h", w.integers(0), end, axis)
-        (safe,) = w.write(self.pieces.safe, [w.emit("Reshape", h, w.integers(-1))])
-        columns, self.columns = [w.emit("Unsqueeze", safe, axis)], []
+        w, axis = self.main, self.main.integers(1)
+        columns, self.columns = [w.emit("Unsqueeze", w.emit("Reshape", h, w.integers(-1)), axis)], []
         for first, _ in self.pieces.parts:
             mine = []
             for x, flat in [] if first is None else zip(w.write(first, columns[:1]), _flat(first), strict=True):
                 mine.append((len(columns), flat))
                 columns.append(w.emit("Unsqueeze", x, axis) if flat else x)
             self.columns.append(mine)
-        self.width = len(columns)
+        self.width, self.count = len(columns), BLOCK * len(columns)
         wide = w.emit("Concat", w.emit("Shape", h), w.integers(self.width), axis=0)
         return [w.emit("Reshape", w.emit("Concat", *columns, axis=1), wide), *["u"] * bool(self.pieces.inputs)]
 
-    def report(self, rows: list[str], flat: str, shape: str) -> list[str]:
-        """The rows of all steps, (K, B, width), as the outputs of the file."""
+    def _h(self) -> str:
+        """H, (K, B) or, where all samples share their steps, (K, 1)."""
+        w, axis = self.main, self.main.integers(1)
+        extremes = [w.emit(kind, "h", axis, keepdims=0) for kind in ("ReduceMin", "ReduceMax")]
+        shared = w.emit("ReduceMin", w.emit("Equal", *extremes), w.integers(0), keepdims=1)
+        end = w.emit("Shape", "s")
+        if not self.one.iterates or self.one.attempt.plan.lean:  # others put what h decides beside what the state does
+            end = w.emit("Where", shared, axis, end)
+        return w.emit("Slice", "h", w.integers(0), end, axis)
+
+    def _safe(self, h: str) -> str:
+        """The same where it is a step, else NaN."""
+        w = self.main
+        (safe,) = w.write(self.pieces.safe, [w.emit("Reshape", h, w.integers(-1))])
+        return w.emit("Reshape", safe, w.emit("Shape", h), allowzero=1)
+
+    def report(self, rows: list[str], h: str, flat: str, shape: str) -> list[str]:
+        """The rows of all steps, (K, B, width), as the outputs of the file; h is that of `_h`, flat that of all."""
         w = self.main
         first, last = w.integers(0), w.integers(-1)
         long = w.emit("Reshape", w.emit("Size", "h"), w.integers(1))
@@ -104,13 +128,18 @@ class RolloutWriter:
         after = [*rows[:2], w.emit("Reshape", rows[2], shape)]
         before = []
         for start, x in zip(("q", "p", "s"), after, strict=True):
+            if not self.pieces.boxed:  # onnxruntime computes what nobody reads
+                before.append(x)
+                continue
             head = w.emit("Unsqueeze", start, first)
             before.append(w.emit("Concat", head, w.emit("Slice", x, first, last, first), axis=0))
         sizes = (matrix, matrix, long)
         states = [w.emit("Reshape", x, a) for x, a in zip((*before, *after), sizes * 2, strict=True)]
         others = [w.emit("Reshape", x, long) for x in rows[3:]]
         if self.pieces.conformal is not None:
-            others = [*w.write(self.pieces.conformal, [flat]), *others]
+            (c,) = w.write(self.pieces.conformal, [w.emit("Reshape", h, last)])
+            c = w.emit("Expand", w.emit("Reshape", c, w.emit("Shape", h), allowzero=1), shape)
+            others = [w.emit("Reshape", c, long), *others]
         out = w.write(self.pieces.said, [flat, *states, *others])
         wide = w.emit("Concat", shape, w.integers(self.n), axis=0)
         return [w.emit("Reshape", x, wide if i < 2 else shape) for i, x in enumerate(out)]
@@ -142,8 +171,8 @@ class RolloutWriter:
         """One step, without a good guess: the next carry and the rows."""
         row = self._row(w, table)
         if not self.one.iterates:
-            state, rest = self._leap(w, carry, row)
-            return state, self._rows(w, [state], [rest])
+            state, values = self._leap(w, carry, row)
+            return state, self._rows(w, [values])
         kept = 3 + self.one.kept
         found = self._attempt(w, carry, carry[kept], row, 1)
         *found, leap = self._decided(w, found, [*carry[:kept], *row[1]], row[0][0])
@@ -151,32 +180,33 @@ class RolloutWriter:
         state, rest = self._landed(w, carry, row, solved)
         old = w.emit("Slice", carry[kept], w.integers(0), w.integers((HISTORY - 1) * self.n), w.integers(1))
         state.insert(kept, w.emit("Concat", w.emit("Sub", solved[0], leap), old, axis=1))
-        return state, [*self._rows(w, [state], [rest]), left, last]
+        return state, [*self._rows(w, [[*state[:3], *rest]]), left, last]
 
     def block(self, w: Writer, carry: list[str], table: list[str]) -> tuple[list[str], list[str]]:
         """`BLOCK` steps by attempts alone or, where they do not suffice, one by one."""
         from onnx import helper
 
         kept = 3 + self.one.kept
-        state, states, rests, sizes = carry, [], [], []
+        state, values, sizes = carry, [], []
         misses = []
         if self.one.iterates:
             parts = w.integers(*[self.n] * HISTORY)
             misses = w.several("Split", [carry[kept], parts], HISTORY, axis=1)
+        fixed = w.several("Split", [table[0], w.integers(*[1] * self.count)], self.count, axis=1)
         for j in range(BLOCK):
             at = w.constant(j, np.int64)
-            row = self._row(w, [w.emit("Gather", x, at, axis=0) for x in table])
+            row = fixed[j * self.width : (j + 1) * self.width], [w.emit("Gather", x, at, axis=0) for x in table[1:]]
             if not self.one.iterates:
-                state, rest = self._leap(w, state, row)
+                state, found = self._leap(w, state, row)
+                values.append(found)
             else:
                 x, p1, L, c, *size = self._attempt(w, state, w.emit("Concat", *misses, axis=1), row, 0)
                 sizes.append((x, *size))
                 misses = [size[0], *misses[:-1]]
                 new, rest = self._landed(w, state, row, [x, p1, L, c])
                 state = [*new[:kept], "", *new[kept:]]
-            states.append(state)
-            rests.append(rest)
-        rows = self._rows(w, states, rests)
+                values.append([*state[:3], *rest])
+        rows = self._rows(w, values)
         if not self.one.iterates:
             return state, rows
         state[kept] = w.emit("Concat", *misses, axis=1)
@@ -188,7 +218,9 @@ class RolloutWriter:
         self.bodies += 1
         quick, slow = (Writer(self.constants, self.dtype, f"{x}{self.bodies}_") for x in ("a", "b"))
         taken = [quick.emit("Identity", x) for x in (*state, *rows)]
-        again, more = self.loop(slow, slow.integers(BLOCK), carry, table, self.single)
+        rows_of_h = slow.emit("Reshape", table[0], slow.integers(0, BLOCK, self.width))
+        steps = [slow.emit("Transpose", rows_of_h, perm=[1, 0, 2]), *table[1:]]
+        again, more = self.loop(slow, slow.integers(BLOCK), carry, steps, self.single)
         more = [slow.emit("Reshape", x, slow.integers(-1, y)) for x, y in zip(more, self.widths, strict=True)]
         again = own(slow, [*again, *more], [])
         empty = helper.make_empty_tensor_value_info
@@ -201,13 +233,14 @@ class RolloutWriter:
 
     @property
     def widths(self) -> list[int]:
-        """Of the rows: q1, p1, s1[, c][, the last two increments' sizes]."""
+        """Of the rows: q1, p1, s1[, c][, the last two increments' sizes]; or those of `Move`."""
+        if self.pieces.leaps is not None:
+            return [self.n, self.n, self.n, 1]
         return [self.n, self.n, *[1] * (1 + (self.pieces.conformal is None) + 2 * self.one.iterates)]
 
-    def _rows(self, w: Writer, states: list[list[str]], rests: list[list[str]]) -> list[str]:
+    def _rows(self, w: Writer, values: list[list[str]]) -> list[str]:
         """Q1, p1, s1[, c] of several steps, one below the other."""
-        values = zip(*([*state[:3], *rest] for state, rest in zip(states, rests, strict=True)), strict=True)
-        return [w.emit("Concat", *x, axis=0) for x in values]
+        return [w.emit("Concat", *x, axis=0) for x in zip(*values, strict=True)]
 
     def _row(self, w: Writer, table: list[str]) -> tuple[list[str], list[str]]:
         """What h decides at one step, each (B, 1), and u."""
@@ -218,10 +251,13 @@ class RolloutWriter:
         return [w.emit("Squeeze", row[0][i], w.integers(1)) if flat else row[0][i] for i, flat in self.columns[part]]
 
     def _leap(self, w: Writer, carry: list[str], row: Row) -> tuple[list[str], list[str]]:
-        """An explicit step: the next carry, and c where it is a row."""
+        """An explicit step: the next carry, and what is a row."""
+        if self.pieces.leaps is not None:
+            new = w.write(self.pieces.leaps.move, [*carry[:2], *row[0], *carry[2:]])
+            return [*new[:2], *new[4:]], new[:4]
         fixed = self._fixed(w, row, 0)
         *new, c = w.write(self.pieces.parts[0][1], [*carry, *row[1], *fixed])
-        return new, [] if self.pieces.conformal is not None else [c]
+        return new, [*new[:3], *([] if self.pieces.conformal is not None else [c])]
 
     def _attempt(self, w: Writer, carry: list[str], misses: str, row: Row, patient: int) -> list[str]:
         """What `Attempt` gives."""

@@ -10,6 +10,7 @@ from herglotz.export.equation import example
 from herglotz.export.hoist import hoisted
 from herglotz.export.newton import Values, remainder
 from herglotz.export.one_step import OneStep, Report, SafeStep
+from herglotz.export.onnx_leap import Leaps, has_leaps
 from herglotz.export.trace import Graph, traced
 from herglotz.models import ContactLagrangian
 
@@ -106,7 +107,7 @@ class Pieces:
 
     def __init__(self, one: OneStep, report: Report, model: ContactLagrangian, h: float):
         q, p, s, steps, *u = example(model, h)
-        self.one, self.inputs = one, u
+        self.one, self.inputs, self.boxed = one, u, report.box is not None
         self.safe = traced(SafeStep(model), (steps,))
         self.conformal = None if model.s_enters_motion else traced(Conformal(model), (steps,))
         self.start = None if one.field is None else traced(FieldAtStart(one.field), (q,))
@@ -115,6 +116,7 @@ class Pieces:
         here = (column + 3, 0.3 * q)[: one.kept]
         lost = (0.1 * p, column + 0.1) if one.compensated else ()
         self.lost = len(lost)
+        self.leaps = Leaps(model) if not one.iterates and has_leaps(model) else None
         if not one.iterates:
             self.parts = [hoisted(traced(one.explicit, (q, p, column, h_column, *here, *lost, *u)), 3)]
             self.said = traced(Said(report), (steps, *rows))
