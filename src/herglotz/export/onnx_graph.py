@@ -34,7 +34,6 @@ class RolloutWriter:
         """From q, p, s, h[, u] to the names of the outputs: q, p (K, B, n), the others (K, B)."""
         w, one = self.main, self.one
         shape, batch = w.emit("Shape", "h"), w.emit("Shape", "s")
-        flat = w.emit("Reshape", "h", w.integers(-1))
         leaps = self.pieces.leaps
         h = self._h()
         safe = self._safe(h)
@@ -77,7 +76,7 @@ class RolloutWriter:
             rows.append(w.emit("Concat", *(w.emit("Reshape", x, size) for x in found), axis=0))
         if leaps is not None and fixed is not None:
             rows = reported(w, leaps, fixed, [*begin, column], rows)
-        return self.report(rows, h, flat, shape)
+        return self.report(rows, h, shape)
 
     @property
     def blocked(self) -> bool:
@@ -119,13 +118,11 @@ class RolloutWriter:
         (safe,) = w.write(self.pieces.safe, [w.emit("Reshape", h, w.integers(-1))])
         return w.emit("Reshape", safe, w.emit("Shape", h), allowzero=1)
 
-    def report(self, rows: list[str], h: str, flat: str, shape: str) -> list[str]:
-        """The rows of all steps, (K, B, width), as the outputs of the file; h is that of `_h`, flat that of all."""
+    def report(self, rows: list[str], h: str, shape: str) -> list[str]:
+        """The rows of all steps, (K, B, width), as the outputs of the file; h is that of `_h`."""
         w = self.main
         first, last = w.integers(0), w.integers(-1)
-        long = w.emit("Reshape", w.emit("Size", "h"), w.integers(1))
-        matrix = w.emit("Concat", long, w.integers(self.n), axis=0)
-        after = [*rows[:2], w.emit("Reshape", rows[2], shape)]
+        after = [*rows[:2], *(w.emit("Reshape", x, shape) for x in rows[2:3])]
         before = []
         for start, x in zip(("q", "p", "s"), after, strict=True):
             if not self.pieces.boxed:  # onnxruntime computes what nobody reads
@@ -133,16 +130,11 @@ class RolloutWriter:
                 continue
             head = w.emit("Unsqueeze", start, first)
             before.append(w.emit("Concat", head, w.emit("Slice", x, first, last, first), axis=0))
-        sizes = (matrix, matrix, long)
-        states = [w.emit("Reshape", x, a) for x, a in zip((*before, *after), sizes * 2, strict=True)]
-        others = [w.emit("Reshape", x, long) for x in rows[3:]]
+        others = [w.emit("Reshape", x, shape) for x in rows[3:]]
         if self.pieces.conformal is not None:
             (c,) = w.write(self.pieces.conformal, [w.emit("Reshape", h, last)])
-            c = w.emit("Expand", w.emit("Reshape", c, w.emit("Shape", h), allowzero=1), shape)
-            others = [w.emit("Reshape", c, long), *others]
-        out = w.write(self.pieces.said, [flat, *states, *others])
-        wide = w.emit("Concat", shape, w.integers(self.n), axis=0)
-        return [w.emit("Reshape", x, wide if i < 2 else shape) for i, x in enumerate(out)]
+            others = [w.emit("Expand", w.emit("Reshape", c, w.emit("Shape", h), allowzero=1), shape), *others]
+        return w.write(self.pieces.said, ["h", *before, *after, *others])
 
     def loop(
         self, outer: Writer, trip: str, carry: list[str], table: list[str], body: Callable[..., tuple[list[str], ...]]

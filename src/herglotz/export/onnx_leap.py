@@ -119,7 +119,7 @@ class Leaps:
         self.move = traced(Move(model), (q, 0.1 * p, *three, *((0.2 * p,) if self.lost else ())))
         rows = (0.1 * p, 0.3 * p, 0.2 * q, column, column + 1, *three, column + 4)
         self.mass = model.kinetic.mass().detach()  # pyright: ignore[reportCallIssue]
-        self.gained = traced(Gained(), tuple(torch.stack([x, 2 * x]) for x in rows))
+        self.gained = traced(Gained(), tuple(torch.stack([x, 2 * x], 1) for x in rows))
 
 
 def has_leaps(model: ContactLagrangian) -> bool:

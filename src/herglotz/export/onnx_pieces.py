@@ -111,7 +111,7 @@ class Pieces:
         self.safe = traced(SafeStep(model), (steps,))
         self.conformal = None if model.s_enters_motion else traced(Conformal(model), (steps,))
         self.start = None if one.field is None else traced(FieldAtStart(one.field), (q,))
-        rows = (q, p, s, q + 1, p + 1, s + 1, s + 2)
+        rows = [torch.stack([x, -x], 1) for x in (steps, q, p, s, q + 1, p + 1, s + 1, s + 2)]  # two axes in front
         column, h_column = s[:, None], steps[:, None]
         here = (column + 3, 0.3 * q)[: one.kept]
         lost = (0.1 * p, column + 0.1) if one.compensated else ()
@@ -119,7 +119,7 @@ class Pieces:
         self.leaps = Leaps(model) if not one.iterates and has_leaps(model) else None
         if not one.iterates:
             self.parts = [hoisted(traced(one.explicit, (q, p, column, h_column, *here, *lost, *u)), 3)]
-            self.said = traced(Said(report), (steps, *rows))
+            self.said = traced(Said(report), tuple(rows))
             return
         misses, x = torch.cat([0.1 * p] * HISTORY, -1), 0.1 * q
         start = (q, p, column, h_column, misses, *here, *u)
@@ -137,7 +137,7 @@ class Pieces:
         values = (here[0][:, 0].clone(), *here[1:]) if here else ()
         self.iterate = traced(Iterate(one), (q, p, s, steps, *carried, *values, *u))
         self.outcome = traced(Outcome(one), (steps, x, 0.2 * q, s + 3, s > 0, 2 * p, s + 1, s + 2))
-        self.said = traced(Said(report), (steps, *rows, s + 3, s + 4))
+        self.said = traced(Said(report), (*rows, *(torch.stack([s + i, s - i], 1) for i in (3, 4))))
 
 
 class FieldAtStart(nn.Module):
