@@ -64,7 +64,7 @@ def check_range(h: Tensor, span: Sequence[float] | None) -> None:
         return
     slack = 4 * torch.finfo(h.dtype).eps
     if float(h.min()) < span[0] * (1 - slack) or float(h.max()) > span[1] * (1 + slack):
-        found = f"{float(h.min()):g} … {float(h.max()):g}"
+        found = " … ".join(dict.fromkeys(f"{float(x):g}" for x in (h.min(), h.max())))
         raise InputError(
             f"h must lie in [{span[0]:g}, {span[1]:g}], where the model was fitted; got {found}. "
             "Export it with another --h-range (h_range in Python) to step elsewhere"

@@ -54,8 +54,8 @@ class Run:
     def h_range(self) -> tuple[float, float]:
         """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps."""
         steps = self.data.steps().h
-        fitted = steps[steps <= GAP * self.h]
-        return float(fitted.min()) * (1 - 1e-6), float(fitted.max()) * (1 + 1e-6)
+        fitted = [self.h, *([] if self.setting else steps[steps <= GAP * self.h].tolist())]
+        return min(fitted) * (1 - 1e-7), max(fitted) * (1 + 1e-7)
 
     @property
     def setting(self) -> dict[str, Any]:
