@@ -88,7 +88,7 @@ ROWS = [
     Row("Kepler, drag, larger step", lambda: scene("kepler"), 0.05, 20, 100, CENTRAL, 200, True, 1e-4),
     Row("chain of 10", lambda: scene("chain", masses=10), 0.1, 10, 40, SPRINGS, 200, True, 1e-4),
     Row("chain of 10, larger step", lambda: scene("chain", masses=10), 0.2, 10, 40, SPRINGS, 200, True, 1e-4),
-    Row("chain of 32", lambda: scene("chain", masses=32), 0.1, 2, 20, SPRINGS, 20, True, 1e-4, 1),
+    Row("chain of 32", lambda: scene("chain", masses=32), 0.1, 2, 20, SPRINGS, 20, True, 1e-4),
 ]  # fmt: skip
 
 

@@ -38,6 +38,31 @@ def test_a_chain_is_learned_from_three_numbers():
     assert free_run(model, of, 0.1, 40) < 1e-4
 
 
+def test_what_is_known_is_not_learned_again():
+    # fails if a known part of V does not reach the fit or has the other sign: V = −cos q is then found otherwise
+    data = simulate(scene("damped_pendulum"), trajectories=3, steps=20, h=0.1, seed=0)
+    settings = FitConfig(
+        level="linear", objective="residual", train_fraction=1.0, known=("-0.7 cos(q1)",), order=4, iterations=30
+    )
+    run = fit(data, settings, progress=False)
+    model: Any = run.model
+    assert model.potential.features.sum.coefficient.tolist() == pytest.approx([-0.3, 0.0], abs=1e-5)
+    assert run.metrics["rate"] == pytest.approx(0.2, abs=1e-5)
+
+
+@pytest.mark.slow
+def test_a_chain_of_thirty_two():
+    # fails if the cost of a fit, or the rounding of a step, grows too fast with the number of coordinates
+    of = scene("chain", masses=32)
+    data = simulate(of, trajectories=2, steps=20, h=0.1, seed=0)
+    settings = FitConfig(
+        level="linear", objective="residual", train_fraction=1.0, features=("chain",), alike=True, order=4
+    )
+    run = fit(data, settings, progress=False)
+    assert run.metrics["rate"] == pytest.approx(0.1, abs=1e-5)
+    assert free_run(run.model, of, 0.1, 20) < 1e-4
+
+
 @pytest.mark.slow
 def test_two_links_are_learned_from_six_numbers():
     # fails if the mass that depends on position is not found, or its part of the rule's error is wrong

@@ -80,12 +80,13 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--feature", action="append", default=[], metavar="TEXT",
-        help="what L may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2', or a list by name "
-        "(chain, sites, central, pendulums, harmonics); may be given again",
+        help="what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of K), "
+        "'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics); may be given again",
     )  # fmt: skip
     parser.add_argument(
         "--known", action="append", default=[], metavar="TEXT",
-        help="what is known of L, with its numbers (the first mass is 1): '9.81 cos(q1)'; may be given again",
+        help="what is known of L = K - V, with its numbers (the first mass is 1): '-9.81 cos(q1)' is a pendulum's V, as no "
+        "velocity is in it; may be given again",
     )  # fmt: skip
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")

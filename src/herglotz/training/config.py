@@ -81,11 +81,12 @@ class FitConfig:
         The map G from inputs to forces, n · m numbers row by row, where it is known; empty: learned. Forces are in
         units in which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
     features
-        What L may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, `"(q2 - q1)^4 + (q3 - q2)^4"`, or one
-        of the names chain, sites, central, pendulums, harmonics, revolute. Each has one coefficient, learned. See
-        `herglotz.models.features`.
+        What L = K − V may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, part of K;
+        `"(q2 - q1)^4 + (q3 - q2)^4"`, without velocities part of V; or one of the names chain, sites, central,
+        pendulums, harmonics, revolute. Each has one coefficient, learned. See `herglotz.models.features`.
     known
-        What is known of L, the same way, with its numbers (the first mass is 1); nothing of it is learned.
+        What is known of K and V, the same way, with its numbers (the first mass is 1): `"-9.81 cos(q1)"` is a
+        pendulum's V. Nothing of it is learned.
     alike
         All coordinates have one mass, and their potential is made of features alone: chains.
     coupled
