@@ -85,8 +85,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--known", action="append", default=[], metavar="TEXT",
-        help="what is known of L = K - V, with its numbers (the first mass is 1): '-9.81 cos(q1)' is a pendulum's V: no "
-        "velocity is in it; may be given again",
+        help="what is known of L = K - V, with its numbers (the first mass is 1): '-9.81 cos(q1)' is a pendulum's V: "
+        "no velocity is in it. May be given again",
     )  # fmt: skip
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")

@@ -17,7 +17,10 @@ QUIET, PATIENCE = 1e-8, 50  # so many costs in a row that differ by less than th
 class Differentiable(Protocol):
     """A scalar objective with its gradient, a sum over rows."""
 
-    rows: int
+    @property
+    def rows(self) -> int:
+        """How many there are."""
+        ...
 
     def cost(self, x: Tensor) -> Tensor:
         """The whole cost, a scalar."""

@@ -21,6 +21,7 @@ from herglotz.training.robust import loss, root_weights
 
 DENSE = 5000  # parameters up to which JᵀJ is built
 PROBES = 16  # of the diagonal
+ROOM = 100  # directions of the conjugate gradients that memory is taken for at a time
 
 
 class Linearised:
@@ -89,10 +90,12 @@ class Curvature:
         root = damping.sqrt()
         y, rest = torch.zeros_like(b), b / root
         direction, size = rest, rest @ rest
-        enough, before = tol * tol * float(size), b.new_empty(iterations, len(b))
+        enough, before = tol * tol * float(size), b.new_empty(0, len(b))
         for k in range(iterations):
             if not float(size) > enough:  # nan too
                 break
+            if k == len(before):
+                before = torch.cat([before, before.new_empty(ROOM, len(b))])
             before[k] = rest / size.sqrt()
             product = (self @ (direction / root)) / root + direction
             length = size / (direction @ product)
