@@ -8,7 +8,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
-from herglotz.training import FitConfig, fit
+from herglotz.training import FitConfig, fit, laplace
 
 
 def free_run(model, of, h, steps):
@@ -48,6 +48,26 @@ def test_what_is_known_is_not_learned_again():
     model: Any = run.model
     assert model.potential.features.sum.coefficient.tolist() == pytest.approx([-0.3, 0.0], abs=1e-5)
     assert run.metrics["rate"] == pytest.approx(0.2, abs=1e-5)
+
+
+def test_samples_far_apart_are_crossed_in_model_steps():
+    # fails if a recorded step is one model step in the fit, the free run or the bands: 1e-3 then
+    data = simulate(scene("damped_pendulum"), trajectories=3, steps=18, h=0.8, seed=0).select(
+        [1, 2]
+    )  # they do not turn over
+    found = {}
+    for m in (1, 4):
+        run = fit(data, FitConfig(objective="trajectory", level="linear", order=4, substeps=m), progress=False)
+        model: Any = run.model
+        found[m] = (
+            abs(float(model.potential.features.sum.coefficient.detach()[0]) + 1),
+            run.metrics["extrapolation_rms"],
+        )
+        assert run.h == pytest.approx(0.8 / m)
+        assert (run.metrics["one_step_rms"] is None) is (m > 1)
+        torch.testing.assert_close(laplace(run).bands().q, run.prediction, rtol=0, atol=1e-8)
+    assert max(found[4]) < 5e-5
+    assert min(found[1]) > 10 * max(found[4])
 
 
 @pytest.mark.slow

@@ -85,14 +85,18 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--known", action="append", default=[], metavar="TEXT",
-        help="what is known of L = K - V, with its numbers (the first mass is 1): '-9.81 cos(q1)' is a pendulum's V: "
-        "no velocity is in it. May be given again",
+        help="what is known of L = K - V, with its numbers (the first mass is 1): --known='-9.81 cos(q1)' is a "
+        "pendulum's V: no velocity is in it. May be given again",
     )  # fmt: skip
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument(
         "--order", type=int, choices=(2, 4), default=2,
         help="of the rule; 4: from the features alone, without networks (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--substeps", type=count, default=1, metavar="M",
+        help="model steps in a recorded step, for samples far apart; with --objective trajectory (default %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
     add_machine_flags(parser)
@@ -113,7 +117,7 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        coupled=arguments.coupled, order=arguments.order,
+        coupled=arguments.coupled, order=arguments.order, substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)

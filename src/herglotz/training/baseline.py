@@ -15,6 +15,7 @@ from herglotz.errors import InputError
 from herglotz.training.robust import FREEDOM, root_weights, scale_of
 
 ROUNDS = 10  # of re-weighting
+JITTER = 1.05  # steps longer than the typical one by less than this are crossed in as many model steps
 GROSS = 30.0  # robust standard deviations of an acceleration that no smooth motion misses the baseline by
 
 
@@ -28,7 +29,8 @@ class Baseline:
     stiffness: tuple[float, ...]
     tilt: tuple[float, ...]
     rate: float
-    max_step: float  # longest model step
+    max_step: float  # longest recorded step that is no gap
+    model_step: float  # longest step of the model along a trajectory
     low: Tensor  # (n,) lowest position
     high: Tensor  # (n,) highest
     input_map: tuple[float, ...] = ()  # (n · m) accelerations per unit of each input, row by row
@@ -40,7 +42,7 @@ class Baseline:
         return len(self.input_map) // len(self.angles)
 
 
-def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False) -> Baseline:
+def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False, substeps: int = 1) -> Baseline:
     """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ + (G u)ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ + (G u)ᵢ to finite differences.
 
     With `drag` d (affine level) there is Σⱼ dⱼ q̇ⱼ q̇ᵢ − dᵢ|q̇|²/2 as well, the motion of L = |q̇|²/2 − V + s d·q̇; a
@@ -48,6 +50,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
 
     Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
     Student's t takes the place of least squares (`herglotz.training.robust`), and rows that miss grossly set no size.
+    A recorded step is crossed in `substeps` model steps by trajectory fitting.
 
     Raises
     ------
@@ -102,6 +105,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         tilt=tuple(tilt),
         rate=rate,
         max_step=max_step,
+        model_step=max_step if substeps == 1 else JITTER * data.typical_step / substeps,
         low=q.amin(0),
         high=q.amax(0),
         input_map=tuple(x[2 * n + 1 : 2 * n + 1 + n * m]),

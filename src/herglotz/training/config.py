@@ -94,6 +94,9 @@ class FitConfig:
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
+    substeps
+        Model steps in a recorded step, in trajectory fitting: for samples further apart than the rule is good for. The
+        model is then stepped at that part of the data's step.
     """
 
     level: str = "auto"
@@ -124,6 +127,7 @@ class FitConfig:
     alike: bool = False
     coupled: bool = False
     order: int = 2
+    substeps: int = 1
 
     def __post_init__(self):
         _choice("level", self.level, ("auto", *LEVELS))
@@ -155,6 +159,12 @@ class FitConfig:
                 f"{self.optimiser} fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm"
             )
         self._check_batch()
+        if self.substeps < 1:
+            raise InputError(f"substeps must be >= 1, got {self.substeps}")
+        if self.substeps > 1 and self.objective != "trajectory":
+            raise InputError(
+                f"substeps are of trajectory fitting, not of the objective {self.objective!r}; set it to 'trajectory'"
+            )
         try:
             device = torch.device(self.device)
         except RuntimeError:

@@ -92,7 +92,7 @@ def fit(
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())
-    base = estimate_baseline(kept, outliers=suspect, drag=dragged(config))
+    base = estimate_baseline(kept, outliers=suspect, drag=dragged(config), substeps=config.substeps)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     free = nothing_told(kept, told)
     stages = Stages(progress, checkpoint, _key(data, told if free else config), resume)
@@ -102,7 +102,7 @@ def fit(
     fitted = replace(fitted, states=with_dropped(fitted, train, dropped))
     if fitted.used is not None:
         dropped[~dropped] = ~fitted.used
-    states, status = states_everywhere(fitted, data, train.lengths, base.max_step)
+    states, status = states_everywhere(fitted, data, train.lengths, base.model_step)
     metrics = judge(fitted, data, train, dropped, states, base, config.robust != "off")
     metrics |= {
         "extrapolation_status": status,
@@ -120,7 +120,8 @@ def fit(
     }
     x, n = fitted.states, data.dof
     box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
-    return Run(fitted.model, config, metrics, data, train.lengths, states, train.typical_step, box, stages.history)
+    h = train.typical_step / config.substeps
+    return Run(fitted.model, config, metrics, data, train.lengths, states, h, box, stages.history)
 
 
 def _fit_training_part(

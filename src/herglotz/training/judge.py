@@ -105,9 +105,10 @@ def judge(
         x = torch.cat([x[: len(problem.flat.get())], x.new_tensor([unit]).log()])
     ratio = (triples.h1 / triples.h0)[:, None]
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
+    stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
     rate = getattr(fitted.model.damping, "rate", None)
     return {
-        "one_step_rms": _rms(problem.residuals(x)) if len(triples) else None,
+        "one_step_rms": _rms(problem.residuals(x)) if stepped else None,
         "one_step_rms_constant_velocity": _rms(unmoved) if len(triples) else None,
         "train_rms": _rms(error[used]),
         "outliers": int(dropped.sum()),

@@ -151,7 +151,7 @@ def fit_trajectories(
     def stage(
         length: int, sigma: float, freedom: float | None, before: _Stage | None, used: Tensor | None = None
     ) -> _Stage | None:
-        grid = segment_grid(data, length, base.max_step)
+        grid = segment_grid(data, length, base.model_step)
         prior = make_prior(model, base, departures[0])
         problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, used=used, s=s)
         if before is None:

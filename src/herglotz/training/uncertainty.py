@@ -88,7 +88,7 @@ class Laplace:
             train, out = without(train, lone), out[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
-        self.base = estimate_baseline(train, outliers=found)
+        self.base = estimate_baseline(train, outliers=found, substeps=run.config.substeps)
         self.sigma = float(run.metrics["sigma"])
         departure = run.metrics.get("departure") or run.config.departures[-1]
         self.prior = make_prior(run.model, self.base, departure)
@@ -203,7 +203,7 @@ class Laplace:
 
     def _solved(self, data: Trajectories, start: Tensor, used: Tensor | None = None) -> tuple[ShootingProblem, Path]:
         """Each trajectory as one segment, solved from its start state (B, 2n+1)."""
-        grid = segment_grid(data, max(data.lengths), self.base.max_step)
+        grid = segment_grid(data, max(data.lengths), self.base.model_step)
         problem = ShootingProblem(
             self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom, used=used
         )

@@ -322,6 +322,8 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
         ({"train_fraction": 0.0}, r"train fraction must be in \(0, 1\], got 0"),
         ({"optimiser": "adam"}, "adam fits the objectives residual and raw, not 'auto'"),
         ({"optimiser": "adamw"}, "adamw fits the objectives residual and raw, not 'auto'"),
+        ({"substeps": 2}, "substeps are of trajectory fitting, not of the objective 'auto'"),
+        ({"substeps": 0}, "substeps must be >= 1, got 0"),
         ({"batch": 8}, "batch is of adam and adamw"),
         ({"batch": 0, "optimiser": "adam", "objective": "residual"}, "batch must be >= 1, got 0"),
         ({"batch": 8, "optimiser": "adam", "objective": "residual", "level": "full"}, "carries s along whole"),
