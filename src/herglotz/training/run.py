@@ -17,6 +17,7 @@ from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
+from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 
 FORMAT = 1
@@ -52,10 +53,16 @@ class Run:
 
     @property
     def h_range(self) -> tuple[float, float]:
-        """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps."""
-        steps = self.data.steps().h
-        fitted = [self.h, *([] if self.setting else steps[steps <= GAP * self.h].tolist())]
-        return min(fitted) * (1 - 1e-7), max(fitted) * (1 + 1e-7)
+        """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps.
+
+        A tuned model is made for one step.
+        """
+        steps, m = self.data.steps().h, self.config.substeps
+        fitted = steps[steps <= GAP * m * self.h]
+        if m > 1:
+            fitted = fitted / (fitted / (JITTER * self.h) - 1e-6).ceil()
+        ends = [self.h, *([] if self.setting else (float(fitted.min()), float(fitted.max())))]
+        return min(ends) * (1 - 1e-7), max(ends) * (1 + 1e-7)
 
     @property
     def setting(self) -> dict[str, Any]:
