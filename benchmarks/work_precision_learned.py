@@ -127,38 +127,71 @@ def _eager(point: dict, stepper: Any, case: Case, h: float, u: Tensor | None) ->
     return Timed(point, run, steps * h)
 
 
+class FixedNewton(torch.nn.Module):
+    """A fixed number of iterations in place of a loop that ends when all are solved, which dynamo cannot trace."""
+
+    def __init__(self, newton: Any, turns: int):
+        super().__init__()
+        self.newton, self.turns, self.equation = newton, turns, newton.equation
+
+    def start(self, *arguments: Any, **options: Any) -> tuple[Tensor, ...]:
+        """Newton's own."""
+        return self.newton.start(*arguments, **options)
+
+    def forward(self, problem: Any, carry: Any, constants: Any) -> tuple[Tensor, ...]:
+        """Δ, its step, merit, done and the values; what is not done then gets its status from `StepModule`."""
+        for _ in range(self.turns + 1):  # the first evaluates the guess
+            carry = self.newton.iterate(problem, carry, constants)
+        _, done, x, delta, merit, _, _, *values = carry
+        return x, delta, merit, done, *values
+
+
+def _turns(case: Case) -> int:
+    """The most iterations that any start needs anywhere on its motion."""
+    state, u, most = case.entry, inputs_of(case), 1
+    with torch.no_grad():
+        for k in range(round(case.setup.T / case.setup.h)):
+            step = Stepper(case.run.model).step(state, case.setup.h, None, None if u is None else u[k])
+            state, most = step.state, max(most, step.iterations)
+    return most
+
+
 def _compiled(case: Case) -> list[Timed]:
-    """`torch.compile` of the exported step; left out where it cannot be had."""
+    """`torch.compile` of the exported step, compiled once, for one motion; left out where it cannot be had."""
     from herglotz.export import StepModule
 
-    model, h = copy.deepcopy(case.run.model), case.setup.h
+    model, h = copy.deepcopy(case.run.model).requires_grad_(False), case.setup.h
+    module, turns = StepModule(model), _turns(case)
+    if not model.linear_in_q1:
+        module.newton = FixedNewton(module.newton, turns)
+    steps, u = round(case.setup.T / h), inputs_of(case)
+    size = torch.tensor([h], dtype=torch.float64)
+    held = [() if u is None else (u[k : k + 1].clone(),) for k in range(steps)]
     try:
-        step = torch.compile(StepModule(model))
-        state, out, size = case.entry, [], torch.tensor(h, dtype=torch.float64)
-        steps = round(case.setup.T / h)
-        u = inputs_of(case)
-        held = [() if u is None else (u[k].expand(len(state.s), -1).contiguous(),) for k in range(steps)]
+        step = torch.compile(module)
+        ends = []
         with torch.no_grad():
-            sizes = size.expand(len(state.s)).contiguous()
-            for k in range(steps):
-                state = State(*step(*state, sizes, *held[k])[:3])
-                out.append(state.q)
-            one = State(*(x[:1].contiguous() for x in case.entry))
-            few = tuple(x[:1] for x in held[0])
-            step(*one, sizes[:1], *few)
+            for i in range(len(case.entry.s)):
+                x, q = State(*(y[i : i + 1].clone() for y in case.entry)), []
+                for k in range(steps):
+                    x = State(*step(*x, size, *held[k])[:3])
+                    q.append(x.q)
+                ends.append(torch.stack(q[steps // CHECKS - 1 :: steps // CHECKS], 1))
     except Exception as error:  # whatever the compiler says, the other forms are still measured
         print(f"torch.compile, {case.setup.name}: {type(error).__name__}: {str(error)[:200]}")
         return []
-    errors = judged(torch.stack(out, 1)[:, steps // CHECKS - 1 :: steps // CHECKS], case.truth)
-    point = {"kind": "learned, torch.compile", "setting": "own model, torch.compile", "h": h, "dtype": "float64"}
+    start = State(*(y[:1].clone() for y in case.entry))
+    label = "own model, torch.compile" + ("" if model.linear_in_q1 else f", {turns} iterations")
+    point = {"kind": "learned, torch.compile", "setting": label, "h": h, "dtype": "float64"}
 
     def run() -> None:
-        x = one
+        x = start
         with torch.no_grad():
-            for _ in range(8):
-                x = State(*step(*x, sizes[:1], *few)[:3])
+            for k in range(min(8, steps)):
+                x = State(*step(*x, size, *held[k])[:3])
 
-    return [Timed({**point, **errors, "artefact": "torch.compile"}, run, 8 * h)]
+    errors = judged(torch.cat(ends), case.truth)
+    return [Timed({**point, **errors, "artefact": "torch.compile"}, run, min(8, steps) * h)]
 
 
 def _distilled(case: Case, quick: bool) -> list[Timed]:

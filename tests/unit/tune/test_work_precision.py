@@ -187,6 +187,30 @@ def test_the_learned_equation_is_that_of_the_model(benchmark):
     assert float((other - wanted).abs().max()) > 1e-3
 
 
+def test_a_fixed_number_of_iterations_is_the_step_or_says_that_it_is_not(benchmark):
+    # fails if the unrolled loop that torch.compile takes is another method, or hides that it did not arrive
+    from herglotz.export import StepModule
+    from herglotz.models import ContactLagrangian, ModelConfig
+    from herglotz.stepping import Status
+
+    model = ContactLagrangian(ModelConfig(correction_width=6)).double()
+    make = torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.5 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        q, p = torch.randn(2, 7, 1, generator=make, dtype=torch.float64)
+        x = (q, p, torch.zeros(7, dtype=torch.float64), torch.full((7,), 0.4, dtype=torch.float64))
+        plain, module = StepModule(model), StepModule(model)
+        newton, wanted = module.newton, plain(*x)
+        for turns, arrives in ((12, True), (1, False)):
+            module.newton = benchmark["_learned"].FixedNewton(newton, turns)
+            found = module(*x)
+            assert bool((found[5] == Status.CONVERGED).all()) == arrives
+            if arrives:
+                torch.testing.assert_close(found[:3], wanted[:3], rtol=1e-13, atol=1e-13)
+    assert bool(found[0].isnan().any())
+
+
 def test_what_was_not_measured_is_said(benchmark):
     # fails if a knob without a point passes for measured
     points = [{"kind": "learned, level conservative", "setting": ""}, {"kind": "learned, ONNX", "artefact": "ONNX"}]
