@@ -91,19 +91,31 @@ TERMS = {
 
 def terms(scenes: dict[str, list[dict]]) -> list[str]:
     """Each scene's own model at the step of its data, and what other terms cost and bring: all fitted alike."""
-    lines = ["", "## Terms", "", "| scene | terms | µs a step | median error |", "|---|---|---|---|"]
+    head = ("scene", "terms", "µs a step", "median error", "times the scene's own: cost, error")
+    lines = ["", "## Terms", "", f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
 
-    def cells(p: dict) -> str:
+    def cells(p: dict, own: dict | None) -> str:
         error = "fails" if p["median"] is None else f"{p['median']:.2g}"
         eager = " (PyTorch)" if p["artefact"] == "eager" else ""
-        return f"{p['us_per_time'] * p['h']:.2g}{eager} | {error} |"
+        times = ""
+        if own is not None:  # both at the step of the data
+            worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
+            times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
+        return f"{p['us_per_time'] * p['h']:.2g}{eager} | {error} | {times} |"
 
     for name, points in scenes.items():
-        own = [p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"]
-        lines += [f"| **{name}** | **{TERMS[name]}** | {cells(p)}" for p in own]
+        own = next((p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"), None)
+        if own is not None:
+            lines.append(f"| **{name}** | **{TERMS[name]}** | {cells(own, None)}")
         others = [p for p in points if p["kind"].startswith("learned, ") and p["setting"].startswith(p["kind"][9:])]
-        lines += [f"| | {p['kind'][9:]} | {cells(p)}" for p in others if p["kind"] not in NOT_TERMS]
+        lines += [f"| | {_changed(p['kind'][9:])} | {cells(p, own)}" for p in others if p["kind"] not in NOT_TERMS]
     return lines
+
+
+def _changed(label: str) -> str:
+    """What a fit with another set of terms lacks or has besides."""
+    return {"level conservative": "no damping", "level linear": "one rate, no drag",
+            "level affine": "drag besides, with its network"}.get(label, label)  # fmt: skip
 
 
 def coverage(scenes: dict[str, list[dict]]) -> list[str]:

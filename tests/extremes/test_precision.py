@@ -52,6 +52,21 @@ def test_bfloat16_weights_change_the_model_and_not_the_arithmetic(name, dtype):
     assert float(twin.max()) < 1e-2 * float(error.max())
 
 
+@pytest.mark.parametrize("name", ["explicit", "correction"])
+def test_errors_grow_with_the_steps_and_no_faster(name):
+    # fails if rounding adds up with a sign, or is amplified: more than a fifth of an ε a step; or if
+    # the error of another model (weights of 8 bits) goes on growing while the motion decays
+    settings = {**SETTINGS[name], "rate": 0.01}
+    single = build(0.1, dtype=torch.float32, **settings)
+    error = errors(single, build(0.1, **settings).float().double(), torch.float32, steps=512)
+    growth = error.cummax(-1).values.median(0).values
+    k = torch.arange(1, 514, dtype=torch.float64)
+    assert bool((growth < 0.2 * torch.finfo(torch.float32).eps * k).all())
+    coarse = build(0.1, **settings).to(torch.bfloat16).double()
+    growth = errors(coarse, build(0.1, **settings), torch.float64, steps=512).cummax(-1).values.median(0).values
+    assert float(growth[512]) < 2 * float(growth[128]) < 0.1
+
+
 @pytest.mark.parametrize("dtype", [torch.bfloat16, torch.float16], ids=str)
 def test_half_precision_states_are_refused(dtype):
     # fails if a state of 8 or 11 bits reaches a solver that has no such type
