@@ -168,6 +168,14 @@ def test_wrong_input_is_one_line(pendulum_run, capsys, arguments, words):
     assert error.count("\n") == 1
 
 
+def test_data_are_no_run(tmp_path, capsys):
+    # fails if a file of data is refused as a place for the result, which nobody named
+    file = tmp_path / "motion.csv"
+    file.write_text("t[s],q\n")
+    assert main(["tune", str(file), "--max-error", "1"]) == 2
+    assert "motion.csv: is a file; give the folder" in capsys.readouterr().err
+
+
 def test_another_run_is_not_overwritten(pendulum_run, capsys):
     # fails if --out takes the place of a fitted run
     assert main(["tune", str(pendulum_run), "--max-error", "1", "--out", str(pendulum_run)]) == 2

@@ -73,6 +73,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError("say what you need: either --max-error or --budget-us")
     multiples = _numbers("--multiples", arguments.multiples)
     widths, kicks = _whole("--widths", arguments.widths), _whole("--kicks", arguments.kicks)
+    if arguments.source.is_file():
+        raise InputError(f"{arguments.source}: is a file; give the folder that `herglotz fit --out` wrote")
     out: Path = arguments.out or arguments.source / "tuned"
     check_output_folder(out)
     if (out / "model.pt").exists() and not (out / "tuned.json").exists():
