@@ -52,7 +52,7 @@ COVERED = (
     ("rules of order 1, 2, 4, 6, implicit", lambda p: p.get("order") == 6 and p["kind"].startswith("lobatto")),
     ("compositions of order 4, 6, explicit", lambda p: p["kind"].startswith(("yoshida", "suzuki", "kahan"))),
     ("larger h, learned", lambda p: p["kind"] in ("learned, no re-training", "learned, distilled", "learned kicks")),
-    ("correction on/off", lambda p: p["kind"] == "learned, no correction" or "width" in p),
+    ("correction on/off", lambda p: p["kind"] in ("learned, no correction", "learned, distilled")),
     ("width, depth", lambda p: p["kind"] in ("learned, distilled", "learned, correction 6 × 2")),
     ("level", lambda p: p["kind"].startswith("learned, level")),
     ("float32", lambda p: p["kind"] == "learned" and p.get("dtype") == "float32"),

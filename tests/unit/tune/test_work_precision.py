@@ -213,9 +213,11 @@ def test_a_fixed_number_of_iterations_is_the_step_or_says_that_it_is_not(benchma
 
 def test_what_was_not_measured_is_said(benchmark):
     # fails if a knob without a point passes for measured
-    points = [{"kind": "learned, level conservative", "setting": ""}, {"kind": "learned, ONNX", "artefact": "ONNX"}]
+    points = [{"kind": "learned, level conservative", "setting": ""}, {"kind": "learned, ONNX", "artefact": "ONNX"},
+              {"kind": "neural ODE, RK4", "width": 8, "depth": 1}]  # fmt: skip
     lines = benchmark["_report"].coverage({"driven_pendulum": points})
     cells = {line.split("|")[1].strip(): line.split("|")[2].strip() for line in lines if line.startswith("| ")}
     assert (cells["level"], cells["ONNX"]) == ("yes", "yes")
     assert cells["torch.compile"].startswith("no")
+    assert cells["correction on/off"].startswith("no")  # a width of another's network is none
     assert cells["larger h, learned"] == "no: an input is held over h only"
