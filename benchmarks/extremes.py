@@ -317,10 +317,11 @@ def terms_table(rows: list[Row]) -> list[str]:
         level = f"**{r['level']}**" if r is own else r["level"]
         errors, error = r.get("errors"), r.get("median_error")
         shown = "not fitted" if error is None or not errors else f"{error:.2g} ({errors[0]:.2g}–{errors[-1]:.2g})"
-        times = r["c_us"] / own["c_us"]
+        c_us, unit = (x["c_us"] if isinstance(x["c_us"], float) else math.nan for x in (r, own))  # text: no compiler
+        times = c_us / unit
         against = f"× {times:.2g}" if error is None else f"× {error / own['median_error']:.2g}, × {times:.2g}"
         lines.append(
-            f"| {r['scene']} | {level} | {TERMS[r['level']]} | {r['c_us']:.2g} | {r['eager_us']:.0f} | {shown} | "
+            f"| {r['scene']} | {level} | {TERMS[r['level']]} | {c_us:.2g} | {r['eager_us']:.0f} | {shown} | "
             f"{'' if r is own else against} |"
         )
     return lines
