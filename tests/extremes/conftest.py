@@ -22,7 +22,7 @@ def _bounded(seconds, grace=GRACE, screen=None):
     def stop(*_):
         raise TimeoutError(f"still running after {seconds:g} s")
 
-    faulthandler.dump_traceback_later(seconds + grace, exit=True, file=screen or sys.__stderr__)
+    faulthandler.dump_traceback_later(seconds + grace, exit=True, file=screen or sys.__stderr__ or 2)
     before = signal.signal(signal.SIGALRM, stop) if hasattr(signal, "setitimer") else None
     try:
         if before is not None:

@@ -235,7 +235,8 @@ def test_features_are_evaluated_as_often_as_they_must(monkeypatch):
     calls = count_calls(monkeypatch, *places[1:3], *places[4:])
     jets = count_calls(monkeypatch, places[0])
     for name in COUNTS:
-        calls.clear(), jets.clear()
+        calls.clear()
+        jets.clear()
         model = build(0.02, **SCENES[name][0])
         state, iterations = starts(1, dof=model.dof), 0
         with torch.no_grad():
