@@ -11,11 +11,13 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
+from herglotz.data.windows import Triples
 from herglotz.errors import InputError
 from herglotz.training.robust import FREEDOM, root_weights, scale_of
 
 ROUNDS = 10  # of re-weighting
 JITTER = 1.05  # steps longer than the typical one by less than this are crossed in as many model steps
+PULLED = 3.0  # ratio of scales beyond which least squares follow the outliers
 GROSS = 30.0  # robust standard deviations of an acceleration that no smooth motion misses the baseline by
 
 
@@ -57,25 +59,9 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     InputError
         If nothing moves.
     """
-    max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
-    t = data.triples(max_step)
-    if len(t) == 0:
-        raise InputError(f"{data.source or 'data'}: no three samples in a row without a gap; record at equal steps")
-    h0, h1 = t.h0[:, None], t.h1[:, None]
-    v = (t.q2 - t.q0) / (h0 + h1)
-    a = 2 * ((t.q2 - t.q1) / h1 - (t.q1 - t.q0) / h0) / (h0 + h1)
+    max_step, t, v, a, columns = _differences(data, drag)
     n = data.dof
     m = 0 if data.u is None else data.u.shape[1]
-    columns = a.new_zeros(len(t), n, 2 * n + 1 + n * m)
-    for i, angle in enumerate(data.angles):
-        columns[:, i, 2 * i] = -(t.q1[:, i].sin() if angle else t.q1[:, i])
-        columns[:, i, 2 * i + 1] = -(t.q1[:, i].cos() if angle else torch.ones_like(t.q1[:, i]))
-        columns[:, i, 2 * n] = -v[:, i]
-        if data.u is not None:
-            columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (data.u[t.index] + data.u[t.index + 1]) / 2
-    if drag:
-        half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
-        columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
     q = data.q
     if outliers:
         x, good = _robust(columns.cpu(), a.cpu())
@@ -111,6 +97,43 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         input_map=tuple(x[2 * n + 1 : 2 * n + 1 + n * m]),
         start=start,
     )
+
+
+def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
+    """Whether least squares miss the bulk of the data by far more than Student's t: outliers that are no lone spikes.
+
+    Scales of the bulk, in accelerations: 2.6 to 18 times larger where a sixth of the samples are wrong in runs of six,
+    at most 2.6 times where a smooth motion does not obey this equation.
+    """
+    *_, a, columns = _differences(data, drag)
+    rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    plain = torch.linalg.lstsq(rows, right).solution
+    robust = rows.new_tensor(_robust(columns.cpu(), a.cpu())[0])[:, None]
+    return scale_of(rows @ plain - right) > PULLED * scale_of(rows @ robust - right)
+
+
+def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:
+    """Longest step, triples (T), velocities (T, n), accelerations (T, n), and what each coefficient adds (T, n, k)."""
+    max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
+    t = data.triples(max_step)
+    if len(t) == 0:
+        raise InputError(f"{data.source or 'data'}: no three samples in a row without a gap; record at equal steps")
+    h0, h1 = t.h0[:, None], t.h1[:, None]
+    v = (t.q2 - t.q0) / (h0 + h1)
+    a = 2 * ((t.q2 - t.q1) / h1 - (t.q1 - t.q0) / h0) / (h0 + h1)
+    n = data.dof
+    m = 0 if data.u is None else data.u.shape[1]
+    columns = a.new_zeros(len(t), n, 2 * n + 1 + n * m)
+    for i, angle in enumerate(data.angles):
+        columns[:, i, 2 * i] = -(t.q1[:, i].sin() if angle else t.q1[:, i])
+        columns[:, i, 2 * i + 1] = -(t.q1[:, i].cos() if angle else torch.ones_like(t.q1[:, i]))
+        columns[:, i, 2 * n] = -v[:, i]
+        if data.u is not None:
+            columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (data.u[t.index] + data.u[t.index + 1]) / 2
+    if drag:
+        half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
+        columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
+    return max_step, t, v, a, columns
 
 
 def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:

@@ -21,7 +21,7 @@ from herglotz.data.windows import Triples
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian
 from herglotz.training.adam import DECAY, adam
-from herglotz.training.baseline import Baseline, estimate_baseline
+from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.build import build_model, dragged
 from herglotz.training.config import FitConfig
@@ -92,6 +92,7 @@ def fit(
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())
+    suspect = suspect or (config.robust == "auto" and outliers_pull(kept, drag=dragged(config)))
     base = estimate_baseline(kept, outliers=suspect, drag=dragged(config), substeps=config.substeps)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     free = nothing_told(kept, told)

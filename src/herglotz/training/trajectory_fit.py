@@ -302,7 +302,6 @@ def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _noise(problem: ShootingProblem, path: Path) -> float:
-    """Scale of the residuals, in units of q: their RMS, weighted where the loss is robust."""
+    """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
     misfit = problem.misfit(path)[problem.used[problem.grid.sample]]
-    weighted = misfit * root_weights(misfit / problem.sigma, problem.freedom)
-    return float(weighted.square().mean().sqrt())
+    return scale_of(misfit) if problem.freedom else float(misfit.square().mean().sqrt())
