@@ -30,7 +30,7 @@ def _pendulum_motion(q: Tensor, clean: Tensor, v: Tensor, gamma: float) -> tuple
 
 
 def pendulum(h: float, noise: float = 0.0, trajectories: int = 40) -> Problem:
-    """The damped pendulum of benchmarks/learned.py: 40 × 41 positions; 5 × 20 unseen starts, 100 steps."""
+    """The damped pendulum: 40 × 41 positions; 5 × 20 unseen starts, 100 steps."""
     system, gamma = scene("damped_pendulum"), 0.2
 
     def samples(seed: int, exact: bool) -> Samples:

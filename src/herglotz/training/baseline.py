@@ -18,6 +18,7 @@ from herglotz.training.robust import FREEDOM, root_weights, scale_of
 ROUNDS = 10  # of re-weighting
 JITTER = 1.05  # steps longer than the typical one by less than this are crossed in as many model steps
 PULLED = 3.0  # ratio of scales beyond which least squares follow the outliers
+NEGLIGIBLE = 1e-3  # of the RMS acceleration: a bulk that is missed by less is at rest, or exact
 GROSS = 30.0  # robust standard deviations of an acceleration that no smooth motion misses the baseline by
 
 
@@ -100,16 +101,20 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
 
 
 def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
-    """Whether least squares miss the bulk of the data by far more than Student's t: outliers that are no lone spikes.
+    """Whether outliers that are no lone spikes pull the least-squares start away from all else.
 
-    Scales of the bulk, in accelerations: 2.6 to 18 times larger where a sixth of the samples are wrong in runs of six,
-    at most 2.6 times where a smooth motion does not obey this equation.
+    All needed: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a period),
+    and least squares miss their bulk, by more than rounding, three times as far as Student's t does.
     """
-    *_, a, columns = _differences(data, drag)
+    _, t, v, a, columns = _differences(data, drag)
+    size = float(a.square().mean().sqrt())
+    jumps = float((a * (t.h0 + t.h1)[:, None] / 2).square().mean().sqrt()) > float(v.square().mean().sqrt())
+    if not jumps:
+        return False
     rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    plain = torch.linalg.lstsq(rows, right).solution
-    robust = rows.new_tensor(_robust(columns.cpu(), a.cpu())[0])[:, None]
-    return scale_of(rows @ plain - right) > PULLED * scale_of(rows @ robust - right)
+    plain = scale_of(rows @ torch.linalg.lstsq(rows, right).solution - right)
+    robust = scale_of(rows @ rows.new_tensor(_robust(columns.cpu(), a.cpu())[0])[:, None] - right)
+    return plain > max(PULLED * robust, NEGLIGIBLE * size)
 
 
 def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from herglotz.data import simulate
+from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
@@ -87,8 +87,11 @@ def test_outliers_in_runs_are_noticed_before_the_first_fit():
     for seed in range(3):
         assert outliers_pull(recorded(seed, share=0.15, run=6)[0])
         assert not outliers_pull(recorded(seed)[0])
-    for name, h in (("parachute", 0.2), ("kepler", 0.05), ("double_pendulum", 0.05), ("quadratic_drag", 0.2)):
-        assert not outliers_pull(simulate(scene(name), trajectories=10, steps=60, h=h).unwrapped())
+    for name, steps, h in (("parachute", 60, 0.2), ("kepler", 60, 0.05), ("double_pendulum", 60, 0.05),
+                           ("quadratic_drag", 1000, 0.2), ("damped_pendulum", 1000, 0.2)):  # fmt: skip
+        assert not outliers_pull(simulate(scene(name), trajectories=4, steps=steps, h=h).unwrapped())
+    t = 2.0 * torch.arange(500, dtype=torch.float64)  # three samples a period, and at rest for most of the time
+    assert not outliers_pull(Trajectories.of(t, torch.exp(-0.1 * t) * torch.cos(t)))
 
 
 def test_clean_data_are_fitted_as_without(clean):
