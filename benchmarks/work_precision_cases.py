@@ -13,7 +13,6 @@ from work_precision_scenes import CHECKS, Setup, exact_motion, judged, starts_of
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
-from herglotz.export import ExportedStepper
 from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.reference import JITTER, draw_starts, record
@@ -80,16 +79,11 @@ def rolled(case: Case, stepper: Any, h: float, dtype: torch.dtype = torch.float6
     steps, u = round(case.setup.T / h), inputs_of(case)
     if steps % CHECKS:
         raise InputError(f"{steps} steps do not reach the {CHECKS} times of the check")
-    options = {} if u is None else given(stepper, u.to(dtype))
+    options = {} if u is None else {"inputs": u.to(dtype)}
     with torch.no_grad():
         start = (x.to(dtype).contiguous() for x in case.entry)
         q = stepper.rollout(*start, h=h, steps=steps, **options).q[:, 1:]
     return judged(q[:, steps // CHECKS - 1 :: steps // CHECKS], case.truth)
-
-
-def given(stepper: Any, u: Tensor) -> dict[str, Tensor]:
-    """The inputs under the name that this kind of stepper has for them."""
-    return {"u" if isinstance(stepper, ExportedStepper) else "inputs": u}
 
 
 def inputs_of(case: Case) -> Tensor | None:

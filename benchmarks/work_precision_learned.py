@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from work_precision_cases import COUNT, Case, Timed, costs, entered, fit_config, given, inputs_of, motions_of, rolled
+from work_precision_cases import COUNT, Case, Timed, costs, entered, fit_config, inputs_of, motions_of, rolled
 from work_precision_headline import equation, kicks
 from work_precision_rivals import classical, neural
 from work_precision_scenes import CHECKS, judged, starts_of
@@ -118,7 +118,7 @@ def _own(case: Case, quick: bool) -> list[Timed]:
 def _eager(point: dict, stepper: Any, case: Case, h: float, u: Tensor | None) -> Timed:
     steps = min(24, round(case.setup.T / h))
     start = State(*(x[:1] for x in case.entry))
-    options = {} if u is None else given(stepper, u[:steps])
+    options = {} if u is None else {"inputs": u[:steps]}
 
     def run() -> None:
         with torch.no_grad():
