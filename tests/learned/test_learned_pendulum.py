@@ -110,7 +110,8 @@ def test_prediction_never_saw_the_test_part(demo_run):
     for first, length, trained in zip(data.offsets, data.lengths, demo_run.train_lengths, strict=True):
         q[first + trained : first + length] += 0.5
     other = fit(replace(data, q=q), FitConfig(departures=(2e-4, 2e-3)))
-    assert torch.equal(other.prediction, demo_run.prediction)
+    # Not bit for bit: the last bits of a matrix product depend on where its memory lies.
+    torch.testing.assert_close(other.prediction, demo_run.prediction, rtol=0, atol=1e-6)
     assert other.metrics["extrapolation_rms"] > 0.4
 
 
