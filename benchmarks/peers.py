@@ -45,7 +45,7 @@ from herglotz.errors import InputError
 
 ROOT = Path(__file__).resolve().parents[1]
 BUDGET = 10.0  # seconds of processor time of a network peer's fit
-LIMIT = 300  # seconds of processor time after which a cell is given up
+LIMIT = 900  # seconds of processor time after which a cell is given up
 
 
 class _OutOfTimeError(Exception):
