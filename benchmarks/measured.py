@@ -3,7 +3,7 @@
 Writes results/measured.json, .md and .png, and coverage.png. Settings are the defaults unless a set says otherwise
 (measured_free.py, measured_windows.py, measured_coverage.py say what each is). Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
-run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, real_pendulum 20, air_track 18,
+run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20, air_track 18,
 driven_pendulum 110, coverage_simulated 27, coverage_real about 90; `cpu_seconds` in the table says what it took.
 """
 
@@ -22,7 +22,7 @@ from typing import Any
 
 import measured_coverage
 import torch
-from measured_free import AIR_TRACK, PENDULUM, extrapolation, noise, one_trajectory, outliers
+from measured_free import AIR_TRACK, PENDULUM, disturbed, extrapolation, noise, one_trajectory, outliers
 from measured_windows import DFKI, DOUBLE, double_pendulum, driven_pendulum
 
 from herglotz.data.files import write_atomically
@@ -46,6 +46,7 @@ ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] =
     "noise": ((), noise),
     "one_trajectory": ((), one_trajectory),
     "outliers": ((), outliers),
+    "disturbed": ((), disturbed),
     "real_pendulum": ((PENDULUM,), extrapolation(PENDULUM)),
     "air_track": ((AIR_TRACK,), extrapolation(AIR_TRACK)),
     "double_pendulum": (DOUBLE, double_pendulum),

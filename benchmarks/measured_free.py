@@ -4,6 +4,8 @@
   rollouts from 20 exact unseen starts against the noiseless truth. `one_trajectory`: the same from one of 41 samples.
 * outliers: 6 × 61 of these positions with 2 % of them off by 0.5 … 1.5 rad, beside the same fit without outliers, and
   with outliers but without the robust loss; 60-step rollouts.
+* disturbed: 10 × 101 noisy positions of the pendulum under a random force (velocity kicks of 0.02 at every sample), by
+  multiple shooting and by joint smoothing; 100-step rollouts without the force, and the noise found over the true one.
 * real_pendulum, air_track: first two thirds → free run over the last third.
 """
 
@@ -15,7 +17,7 @@ from pathlib import Path
 
 import torch
 
-from herglotz.data import load, simulate
+from herglotz.data import Trajectories, load, simulate
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
@@ -68,6 +70,38 @@ def outliers(seed: int, folder: Path) -> dict[str, float]:  # noqa: ARG001
         run = fit(data, FitConfig(train_fraction=1.0, seed=seed, robust=robust), progress=False)
         found[name] = rollout_rms(run.model, 60, seed)
     return {**found, "over_clean": found["robust"] / found["clean"]}
+
+
+def disturbed(seed: int, folder: Path) -> dict[str, float]:  # noqa: ARG001
+    count, steps, h, parts = 10, 100, 0.2, 20
+    start = simulate(scene("damped_pendulum"), trajectories=count, steps=2, h=h, seed=seed, keep_state=True)
+    assert start.p is not None
+    x = torch.cat([start.q, start.p], -1)[::3]  # (count, 2); mass 1
+    make = torch.Generator().manual_seed(seed + 7)
+
+    def rates(x: torch.Tensor) -> torch.Tensor:
+        return torch.stack([x[:, 1], -x[:, 0].sin() - 0.2 * x[:, 1]], -1)
+
+    q = [x[:, 0]]
+    for _ in range(steps):
+        for _ in range(parts):
+            d = h / parts
+            a = rates(x)
+            b = rates(x + d / 2 * a)
+            c = rates(x + d / 2 * b)
+            x = x + d / 6 * (a + 2 * b + 2 * c + rates(x + d * c))
+        x[:, 1] += 0.02 * torch.randn(count, generator=make, dtype=x.dtype)
+        q.append(x[:, 0])
+    noisy = torch.stack(q, 1) + 0.01 * torch.randn(count, steps + 1, generator=make, dtype=x.dtype)
+    t = (h * torch.arange(steps + 1, dtype=x.dtype)).repeat(count)
+    data = Trajectories.of(t, noisy.reshape(-1, 1), (steps + 1,) * count, angles=start.angles)
+    found = {}
+    for objective in ("trajectory", "smoothing"):
+        run = fit(data, FitConfig(train_fraction=1.0, seed=seed, objective=objective), progress=False)
+        found[objective] = rollout_rms(run.model, 100, seed)
+        found[f"{objective}_noise"] = run.metrics["sigma"] / 0.01
+        found[f"{objective}_rate"] = run.metrics["rate"] / 0.2
+    return found
 
 
 def extrapolation(name: str) -> Callable[[int, Path], dict[str, float]]:

@@ -64,9 +64,8 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
     began = time.process_time()
     out: dict[str, Any] = {"error": None, "commit": _commit()}
     try:
-        if name.startswith("ours") and problem.whole is not None:
-            level = {"level": "forced"} if name == "ours_forced" else {}
-            found, out["parameters"] = measured(problem.whole(), seed, **level)
+        if name == "ours" and problem.whole is not None:
+            found, out["parameters"] = measured(problem.whole(), seed)
             return out | found | {"seconds": time.process_time() - began}
         samples = problem.samples(seed, exact)
         began = time.process_time()  # simulating the data is not training
@@ -133,8 +132,6 @@ def plan(data: list[str], peers: list[str], seeds: int) -> list[tuple[str, str, 
             problem = PROBLEMS[name]()
             simulated = problem.simulated
             for peer in peers:
-                if peer == "ours_forced" and problem.dof == 1:
-                    continue  # one rate is all the friction that one joint has
                 needs = PEERS[peer].needs
                 given = ["differences" if needs == "velocities" else "positions"]
                 if needs != "positions" and simulated:

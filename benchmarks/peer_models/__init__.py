@@ -13,7 +13,6 @@ from .lagrangian import train_delan, train_lnn
 from .ours import train_ours
 from .package_peers import train_phlearn, train_sindy
 from .rollouts import Predictor
-from .samples import Samples
 from .steps import train_mlp, train_neural_ode
 
 Train = Callable[..., Predictor]
@@ -51,19 +50,12 @@ class Peer:
         return self.package is None or find_spec(self.package) is not None
 
 
-def _forced(samples: Samples, seed: int, budget: float) -> Predictor:
-    return train_ours(samples, seed, budget, level="forced")
-
-
 PEERS = {
     "ours": Peer(
         "herglotz, no flag changed",
         train_ours,
         "positions",
         "`herglotz.training.fit` with its defaults; stops by itself",
-    ),
-    "ours_forced": Peer(
-        "herglotz, forced level", _forced, "positions", "the same with `level='forced'`, for two joints only"
     ),
     "neural_ode": Peer(
         "neural ODE",

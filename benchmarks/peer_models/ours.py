@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,17 +36,17 @@ class Learned:
         return torch.cat([q0[:, None], out.q], 1)
 
 
-def train_ours(samples: Samples, seed: int, budget: float, **settings: Any) -> Learned:  # noqa: ARG001
+def train_ours(samples: Samples, seed: int, budget: float) -> Learned:  # noqa: ARG001
     """`herglotz.training.fit` on all samples; the budget is not used: it stops by itself."""
     lengths = [len(q) for q in samples.q]
     t = torch.cat([samples.h * torch.arange(k, dtype=torch.float64) for k in lengths])
     data = Trajectories.of(t, torch.cat(samples.q), lengths, angles=samples.angles, source="peers")
-    config = FitConfig(train_fraction=1.0, seed=seed, **settings)
+    config = FitConfig(train_fraction=1.0, seed=seed)
     return Learned(fit(data, config, progress=False), samples.h)
 
 
-def measured(data: Trajectories, seed: int, **settings: Any) -> tuple[Metrics, int]:
+def measured(data: Trajectories, seed: int) -> tuple[Metrics, int]:
     """The default fit of a recording, time split included, judged by its own free run; and its parameters."""
-    run = fit(data, FitConfig(seed=seed, **settings), progress=False)
+    run = fit(data, FitConfig(seed=seed), progress=False)
     cut = run.train_lengths[0]
     return free_run(run.prediction[cut:], run.data.q[cut:]), run.metrics["parameters"]

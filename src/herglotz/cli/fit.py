@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
-OBJECTIVES = ("auto", "residual", "trajectory", "raw")
+OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
@@ -44,8 +44,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",
-        help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. auto: measure "
-        "the noise and choose. raw: a plain network on |R|, which collapses, for demonstration (default %(default)s)",
+        help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. smoothing: "
+        "every state, and a little noise in every step, for pushes, chaos, very long records. auto: the first or the "
+        "second, by the noise. raw: a plain network on |R|, which collapses, for demonstration (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
         "--optimiser", choices=OPTIMISERS, default="lm",

@@ -17,7 +17,7 @@ def solve_blocks(blocks: Blocks, rhs: Tensor) -> Tensor:
     (a caustic that the curve has crossed exactly at a node): those samples are solved densely. Not finite where the
     matrix is singular.
     """
-    u = _eliminate(blocks, rhs)
+    u = eliminate(blocks, rhs[..., None])[..., 0]
     defect = (multiply(blocks, u) - rhs).abs().flatten(-2).amax(-1)
     good = defect <= 1e-3 * torch.finfo(rhs.dtype).eps ** 0.25 * rhs.abs().flatten(-2).amax(-1)
     if bool(good.all()):
@@ -30,30 +30,30 @@ def solve_blocks(blocks: Blocks, rhs: Tensor) -> Tensor:
     return u
 
 
+def eliminate(blocks: Blocks, rhs: Tensor) -> Tensor:
+    """Solve for columns rhs (..., K, m, R), pivots inside blocks only: for positive definite systems."""
+    diagonal, upper, lower = blocks
+    count, m = rhs.shape[-3:-1]
+    reduced: list[Tensor] = []
+    pivot, column = diagonal[..., 0, :, :], rhs[..., 0, :, :]
+    for k in range(count):
+        reduced.append(torch.linalg.solve_ex(pivot, torch.cat([upper[..., k, :, :], column], -1))[0])
+        if k + 1 < count:
+            removed = lower[..., k + 1, :, :] @ reduced[-1]
+            pivot = diagonal[..., k + 1, :, :] - removed[..., :m]
+            column = rhs[..., k + 1, :, :] - removed[..., m:]
+    u = [reduced[-1][..., m:]]
+    for X in reversed(reduced[:-1]):
+        u.append(X[..., m:] - X[..., :m] @ u[-1])
+    return torch.stack(u[::-1], -3)
+
+
 def multiply(blocks: Blocks, u: Tensor) -> Tensor:
     """The matrix times u (..., K, m)."""
     diagonal, upper, lower = blocks
     zero = torch.zeros_like(u[..., :1, :])
     after, before = torch.cat([u[..., 1:, :], zero], -2), torch.cat([zero, u[..., :-1, :]], -2)
     return sum((a @ x[..., None])[..., 0] for a, x in ((diagonal, u), (upper, after), (lower, before)))  # type: ignore[return-value]
-
-
-def _eliminate(blocks: Blocks, rhs: Tensor) -> Tensor:
-    diagonal, upper, lower = blocks
-    count, m = rhs.shape[-2:]
-    columns = torch.cat([upper, rhs[..., None]], -1)
-    reduced: list[Tensor] = []
-    pivot, column = diagonal[..., 0, :, :], columns[..., 0, :, :]
-    for k in range(count):
-        reduced.append(torch.linalg.solve_ex(pivot, column)[0])
-        if k + 1 < count:
-            removed = lower[..., k + 1, :, :] @ reduced[-1]
-            pivot = diagonal[..., k + 1, :, :] - removed[..., :m]
-            column = torch.cat([upper[..., k + 1, :, :], (rhs[..., k + 1, :] - removed[..., m])[..., None]], -1)
-    u = [reduced[-1][..., m]]
-    for X in reversed(reduced[:-1]):
-        u.append(X[..., m] - (X[..., :m] @ u[-1][..., None])[..., 0])
-    return torch.stack(u[::-1], -2)
 
 
 def _assemble(blocks: Blocks) -> Tensor:

@@ -10,7 +10,7 @@ from herglotz.training.residual import ResidualProblem
 from herglotz.training.run import Run, load_run, save_run
 from herglotz.training.selection import Selection, select
 from herglotz.training.shooting import ShootingProblem
-from herglotz.training.smoothing import Smoothed, smooth
+from herglotz.training.smoothing import Smoothed, SmoothingProblem, smooth
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.uncertainty import Bands, Laplace, ensemble_bands, laplace
 
@@ -25,6 +25,7 @@ __all__ = [
     "Selection",
     "ShootingProblem",
     "Smoothed",
+    "SmoothingProblem",
     "SupervisedProblem",
     "Trade",
     "adam",

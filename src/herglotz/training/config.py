@@ -13,7 +13,7 @@ from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
 from herglotz.settings import from_plain
 
-OBJECTIVES = ("auto", "residual", "trajectory", "raw")
+OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
@@ -33,8 +33,10 @@ class FitConfig:
         coordinates with an angle among them, where nothing is told, what the data say (`herglotz.training.structure`).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
-        "auto": whichever the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses
-        (always seen with Adam, at some seeds with Levenberg–Marquardt); for demonstration.
+        "smoothing": every state an unknown and a little noise in every step, for noisy data that no model follows for
+        long (pushes, chaos), or of more samples than multiple shooting has memory for. "auto": the first or the second,
+        as the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses (always seen
+        with Adam, at some seeds with Levenberg–Marquardt); for demonstration.
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" or "adamw" for the residual objectives.
     train_fraction
@@ -161,7 +163,7 @@ class FitConfig:
         self._check_batch()
         if self.substeps < 1:
             raise InputError(f"substeps must be >= 1, got {self.substeps}")
-        if self.substeps > 1 and self.objective != "trajectory":
+        if self.substeps > 1 and self.objective not in ("trajectory", "smoothing"):
             raise InputError(
                 f"substeps are of trajectory fitting, not of the objective {self.objective!r}; set it to 'trajectory'"
             )

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
+from herglotz.data import Trajectories
 from herglotz.training.lifted import Path
 from herglotz.training.shooting import ShootingProblem
 
@@ -27,21 +30,24 @@ def held_out_errors(
     """
     r, J = problem.data_rows(path, theta)
     inverse = torch.linalg.pinv(A.double(), hermitian=True)
-    r, J = r.double(), J.double()
-    fold = _folds(problem)
+    J = J.double()
+    return left_out_errors(r.double(), problem.data, lambda rows: J[rows] @ inverse @ J[rows].T) * problem.sigma
+
+
+def left_out_errors(
+    r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
+    data: Trajectories,
+    hat: Callable[[Tensor], Tensor],  # J_B A⁻¹ J_Bᵀ of some of their rows, given as bool (N·n,)
+) -> Tensor:
+    """RMS of r in each fold if its rows had been left out, (FOLDS,)."""
+    parts = [torch.arange(length) * FOLDS // length for length in data.lengths]
+    fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
     errors = []
     for k in range(FOLDS):
-        rows = fold == k
-        H = J[rows] @ inverse @ J[rows].T
-        left_out = torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r[rows])[0]
-        errors.append(left_out.square().mean().sqrt() * problem.sigma)
+        H = hat(fold == k)
+        left_out = torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r[fold == k])[0]
+        errors.append(left_out.square().mean().sqrt())
     return torch.stack(errors).nan_to_num(nan=torch.inf)
-
-
-def _folds(problem: ShootingProblem) -> Tensor:
-    """Fold of every data row, in the order of `data_rows`."""
-    parts = [torch.arange(length) * FOLDS // length for length in problem.data.lengths]
-    return torch.cat(parts).repeat_interleave(problem.n).to(problem.data.t.device)
 
 
 def simplest_not_beaten(errors: dict[float, Tensor]) -> float:

@@ -7,16 +7,17 @@ on where its memory lies; what decides the optimiser's path is therefore taken f
 
 from __future__ import annotations
 
+import functools
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import TypeVar
 
 import torch
 import torch.distributed as dist
 from torch import Tensor
 
-T = TypeVar("T")
+PARTS, LEAST = 8, 512  # rows are dealt out in up to so many parts, none smaller than this
+LANES = 2
 
 
 def world() -> tuple[int, int]:
@@ -29,10 +30,38 @@ def is_first() -> bool:
     return world()[0] == 0
 
 
-def own_share(parts: Sequence[T]) -> list[T]:
-    """The parts that this process works on: every world-size-th of them."""
-    rank, size = world()
-    return list(parts[rank::size])
+def own_parts(count: int, most: int, device: torch.device) -> Iterator[tuple[int, Tensor]]:
+    """The parts of `count` rows that this process works on, at most `most` rows each: (lane, rows).
+
+    Parts and lanes do not depend on the number of processes: batches of another size, and sums in another order, differ
+    in their last bits, and what the data hardly determine then differs in far more.
+    """
+    parts = 1
+    while parts < PARTS and count >= 2 * parts * LEAST:
+        parts *= 2
+    size = max(1, min(most, -(-count // parts)))
+    rank, processes = world()
+    for k, rows in enumerate(torch.arange(count, device=device).split(size)):
+        if k % processes == rank:
+            yield k % LANES, rows
+
+
+class LaneSums:
+    """Sums over parts, every second part in the same lane: bit for bit the same for one process and for two."""
+
+    def __init__(self, *zeros: Tensor):
+        self.lanes = [tuple(torch.zeros_like(x) for x in zeros) for _ in range(LANES)]
+
+    def add(self, lane: int, *terms: Tensor) -> None:
+        """Add the terms of a part."""
+        for x, term in zip(self.lanes[lane], terms, strict=True):
+            x += term
+
+    def total(self) -> tuple[Tensor, ...]:
+        """The sums over all parts of all processes."""
+        for lane in self.lanes:
+            add_over_processes(*lane)
+        return tuple(functools.reduce(torch.add, x) for x in zip(*self.lanes, strict=True))
 
 
 def add_over_processes(*tensors: Tensor) -> None:

@@ -32,6 +32,7 @@ from herglotz.training.matrix_free import DENSE, MatrixFree
 from herglotz.training.residual import ResidualProblem
 from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
+from herglotz.training.smoothing_fit import fit_smoothing
 from herglotz.training.stages import Stages
 from herglotz.training.structure import ROWS, kept_structure, nothing_told
 from herglotz.training.supervision import SupervisedProblem
@@ -88,7 +89,8 @@ def fit(
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
     train = data if config.train_fraction == 1 else data.split_time(config.train_fraction)[0]
-    check_size(train)
+    if config.objective != "smoothing":
+        check_size(train)
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())
@@ -134,12 +136,13 @@ def _fit_training_part(
         objective = "residual"
     size = max(base.scale)
     exact = EXACT * size if config.dtype == "float64" else 1e-5 * size
-    if objective == "trajectory":
+    if objective in ("trajectory", "smoothing"):
         model = build_model(base, config, "potential")
         _, rms = _fit_residual(
             model, train, base, config, stages, "one-step start", PROBE, 0.02 * size, freedom=freedom
         )
-        return _fit_by_trajectory(model, train, base, config, stages, rms / 6**0.5)
+        by = _fit_by_trajectory if objective == "trajectory" else _fit_by_smoothing
+        return by(model, train, base, config, stages, rms / 6**0.5)
     model = build_model(base, config, "plain" if objective == "raw" else "correction")
     expected = _expected(model, train, base, config, exact)
     if objective == "auto" and expected is None:
@@ -186,11 +189,32 @@ def _fit_by_trajectory(
         notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}
         return Fitted(model, _states_of_pairs(model, train), "trajectory", sigma, notes)
     found.problem.flat.set(found.theta)
-    held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
-    notes = {"departure": found.departure, "held_out_rms": held_out, "reason": found.result.reason}
+    notes = {"departure": found.departure, "held_out_rms": _plain(found.held_out), "reason": found.result.reason}
     notes |= {"robust": found.problem.freedom is not None, "segment_steps": found.problem.grid.longest}
     notes["follows_data"] = True
     return Fitted(model, _fitted_states(found), "trajectory", found.sigma, notes, found.problem.used)
+
+
+def _fit_by_smoothing(
+    model: ContactLagrangian, train: Trajectories, base: Baseline, config: FitConfig, stages: Stages, sigma: float
+) -> Fitted:
+    found = fit_smoothing(model, train, base, sigma, config.departures, config.iterations, stages, robust=config.robust)
+    if found is None:
+        notes = {"reason": "the model has no step near the data", "follows_data": False}
+        return Fitted(model, _states_of_pairs(model, train), "smoothing", sigma, notes)
+    found.problem.flat.set(found.theta)
+    notes = {"departure": found.departure, "held_out_rms": _plain(found.held_out), "reason": found.result.reason}
+    notes |= {
+        "robust": found.problem.freedom is not None,
+        "follows_data": found.follows_data(),
+        "process": found.problem.process,
+    }
+    return Fitted(model, found.problem.states(found.x), "smoothing", found.problem.sigma, notes)
+
+
+def _plain(held_out: dict[float, Tensor]) -> dict[str, float]:
+    """RMS over the folds, by prior strength."""
+    return {f"{k:g}": float(v.square().mean().sqrt()) for k, v in held_out.items()}
 
 
 def _fitted_states(found: TrajectoryFit) -> Tensor:

@@ -60,6 +60,7 @@ def levenberg_marquardt(
     max_iterations: int = 150,
     rtol: float = 1e-6,
     patience: int = 5,
+    damping: float = 1e-3,
     callback: Callable[[int, float, Tensor], None] | None = None,
 ) -> OptimiserResult:
     """Minimise ½|r(x)|².
@@ -79,6 +80,9 @@ def levenberg_marquardt(
     rtol, patience
         Stop after `patience` accepted steps in a row that each lower the cost by less than `rtol` relative. A step
         that changes it by rounding only is not taken and counts as one of them.
+    damping
+        λ of the first step. Where few combinations of the unknowns are free beside the diagonal (smoothed states), it
+        has to be far smaller than where all are.
     callback
         Called with (iteration, cost, x) after each iteration.
 
@@ -92,7 +96,7 @@ def levenberg_marquardt(
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, best, "not_finite", 0)
     scale = A.diagonal().clone()
-    damping, growth, quiet = 1e-3, 2.0, 0
+    growth, quiet = 2.0, 0
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     history, reason, iteration = [best], "max_iterations", 0
     for iteration in range(1, max_iterations + 1):

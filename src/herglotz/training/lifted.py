@@ -12,10 +12,14 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
+from torch.func import jacrev, vmap
 
-from herglotz.mechanics import momentum_plus, step_derivative
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.stepping import Status, solve_step
+from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.flat import FixedModel, FlatModel
+
+CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
 
 
 @dataclass(frozen=True)
@@ -69,3 +73,41 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     P = solution.P
     y = torch.cat([solution.q1, momentum_plus(P), (s0 + P.L)[..., None]], -1)
     return y, step_derivative(P, p0)
+
+
+def parameter_derivatives(
+    flat: FlatModel,
+    theta: Tensor,  # (P,)
+    x: Tensor,  # (S, K+1, 2n+1) states that the steps start from; the last is not used
+    q1: Tensor,  # (S, K, n) positions that they lead to
+    h: Tensor,  # (S, K)
+    u: Tensor | None = None,  # (S, K, m)
+) -> Tensor:
+    """∂Φ̃(x_k)/∂θ of every step, (S, K, 2n+1, P), by the implicit-function theorem.
+
+    With F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ; p1 and s1 follow.
+    """
+    S, K, n = *h.shape, q1.shape[-1]
+    q0, p0, s0 = (y.flatten(0, 1) for y in (x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]))
+    ends, steps, inputs = q1.flatten(0, 1), h.flatten(), None if u is None else u.flatten(0, 1)
+
+    def step_functions(
+        theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
+    ) -> Tensor:
+        P = flat.partials(theta, q0, q1, s0, h, 1, u)
+        return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
+
+    per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
+    out = x.new_zeros(S * K, 2 * n + 1, len(theta))
+    for _, part in own_parts(S * K, CHUNK, x.device):
+        here, own = (q0[part], ends[part], p0[part], s0[part], steps[part]), None if inputs is None else inputs[part]
+        G = per_step(theta, *here, own)  # (part, 2n+1, P)
+        with torch.no_grad():
+            P = partials(flat.at(theta, own), here[0], here[1], here[3], here[4], order=2)
+            dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, here[2]), G[:, :n])[0]
+            p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
+            dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
+            ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
+        out[part] = torch.cat([dq1, dp1, ds1], 1)
+    add_over_processes(out)
+    return out.reshape(S, K, 2 * n + 1, len(theta))

@@ -18,7 +18,7 @@ from herglotz.data.windows import Triples, join
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
-from herglotz.training.distributed import add_over_processes, own_share, world
+from herglotz.training.distributed import LaneSums, add_over_processes, own_parts, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.inputs import step_inputs
 from herglotz.training.prior import Prior
@@ -147,12 +147,9 @@ class ResidualProblem:
         theta, latent = self._split(x)
         s = self._action(theta, latent)
         ds = self._action_derivative(theta, s) if self.coupled else None
-        A, b, scale = x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), self.scale
-        cost = x.new_zeros(())
+        sums, scale = LaneSums(x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), x.new_zeros(())), self.scale
         t, axes = self.triples, (0,) * 6 + ((None, None) if self.u is None else (0, 0))
-        _, processes = world()
-        chunk = min(self.chunk, -(-len(t.q0) // processes))
-        for part in own_share(torch.arange(len(t.q0), device=x.device).split(chunk)):
+        for lane, part in own_parts(len(t), self.chunk, x.device):
             arguments = (t.q0[part], t.q1[part], t.q2[part], s[t.index[part]], t.h0[part], t.h1[part])
             arguments += self._inputs(t.index[part])
             r = self._local(theta, *arguments)
@@ -166,13 +163,12 @@ class ResidualProblem:
                 J = J + r_s[..., None] * ds[t.index[part]][:, None, :]
             J = (J / scale[part][..., None]).reshape(-1, len(x))
             r = (r / scale[part]).reshape(-1)
-            cost += loss(r, self.freedom)
+            cost = loss(r, self.freedom)
             if self.freedom is not None:
                 by = root_weights(r, self.freedom)
                 J, r = by[:, None] * J, by * r
-            A += J.T @ J
-            b += J.T @ r
-        add_over_processes(A, b, cost)
+            sums.add(lane, J.T @ J, J.T @ r, cost)
+        A, b, cost = sums.total()
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
             P = len(theta)
@@ -186,10 +182,9 @@ class ResidualProblem:
 
         For models whose motion has no s.
         """
-        t, scale, (_, processes) = self.triples, self.scale, world()
+        t, scale = self.triples, self.scale
         zero = torch.zeros_like(t.h0)
-        chunk = min(self.chunk, -(-len(t) // processes))
-        for part in own_share(torch.arange(len(t), device=zero.device).split(chunk)):
+        for _, part in own_parts(len(t), self.chunk, zero.device):
             rows = (t.q0[part], t.q1[part], t.q2[part], zero[part], t.h0[part], t.h1[part])
             rows += self._inputs(t.index[part])
             yield part, lambda theta, rows=rows, by=scale[part]: (self._local(theta, *rows) / by).reshape(-1)

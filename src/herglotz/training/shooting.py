@@ -6,25 +6,23 @@ Unknowns are the parameters and the state (q, p[, s]) at the start of every segm
     (end of a segment − start of the next) / weight     between segments,
     (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
 
-and the prior. Derivatives run through every implicit step by the implicit-function theorem: with
-F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ. Segments grow until each trajectory is one.
+and the prior. Derivatives run through every implicit step (`lifted.parameter_derivatives`). Segments grow until each
+trajectory is one.
 """
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import jacrev, vmap
 
 from herglotz.data import Trajectories
-from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
-from herglotz.training.distributed import add_over_processes, everywhere, own_share, world
+from herglotz.training.distributed import everywhere
 from herglotz.training.flat import FlatModel
 from herglotz.training.grid import SegmentGrid
 from herglotz.training.inputs import step_inputs
-from herglotz.training.lifted import Path, solve_path
+from herglotz.training.lifted import Path, parameter_derivatives, solve_path
 from herglotz.training.prior import Prior
 from herglotz.training.robust import loss, root_weights
 
@@ -50,8 +48,6 @@ class ShootingProblem:
         (N,) which samples have a say; all without it. The others are outliers that were found.
     s
         (N,) s at every sample in the model's unit, where it is known: trajectories start from it, not from about 0.
-    chunk
-        Steps whose parameter Jacobian is held in memory at once.
     """
 
     def __init__(
@@ -65,11 +61,10 @@ class ShootingProblem:
         freedom: float | None = None,
         used: Tensor | None = None,
         s: Tensor | None = None,
-        chunk: int = 4096,
     ):
         self.freedom = freedom
         self.flat, self.grid, self.data = FlatModel(model), grid, data
-        self.sigma, self.prior, self.chunk = sigma, prior, chunk
+        self.sigma, self.prior = sigma, prior
         self.n = data.dof
         u = step_inputs(model, data)
         self.u = None if u is None else u[grid.row]  # (S, K, m)
@@ -255,43 +250,13 @@ class ShootingProblem:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
         d = self.d
-        B = theta.new_zeros(S, K, d, 0) if held else self._parameter_derivatives(theta, path)[..., :d, :]
+        q1 = path.x[:, 1:, : self.n]
+        B = theta.new_zeros(S, K, d, 0)
+        if not held:
+            B = parameter_derivatives(self.flat, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         Z = [torch.cat([torch.zeros_like(B[:, 0]), eye], -1)]
         pad = theta.new_zeros(S, d, d)
         for k in range(K):
             Z.append(path.A[:, k, :d, :d] @ Z[-1] + torch.cat([B[:, k], pad], -1))
         return torch.stack(Z, 1)
-
-    def _parameter_derivatives(self, theta: Tensor, path: Path) -> Tensor:
-        """B_k = ∂Φ̃(x_k)/∂θ of every step, (S, K, 2n+1, P), by the implicit-function theorem."""
-        n = self.n
-        x, S, K = path.x, *self.grid.h.shape
-        q0, p0, s0 = (x[:, :-1, :n].flatten(0, 1), x[:, :-1, n : 2 * n].flatten(0, 1), x[:, :-1, 2 * n].flatten())
-        q1, h = x[:, 1:, :n].flatten(0, 1), self.grid.h.flatten()
-
-        u = None if self.u is None else self.u.flatten(0, 1)
-
-        def step_functions(
-            theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
-        ) -> Tensor:
-            P = self.flat.partials(theta, q0, q1, s0, h, 1, u)
-            return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
-
-        per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
-        out = x.new_zeros(S * K, 2 * n + 1, self.P)
-        chunk = min(self.chunk, -(-S * K // world()[1]))
-        for part in own_share(torch.arange(S * K, device=x.device).split(chunk)):
-            here = q0[part], q1[part], p0[part], s0[part], h[part]
-            inputs = None if u is None else u[part]
-            G = per_step(theta, *here, inputs)  # (chunk, 2n+1, P)
-            with torch.no_grad():
-                P = partials(self.flat.at(theta, inputs), here[0], here[1], here[3], here[4], order=2)
-                J = momentum_jacobian(P, here[2])
-                dq1 = -torch.linalg.solve_ex(J, G[:, :n])[0]
-                p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
-                dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
-                ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
-            out[part] = torch.cat([dq1, dp1, ds1], 1)
-        add_over_processes(out)
-        return out.reshape(S, K, 2 * n + 1, self.P)

@@ -1,12 +1,13 @@
-"""`smooth`: the states behind noisy positions, given a model: every state an unknown, steps with a little noise.
+"""Smoothing: every state of a trajectory an unknown, steps with a little noise.
 
-Minimises, over the states X_k = (q, p[, s]) at all nodes of a trajectory,
+Minimises, over the states X_k = (q, p[, s]) at all nodes (and over the parameters θ, where they are fitted too),
 
-    ½ Σ |q_k − q_data|²/σ² + ½ Σ |(Φ̃(X_k) − X_{k+1})/w|²,
+    ½ Σ |q_k − q_data|²/σ² + ½ Σ |(Φ̃_θ(X_k) − X_{k+1})/w|² [+ prior(θ)],
 
-by Gauss–Newton. The matrix is block tridiagonal: the cost grows with the number of samples, not with its cube. This is
-the fixed-interval smoother of Rauch, Tung & Striebel (1965), iterated for a nonlinear step (Bell 1994). w > 0 lets the
-motion leave the model a little at every step, so that a push, or a force the model does not know, is followed.
+by Gauss–Newton. The matrix is block tridiagonal, bordered by the parameters: the cost grows with the number of samples,
+not with its cube. With θ held this is the fixed-interval smoother of Rauch, Tung & Striebel (1965), iterated for a
+nonlinear step (Bell 1994). w > 0 lets the motion leave the model a little at every step, so that a push, or a force the
+model does not know, is followed; with w → 0 it is the fit of the start states alone.
 """
 
 from __future__ import annotations
@@ -23,13 +24,199 @@ from herglotz.errors import InputError
 from herglotz.mechanics import legendre_minus, partials
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
-from herglotz.stepping.block_tridiagonal import solve_blocks
-from herglotz.training.flat import FixedModel, FlatModel
-from herglotz.training.grid import segment_grid
+from herglotz.stepping.block_tridiagonal import Blocks
+from herglotz.training.bordered import Bordered
+from herglotz.training.distributed import everywhere, of_first
+from herglotz.training.flat import FlatModel
+from herglotz.training.grid import SegmentGrid, segment_grid
 from herglotz.training.inputs import step_inputs
-from herglotz.training.lifted import all_steps
+from herglotz.training.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.lifted import all_steps, parameter_derivatives
+from herglotz.training.prior import Prior
+from herglotz.training.robust import loss, root_weights
+from herglotz.training.trajectory_fit import StatesOnly
 
-ITERATIONS, HALVINGS = 30, 12
+DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal
+
+
+class SmoothingProblem:
+    """The sum of squares above, over parameters and the states of all nodes (`LeastSquares`).
+
+    Parameters
+    ----------
+    model
+        Its current parameters are not changed.
+    data
+        Trajectories of positions, and of inputs where the model takes them.
+    grid
+        Whole trajectories, one segment each.
+    sigma
+        Standard deviation of the noise on q.
+    process
+        Standard deviation of what a step leaves of the model in p, relative to sigma, in the natural units of both; the
+        same share of the natural size in s, and h/√3 of p's in q, as a random force would add.
+    prior
+        Penalty on the parameters.
+    freedom
+        Degrees of freedom ν of Student's t for the residuals of data and steps (`robust`); None: least squares.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        grid: SegmentGrid,
+        *,
+        sigma: float,
+        process: float,
+        prior: Prior | None = None,
+        freedom: float | None = None,
+    ):
+        self.flat, self.data, self.grid = FlatModel(model), data, grid
+        self.sigma, self.process, self.prior, self.freedom = sigma, process, prior, freedom
+        self.n = n = data.dof
+        self.d = d = 2 * n + (1 if model.s_enters_motion else 0)
+        self.P = len(self.flat.get())
+        u = step_inputs(model, data)
+        self.u = None if u is None else u[grid.row]  # (S, K, m)
+        self.node = grid.node[grid.sample.argsort()]  # (N,) where in (S·M,) each sample is
+        S, M = grid.segments, grid.longest + 1
+        node = torch.arange(M, device=data.q.device)
+        self.inside = (node <= grid.end[:, None])[..., None].to(data.q)  # (S, M, 1) padding has 0
+        self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
+        self.seen[self.node], self.target[self.node] = 1.0, data.q
+        self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
+        scale, speed = (data.q.new_tensor(y) for y in (model.config.scale, model.config.speed))
+        self.action = float((speed * scale).sum())  # natural size of s
+        # What a force that the model does not know adds to p in a step, to q by the way, and to s.
+        p = (speed / scale).expand(*grid.h.shape, n)
+        s = (scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
+        self.w = process * sigma * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
+        self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
+
+    def start(self) -> Tensor:
+        """Positions on straight lines between samples, momenta by FL⁻, s = 0; (P + S·M·d,) with the parameters."""
+        theta, grid, n = self.flat.get(), self.grid, self.n
+        S, K = grid.h.shape
+        x = self.data.q.new_zeros(S, K + 1, self.d)
+        for b in range(S):
+            own = (grid.node // (K + 1) == b).nonzero()[:, 0]
+            node, rows = grid.node[own] - b * (K + 1), grid.sample[own]
+            t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
+            every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))
+            right = torch.searchsorted(node, every).clamp(1, len(node) - 1)
+            here, there = node[right - 1], node[right]
+            share = ((t[every] - t[here]) / (t[there] - t[here]))[:, None]
+            x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
+        with torch.no_grad():
+            _, p, _ = legendre_minus(self.flat.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
+        x[:, :-1, n : 2 * n] = p
+        last = (grid.end - 1)[:, None].clamp_min(0)
+        after = torch.arange(K + 1, device=p.device) >= grid.end[:, None]  # the last node, and padding, as before it
+        held = p.gather(1, last[..., None].expand(-1, -1, n)).expand(-1, K + 1, -1)
+        x[..., n : 2 * n] = torch.where(after[..., None], held, x[..., n : 2 * n])
+        return torch.cat([theta, x.flatten()])
+
+    def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Parameters (P,) and states (S, M, d)."""
+        return x[: self.P], x[self.P :].reshape(self.grid.segments, -1, self.d)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|²; infinite where a step has no solution."""
+        stepped = self._stepped(x)
+        if stepped is None:
+            return x.new_full((), torch.inf)
+        theta, states = self.unpack(x)
+        fit, defect = self._residuals(states, stepped[0])
+        cost = loss(fit, self.freedom) + loss(defect, self.freedom) + self._anchor(states).square().sum() / 2
+        return cost if self.prior is None else cost + self.prior.cost(theta)
+
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Bordered, Tensor]:
+        """(cost, JᵀJ, Jᵀr). `held`: of the states alone, θ as it is."""
+        theta, states = self.unpack(x)
+        stepped, (S, M, d), P = self._stepped(x), states.shape, 0 if held else self.P
+        diagonal, upper, lower = x.new_zeros(3, S, M, d, d)
+        border, corner = x.new_zeros(S, M, d, P), x.new_zeros(P, P)
+        top, gradient = x.new_zeros(P), x.new_zeros(S, M, d)
+        if not everywhere(stepped is not None) or stepped is None:
+            unknown = torch.cat([top, gradient.flatten()])
+            return x.new_full((), torch.inf), Bordered(corner, border, (diagonal, upper, lower)), unknown
+        y, A = stepped[0], stepped[1][..., :d, :d]
+        fit, defect = self._residuals(states, y)
+        by_fit = self.seen * root_weights(fit, self.freedom) / self.sigma  # (S, M, n)
+        by_step = self.inside[:, 1:] * root_weights(defect, self.freedom) / self.w  # (S, K, d)
+        weighted, weight = by_step * root_weights(defect, self.freedom) * defect, by_step.square()[..., None]
+        WA = weight * A
+        diagonal[..., : self.n, : self.n] += torch.diag_embed(by_fit.square())
+        diagonal[:, :-1] += A.mT @ WA
+        diagonal[:, 1:] += torch.diag_embed(weight[..., 0])
+        diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))  # padding stays where it is
+        upper[:, :-1], lower[:, 1:] = -WA.mT, -WA
+        gradient[..., : self.n] = by_fit * root_weights(fit, self.freedom) * fit
+        gradient[:, :-1] += (A.mT @ weighted[..., None])[..., 0]
+        gradient[:, 1:] -= weighted
+        if d > 2 * self.n:
+            diagonal[:, 0, -1, -1] += 1 / self.action**2
+            gradient[:, 0, -1] += self._anchor(states) / self.action
+        if not held:
+            q1 = y[..., : self.n]
+            B = parameter_derivatives(self.flat, theta, self._with_s(states), q1, self.grid.h, self.u)[..., :d, :]
+            WB = weight * B
+            corner, top = torch.einsum("skdp,skdr->pr", B, WB), torch.einsum("skdp,skd->p", B, weighted)
+            border[:, :-1] += A.mT @ WB
+            border[:, 1:] -= WB
+        cost = loss(fit, self.freedom) + loss(defect, self.freedom) + self._anchor(states).square().sum() / 2
+        if self.prior is not None and held:
+            cost = cost + self.prior.cost(theta)
+        elif self.prior is not None:
+            prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
+            cost, corner, top = cost + prior_cost, corner + prior_A, top + prior_b
+        corner, border, diagonal, upper, lower = of_first(corner, border, diagonal, upper, lower)
+        return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
+
+    def misfit(self, x: Tensor) -> Tensor:
+        """Q − q_data at every sample, (N, n), in units of q."""
+        return self.unpack(x)[1].flatten(0, 1)[self.node, : self.n] - self.data.q
+
+    def defects(self, x: Tensor) -> Tensor:
+        """(Φ̃(X_k) − X_{k+1})/w of every step, (S, K, d); 0 where there is none."""
+        stepped = self._stepped(x)
+        assert stepped is not None
+        return self._residuals(self.unpack(x)[1], stepped[0])[1]
+
+    def states(self, x: Tensor) -> Tensor:
+        """States (q, p, s) at every sample, (N, 2n+1); where s does not enter the motion it counts along from 0."""
+        theta, states = self.unpack(x)
+        full = self._with_s(states)
+        if self.d == 2 * self.n:
+            with torch.no_grad():
+                L_d = self.flat.at(theta, self.u)
+                P = partials(L_d, full[:, :-1, : self.n], full[:, 1:, : self.n], 0 * self.grid.h, self.grid.h)
+            for k in range(self.grid.longest):  # L_d = L_d(s = 0) + (c − 1) s
+                full[:, k + 1, -1] = P.c[:, k] * full[:, k, -1] + P.L[:, k]
+        return full.flatten(0, 1)[self.node]
+
+    def _with_s(self, states: Tensor) -> Tensor:
+        zero = states.new_zeros(*states.shape[:2], 2 * self.n + 1 - self.d)
+        return torch.cat([states, zero], -1)
+
+    def _stepped(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Φ̃ of every state but the last, and its derivative."""
+        if self._stepped_at is None or not torch.equal(self._stepped_at[0], x):
+            theta, states = self.unpack(x)
+            with torch.no_grad():
+                stepped = all_steps(self.flat.at(theta, self.u), self._with_s(states), self.grid.h)
+            self._stepped_at = x.clone(), stepped  # an accepted step has been solved for its cost
+        return self._stepped_at[1]
+
+    def _residuals(self, states: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the data, (S, M, n), and of the steps, (S, K, d); 0 where there is no sample or no step."""
+        fit = self.seen * (states[..., : self.n] - self.target) / self.sigma
+        return fit, self.inside[:, 1:] * (y[..., : self.d] - states[:, 1:]) / self.w
+
+    def _anchor(self, states: Tensor) -> Tensor:
+        """Residuals of the first s of each trajectory, (S,); none where s does not enter the motion."""
+        return states[:, 0, 2 * self.n :].flatten() / self.action
 
 
 @dataclass(frozen=True)
@@ -41,7 +228,7 @@ class Smoothed:
 
 
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """Smoothed states of each trajectory.
+    """Smoothed states of each trajectory, the model held.
 
     Parameters
     ----------
@@ -52,8 +239,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     sigma
         Standard deviation of the noise of q, in its units.
     process
-        Standard deviation of what a step leaves of the model, relative to sigma: w = process · sigma in q, and the same
-        share of the natural size in p and s. Small: the model is believed; large: the data are.
+        Of `SmoothingProblem`. Small: the model is believed; large: the data are.
 
     Raises
     ------
@@ -63,110 +249,29 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     check_positive("sigma", sigma)
     check_positive("process", process)
     data = data.unwrapped()
-    flat, n = FlatModel(model), data.dof
-    d = 2 * n + (1 if model.s_enters_motion else 0)
-    q, std = data.q.new_zeros(data.samples, 2 * n + 1), data.q.new_zeros(data.samples, 2 * n + 1)
-    scale, speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))
-    sizes = torch.cat([torch.ones_like(scale), speed / scale, (speed * scale).sum()[None] / scale.max()])[:d]
-    for b, first in enumerate(data.offsets):
-        one = data[b]
-        with torch.no_grad():
-            x, variance, node = _trajectory(flat, model, one, sigma, process * sigma * sizes, d)
-        rows = slice(first, first + one.samples)
-        q[rows, : x.shape[1]], std[rows, :d] = x[node], variance.clamp_min(0).sqrt()[node]
-    return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (q, std)))
-
-
-def _trajectory(
-    flat: FlatModel, model: ContactLagrangian, data: Trajectories, sigma: float, w: Tensor, d: int
-) -> tuple[Tensor, Tensor, Tensor]:
-    """States (K+1, 2n+1) of one trajectory, variances (K+1, d), and the node of every sample."""
-    grid, u = segment_grid(data, data.samples, GAP * data.typical_step), step_inputs(model, data)
-    L_d = flat.at(flat.get(), None if u is None else u[grid.row])
-    h, n, where = grid.h, data.dof, data.source or "data"
-    node = grid.node[grid.sample.argsort()]
-    x = _guess(L_d, data, h, node)
-    precision = 1 / w.square()
-    observed = torch.zeros_like(x[:, :d])
-    observed[node, :n] = 1 / sigma**2
-    target = torch.zeros_like(x[:, :d])
-    target[node, :n] = data.q
-
-    def cost_of(x: Tensor, y: Tensor) -> Tensor:
-        miss, defect = x[:, :d] - target, y[:, :d] - x[1:, :d]
-        return ((observed * miss.square()).sum() + (precision * defect.square()).sum()) / 2
-
-    stepped = all_steps(L_d, x[None], h)
-    if stepped is None:
+    grid = segment_grid(data, data.samples, GAP * data.typical_step)
+    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
+    x, n, d = problem.start(), data.dof, problem.d
+    states = StatesOnly(problem, x[: problem.P])
+    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
+    if result.reason == "not_finite":
+        where = data.source or "data"
         raise InputError(f"{where}: the model has no step near these data, so nothing can be smoothed; fit it again")
-    cost = cost_of(x, stepped[0][0])
-    blocks = None
-    for _ in range(ITERATIONS):
-        y, A = stepped[0][0], stepped[1][0, :, :d, :d]
-        WA = precision[:, None] * A  # (K, d, d)
-        diagonal = torch.diag_embed(observed)
-        diagonal[:-1] += A.mT @ WA
-        diagonal[1:] += torch.diag(precision)
-        if d > 2 * n:  # a constant added to s may be unseen: hold the first one weakly
-            diagonal[0, 2 * n, 2 * n] += 1e-12 * diagonal[:, 2 * n, 2 * n].max()
-        zero = torch.zeros_like(diagonal[:1])
-        blocks = diagonal, torch.cat([-WA.mT, zero]), torch.cat([zero, -WA])
-        defect = y[:, :d] - x[1:, :d]
-        gradient = observed * (x[:, :d] - target)
-        gradient[:-1] += (WA.mT @ defect[..., None])[..., 0]
-        gradient[1:] -= precision * defect
-        step = torch.zeros_like(x)
-        step[:, :d] = solve_blocks(blocks, -gradient)
-        for k in range(HALVINGS):
-            trial = x + step / 2**k
-            stepped_there = all_steps(L_d, trial[None], h)
-            if stepped_there is not None and bool(cost_of(trial, stepped_there[0][0]) <= cost * (1 + 1e-12)):
-                break
-        else:
-            break
-        new = cost_of(trial, stepped_there[0][0])
-        x, stepped, gain, cost = trial, stepped_there, cost - new, new
-        if float(gain) <= 1e-10 * float(cost) + 1e-300:
-            break
-    assert blocks is not None
-    if d == 2 * n:  # s only counts along
-        x[1:, 2 * n] = x[0, 2 * n] + _gained(L_d, x, h)
-    return x, _variances(*blocks), node
+    x = states.full(result.x)
+    found, std = problem.states(x), data.q.new_zeros(data.samples, 2 * n + 1)
+    _, matrix, _ = problem.normal_equations(x, held=True)
+    std[:, :d] = variances(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
+    return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (found, std)))
 
 
-def _guess(L_d: FixedModel, data: Trajectories, h: Tensor, node: Tensor) -> Tensor:
-    """Positions on straight lines between samples, momenta by FL⁻, s = 0: (K+1, 2n+1)."""
-    K, n = h.shape[1], data.dof
-    t = torch.cat([h.new_zeros(1), h[0].cumsum(0)])
-    right = torch.searchsorted(node, torch.arange(K + 1, device=node.device)).clamp(1, len(node) - 1)
-    a, b = node[right - 1], node[right]
-    share = ((t - t[a]) / (t[b] - t[a]))[:, None]
-    q = data.q[right - 1] * (1 - share) + data.q[right] * share
-    _, p, _ = legendre_minus(L_d, q[None, :-1], q[None, 1:], torch.zeros_like(h), h)
-    x = q.new_zeros(K + 1, 2 * n + 1)
-    x[:, :n], x[:-1, n : 2 * n], x[-1, n : 2 * n] = q, p[0], p[0, -1]
-    return x
-
-
-def _gained(L_d: FixedModel, x: Tensor, h: Tensor) -> Tensor:
-    """Values of s along the smoothed positions where it does not enter the motion, less its start, (K,)."""
-    n = (x.shape[1] - 1) // 2
-    s = x[0, 2 * n]
-    P = partials(L_d, x[None, :-1, :n], x[None, 1:, :n], torch.zeros_like(h), h)
-    out = []
-    for L, c in zip(P.L[0], P.c[0], strict=True):  # L_d = L_d(s = 0) + (c − 1) s
-        s = c * s + L
-        out.append(s)
-    return torch.stack(out) - x[0, 2 * n]
-
-
-def _variances(diagonal: Tensor, upper: Tensor, lower: Tensor) -> Tensor:
-    """Diagonal of the inverse, (K+1, d), by elimination from both ends: (A⁻¹)_kk = (S_k + T_k − D_k)⁻¹."""
+def variances(blocks: Blocks) -> Tensor:
+    """Diagonal of the inverse, (S, M, d), by elimination from both ends: (A⁻¹)_kk = (S_k + T_k − D_k)⁻¹."""
+    diagonal, upper, lower = (x.unbind(1) for x in blocks)
     count = len(diagonal)
     S, T = [diagonal[0]], [diagonal[-1]]
     for k in range(1, count):
         S.append(diagonal[k] - lower[k] @ torch.linalg.solve(S[-1], upper[k - 1]))
         j = count - 1 - k
         T.append(diagonal[j] - upper[j] @ torch.linalg.solve(T[-1], lower[j + 1]))
-    both = torch.stack(S) + torch.stack(T[::-1]) - diagonal
+    both = torch.stack(S, 1) + torch.stack(T[::-1], 1) - blocks[0]
     return torch.linalg.inv(both).diagonal(dim1=-2, dim2=-1)

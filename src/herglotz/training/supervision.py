@@ -18,7 +18,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
-from herglotz.training.distributed import add_over_processes, own_share, world
+from herglotz.training.distributed import LaneSums, add_over_processes, own_parts, world
 from herglotz.training.flat import FlatModel
 from herglotz.training.inputs import step_inputs
 from herglotz.training.prior import Prior
@@ -120,19 +120,17 @@ class SupervisedProblem:
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(cost, JᵀJ, Jᵀr), accumulated over chunks of triples."""
-        A, b, cost = x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), x.new_zeros(())
-        chunk = min(self.chunk, -(-len(self.triples) // world()[1]))
-        for part in own_share(torch.arange(len(self.triples), device=x.device).split(chunk)):
+        sums = LaneSums(x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), x.new_zeros(()))
+        for lane, part in own_parts(len(self.triples), self.chunk, x.device):
             rows = self._rows(part)
             axes = tuple(None if y is None else 0 for y in rows)
             r = self._local(x, *rows).reshape(-1) / self.sigma
             J = vmap(jacrev(self._local), (None, *axes))(x, *rows).reshape(-1, len(x)) / self.sigma
-            cost += loss(r, self.freedom)
+            cost = loss(r, self.freedom)
             by = root_weights(r, self.freedom)
             J, r = by[:, None] * J, by * r
-            A += J.T @ J
-            b += J.T @ r
-        add_over_processes(A, b, cost)
+            sums.add(lane, J.T @ J, J.T @ r, cost)
+        A, b, cost = sums.total()
         if self.prior is not None:
             prior_cost, prior_A, prior_b = self.prior.normal_equations(x[:-1])
             A[:-1, :-1] += prior_A

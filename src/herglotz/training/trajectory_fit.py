@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -63,21 +64,33 @@ class _Stage:
         return _noise(self.problem, self.path)
 
 
-class StatesOnly:
-    """A shooting problem with the parameters held: only the segment states are fitted."""
+class StateEquations(Protocol):
+    """A problem over parameters and states, the parameters first, whose equations of the states can be had alone."""
 
-    def __init__(self, problem: ShootingProblem, theta: Tensor):
+    def cost(self, x: Tensor) -> Tensor:
+        """See `LeastSquares`."""
+        ...
+
+    def normal_equations(self, x: Tensor, *, held: bool) -> tuple[Tensor, Any, Tensor]:
+        """See `LeastSquares`; `held`: of the states alone."""
+        ...
+
+
+class StatesOnly:
+    """Such a problem with the parameters held: only the states are fitted."""
+
+    def __init__(self, problem: StateEquations, theta: Tensor):
         self.problem, self.theta = problem, theta
 
     def full(self, states: Tensor) -> Tensor:
-        """All unknowns of the shooting problem."""
+        """All unknowns of the problem."""
         return torch.cat([self.theta, states])
 
     def cost(self, x: Tensor) -> Tensor:
         """See `LeastSquares`."""
         return self.problem.cost(self.full(x))
 
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Any, Tensor]:
         """See `LeastSquares`."""
         return self.problem.normal_equations(self.full(x), held=True)
 

@@ -10,7 +10,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
-from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
+from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt, lifted
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
 from herglotz.training.grid import segment_grid
@@ -27,6 +27,12 @@ def model_of(level, n=1, seed=0, **settings):
         for p in model.parameters():
             p += 0.1 * torch.randn(p.shape, generator=make, dtype=p.dtype)
     return model
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch):
+    """The steps' derivatives by parts of 20, so that there are several."""
+    monkeypatch.setattr(lifted, "CHUNK", 20)
 
 
 def data_of(n=1, gaps=2, noise=0.01):
@@ -50,7 +56,7 @@ def residual_problem(level, n=1):
 def shooting_problem(level, n=1):
     model, data = model_of(level, n), data_of(n)
     prior = prior_of(model, data)
-    problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=0.1, prior=prior, chunk=20)
+    problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=0.1, prior=prior)
     starts = problem.grid.start_sample
     velocity = (data.q[starts + 1] - data.q[starts]) / (data.t[starts + 1] - data.t[starts])[:, None]
     return problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], velocity))

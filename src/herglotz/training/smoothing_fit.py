@@ -1,0 +1,171 @@
+"""Fitting the parameters and every state at once: joint smoothing, for data that no model follows for long.
+
+Multiple shooting asks for a motion of the model in every segment. Here each step may be off by a little process noise,
+so that pushes, chaos and forces that the model does not know stay where they are (weak-constraint estimation, Trémolet
+2006; for parameters of differential equations Ramsay et al. 2007). The price: what process noise explains is not
+learned.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+from herglotz.training.baseline import Baseline
+from herglotz.training.bordered import Bordered
+from herglotz.training.cross_validation import left_out_errors, simplest_not_beaten
+from herglotz.training.grid import segment_grid
+from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
+from herglotz.training.robust import FREEDOM, heavy_tailed, root_weights
+from herglotz.training.smoothing import DAMPING, SmoothingProblem, variances
+from herglotz.training.stages import Stages
+from herglotz.training.trajectory_fit import LOST, make_prior
+
+ROUNDS = 8  # in which both noises are found; at first the steps' is taken as large as the data's
+FALL = 10.0  # factor by which the steps' noise falls in a round, at the most
+SETTLED = 0.1  # change of its logarithm that ends the rounds
+LEAST = 1e-2  # of the steps' noise relative to the data's: with less the states are a motion of the model
+
+
+@dataclass(frozen=True)
+class SmoothingFit:
+    """The chosen fit."""
+
+    x: Tensor  # unknowns of the problem: parameters, then states
+    problem: SmoothingProblem
+    departure: float | None  # prior strength, where the model has a potential network
+    held_out: dict[float, Tensor]  # error of every fold, for every strength tried
+    result: OptimiserResult
+
+    @property
+    def theta(self) -> Tensor:
+        """Parameters, (P,)."""
+        return self.problem.unpack(self.x)[0]
+
+    def follows_data(self) -> bool:
+        """Whether free runs from the first states stay within a factor of the noise: whether the model is enough."""
+        problem, states = self.problem, self.problem.unpack(self.x)[1]
+        n, grid, first = problem.n, problem.grid, states[:, 0]
+        s = first[:, 2 * n] if problem.d > 2 * n else torch.zeros_like(first[:, 0])
+        with torch.no_grad():
+            stepper = Stepper(problem.flat.at(self.theta))
+            out = stepper.rollout(first[:, :n], first[:, n : 2 * n], s, h=grid.h, inputs=problem.u)
+        miss = out.q.flatten(0, 1)[problem.node] - problem.data.q
+        return float(miss.square().mean().sqrt()) <= LOST * problem.sigma
+
+
+def fit_smoothing(
+    model: ContactLagrangian,
+    data: Trajectories,
+    base: Baseline,
+    sigma: float,
+    departures: tuple[float, ...],
+    iterations: int,
+    stages: Stages,
+    *,
+    robust: str = "auto",
+) -> SmoothingFit | None:
+    """Fit parameters and all states to positions, first with much process noise, then with little.
+
+    With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
+    strength is then fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted with.
+    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`).
+
+    Returns
+    -------
+    SmoothingFit or None
+        None where a step near the data has no solution.
+    """
+    if model.potential.network is None:
+        departures = departures[:1]
+    grid = segment_grid(data, data.samples, base.model_step)
+    floor = 1e-8 * max(base.scale)
+    freedom = FREEDOM if robust == "on" else None
+
+    def stage(name: str, x: Tensor | None, departure: float, process: float) -> SmoothingFit | None:
+        prior = make_prior(model, base, departure)
+        problem = SmoothingProblem(
+            model, data, grid, sigma=max(sigma, floor), process=process, prior=prior, freedom=freedom
+        )
+        start, most = problem.start() if x is None else x, min(iterations, 40)
+        result = stages.run(
+            name, start, most,
+            lambda x, callback: levenberg_marquardt(
+                problem, x, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING, callback=callback
+            ),
+        )  # fmt: skip
+        return SmoothingFit(result.x, problem, departure, {}, result) if math.isfinite(result.cost) else None
+
+    weakest = max(departures)
+    last = stage("smoothing", None, weakest, 1.0)
+    if last is None:
+        return None
+    if robust == "auto" and heavy_tailed(last.problem.misfit(last.x)):
+        freedom = FREEDOM
+        last = stage("smoothing, robust", None, weakest, 1.0) or last
+    for k in range(ROUNDS):
+        before = last.problem.process
+        sigma, process = _noises(last)
+        process = max(process, before / FALL)
+        last = stage(f"smoothing, noise {k + 1}", last.x, weakest, process) or last
+        if abs(math.log(process / before)) < SETTLED:
+            break
+    (sigma, process), held_out, fits = _noises(last), {}, []
+    for departure in sorted(departures, reverse=True):
+        found = stage(f"smoothing, prior {departure:g}", last.x, departure, process)
+        if found is not None:
+            fits.append(found)
+            held_out[departure] = _held_out_errors(found)
+            last = found
+    if not fits:
+        return last
+    chosen = simplest_not_beaten(held_out)
+    best = next(f for f in fits if f.departure == chosen)
+    return SmoothingFit(best.x, best.problem, chosen, held_out, best.result)
+
+
+def _noises(fit: SmoothingFit) -> tuple[float, float]:
+    """Standard deviations of the data's noise, and of the steps' relative to it, where the evidence is stationary.
+
+    Of the N·n values recorded, the states take tr H (the sum of their variances over σ²), of which the starts have S·d
+    and the steps' noise the rest: σ² = Σ r² / (N·n − tr H) and w² = Σ e² / (tr H − S·d), as in MacKay (1992).
+    """
+    problem = fit.problem
+    misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
+    used = root_weights(misfit / problem.sigma, problem.freedom).square()
+    taken = float(variances(matrix.blocks).flatten(0, 1)[problem.node, : problem.n].sum()) / problem.sigma**2
+    free = misfit.numel() - taken
+    starts = problem.grid.segments * problem.d
+    sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))
+    defect = problem.defects(fit.x) * problem.process * problem.sigma  # in the units of σ
+    by = root_weights(problem.defects(fit.x), problem.freedom).square()
+    w = math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
+    sigma = max(sigma, problem.sigma / FALL)
+    return sigma, max(w / sigma, LEAST)
+
+
+def _held_out_errors(fit: SmoothingFit) -> Tensor:
+    """See `cross_validation.held_out_errors`."""
+    problem, (_, matrix, _) = fit.problem, fit.problem.normal_equations(fit.x)
+    r = problem.misfit(fit.x) / problem.sigma
+    by = root_weights(r, problem.freedom)
+    rows = (problem.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
+
+    def hat(own: Tensor) -> Tensor:
+        return _hat(matrix, rows[own], by.flatten()[own] / problem.sigma)
+
+    return left_out_errors((by * r).flatten(), problem.data, hat) * problem.sigma
+
+
+def _hat(matrix: Bordered, rows: Tensor, by: Tensor) -> Tensor:
+    """J A⁻¹ Jᵀ of residuals by·x[rows]; not a number where A is not positive definite."""
+    columns = by.new_zeros(len(matrix.diagonal()), len(rows))
+    columns[rows, torch.arange(len(rows))] = by
+    solved = matrix.solve_many(columns)
+    return by.new_full((len(rows), len(rows)), torch.nan) if solved is None else by[:, None] * solved[rows]
