@@ -3,8 +3,9 @@
 Writes results/measured.json, .md and .png, and coverage.png. Settings are the defaults unless a set says otherwise
 (measured_free.py, measured_windows.py, measured_coverage.py say what each is). Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
-run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20, air_track 18,
-driven_pendulum 110, coverage_simulated 27, coverage_real about 90; `cpu_seconds` in the table says what it took.
+run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20,
+air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90; `cpu_seconds` in the table says what
+it took.
 """
 
 from __future__ import annotations
