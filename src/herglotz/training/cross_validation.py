@@ -50,18 +50,19 @@ def left_out_errors(
     return torch.stack(errors).nan_to_num(nan=torch.inf)
 
 
-def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
-    """The smallest key (the strongest prior) whose held-out error the best one does not beat beyond its spread.
+def beaten(errors: Tensor, best: Tensor) -> bool:
+    """Whether held-out errors of blocks of time, (blocks,), are higher than the best ones beyond their spread.
 
-    Spread: the standard error over folds of the difference of their squared errors. An error lower by less than a
-    twentieth beats nothing, however certain: to first order every weaker prior fits each fold a little better, and the
-    free run beyond the data pays for it.
+    Spread: the standard error over blocks of the difference of their squared errors (the one-standard-error rule of
+    Breiman et al. 1984). An error lower by less than a twentieth beats nothing, however certain: a weaker prior, or a
+    parameter near zero, fits each block a little better, and the free run beyond the data pays for it.
     """
+    difference = errors.square() - best.square()
+    spread = float(difference.std() / len(difference) ** 0.5)
+    return not float(difference.mean()) <= max(spread, (MARGIN**2 - 1) * float(best.square().mean()))
+
+
+def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
+    """The smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
-    least = float(errors[best].square().mean())
-    for key in sorted(errors):
-        difference = errors[key].square() - errors[best].square()
-        spread = float(difference.std() / len(difference) ** 0.5)
-        if float(difference.mean()) <= max(spread, (MARGIN**2 - 1) * least):
-            return key
-    return best
+    return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))

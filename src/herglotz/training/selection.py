@@ -16,7 +16,7 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
 from herglotz.training.config import FitConfig
-from herglotz.training.cross_validation import MARGIN
+from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
 from herglotz.training.structure import nothing_told
@@ -48,9 +48,14 @@ class Candidate:
         return self.errors.square().mean(1).sqrt()
 
     @property
+    def median_seed(self) -> int:
+        """The seed of the median held-out RMS (the lower one of two)."""
+        return int(self.of_seeds.argsort()[(len(self.runs) - 1) // 2])
+
+    @property
     def best(self) -> Run:
         """The run of the median seed: representative, not lucky."""
-        return self.runs[int(self.of_seeds.argsort()[(len(self.runs) - 1) // 2])]
+        return self.runs[self.median_seed]
 
     @property
     def parameters(self) -> int:
@@ -116,12 +121,9 @@ def select(
 ) -> Selection:
     """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
 
-    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. A level
-    is beaten if the best level's score is lower beyond the spread of either kind: the standard error over blocks of the
-    difference of their squared errors (median seed; the one-standard-error rule of Breiman et al. 1984), and the best
-    level's own range over seeds. An error lower by less than a twentieth beats nothing, however certain: a parameter
-    near zero changes every block a little. The first level of the ladder that is not beaten is
-    chosen.
+    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. The
+    first level of the ladder is chosen that the best one does not beat: by the rule of the prior's strengths
+    (`cross_validation.beaten`) between the median seeds, and beyond the best level's own range over seeds.
 
     Parameters
     ----------
@@ -200,13 +202,10 @@ def _simplest(candidates: list[Candidate]) -> Candidate:
     best = min(candidates, key=lambda c: c.error)
     if not best.error < float("inf"):
         raise InputError("no level predicts the held-out part: every free run failed; check the data and their step")
-    own = best.errors[int(best.of_seeds.argsort()[(len(best.runs) - 1) // 2])]
     for candidate in candidates:
-        if candidate is best or candidate.error <= max(MARGIN * best.error, float(best.of_seeds.max())):
+        if candidate is best or candidate.error <= float(best.of_seeds.max()):
             return candidate
-        theirs = candidate.errors[int(candidate.of_seeds.argsort()[(len(candidate.runs) - 1) // 2])]
-        difference = theirs.square() - own.square()
-        if float(difference.mean()) <= float(difference.std()) / len(difference) ** 0.5:
+        if not beaten(candidate.errors[candidate.median_seed], best.errors[best.median_seed]):
             return candidate
     return best
 
