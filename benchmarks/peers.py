@@ -159,7 +159,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--peers", help=f"with commas (default: all of {', '.join(PEERS)})")
     parser.add_argument("--seeds", type=int, default=5, help="seeds 0, 1, … of data and weights (default 5)")
     parser.add_argument("--budget", type=float, help=f"seconds of processor time a network fit (default {BUDGET:g})")
-    parser.add_argument("--again", action="store_true", help="measure the chosen cells anew")
+    parser.add_argument(
+        "--again", action="store_true", help="measure the chosen cells (or the figures of the sources) anew"
+    )
     parser.add_argument("--reproduce", action="store_true", help="only the figures of the sources")
     parser.add_argument("--redraw", action="store_true", help="only the table and the figure")
     parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
@@ -174,8 +176,9 @@ def main(argv: list[str] | None = None) -> None:
         path = arguments.out / "peers.json"
         result = opened(path, arguments.budget)
         if arguments.reproduce:
-            reproduce(result, arguments.seeds)
-            store(result, path)
+            if arguments.again:
+                result.pop("reproduced", None)
+            reproduce(result, arguments.seeds, lambda: store(result, path))
         elif not arguments.redraw:
             cells = plan(data, [p for p in peers if p not in missing], arguments.seeds)
             keys = {"/".join(map(str, c)): c for c in cells}

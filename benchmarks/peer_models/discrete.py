@@ -23,20 +23,23 @@ REGULAR = 1.0  # weight of the penalty
 ANCHORS = 128  # base points
 
 
-def _scales(samples: Samples) -> Scales:
+def scales_of_triples(samples: Samples) -> Scales:
+    """Spreads of the middle position, of the difference and of the second difference of triples."""
     q0, q1, q2 = samples.triples()
     return Scales.of(samples.angles, q1, (q1 - q0) / samples.h, (q2 - 2 * q1 + q0) / samples.h**2)
 
 
 class DiscreteLagrangian:
-    """L_d(q0, q1) = h E net(q̄, Δ), and forces where asked for; in units in which mass and spreads are 1."""
+    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1.
 
-    def __init__(self, samples: Samples, generator: torch.Generator, *, forced: bool):
-        self.h, self.scales = samples.h, _scales(samples)
-        inputs, n = self.scales.q_inputs + samples.dof, samples.dof
-        self.net = Network(inputs, 1, generator, nn.Softplus())
-        self.force = Network(inputs, n, generator) if forced else None
-        self.weights = [*self.net.parameters(), *(self.force.parameters() if self.force else ())]
+    `kinetic` is the weight of the first term.
+    """
+
+    def __init__(
+        self, scales: Scales, h: float, net: nn.Module, force: nn.Module | None = None, *, kinetic: float = 1.0
+    ):
+        self.h, self.scales, self.net, self.force, self.kinetic = h, scales, net, force, kinetic
+        self.weights = [*net.parameters(), *(force.parameters() if force else ())]
 
     def inputs(self, q0: Tensor, q1: Tensor) -> Tensor:
         """Network inputs of a pair."""
@@ -45,7 +48,7 @@ class DiscreteLagrangian:
     def slopes(self, q0: Tensor, q1: Tensor) -> tuple[Tensor, Tensor]:
         """(D₁L_d, D₂L_d), (B, n) each, of L_d over h."""
         v = (q1 - q0) / (self.h * self.scales.v)
-        value = v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
+        value = self.kinetic * v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
         return torch.autograd.grad(value, (q0, q1), create_graph=True)  # type: ignore[return-value]
 
     def residual(self, q0: Tensor, q1: Tensor, q2: Tensor) -> Tensor:
@@ -61,20 +64,28 @@ class DiscreteLagrangian:
     def mixed(self, q0: Tensor, q1: Tensor) -> Tensor:
         """−h² σ D₁D₂L_d σ over h, (B, n, n): the unit matrix for a unit mass."""
         q0, q1 = (x.detach().requires_grad_() for x in (q0, q1))
-        D1, n = self.slopes(q0, q1)[0], q0.shape[1]
-        rows = [torch.autograd.grad(D1[:, i].sum(), q1, create_graph=True)[0] for i in range(n)]
         scale = self.scales.v[:, None] * self.scales.v
-        return -(self.h**2) * scale * torch.stack(rows, 1)
+        return -(self.h**2) * scale * jacobian(self.slopes(q0, q1)[0], q1)
+
+
+def jacobian(D1: Tensor, q1: Tensor) -> Tensor:
+    """∂D₁/∂q1 of pairs, (B, n, n)."""
+    rows = [torch.autograd.grad(D1[:, i].sum(), q1, create_graph=True)[0] for i in range(D1.shape[1])]
+    return torch.stack(rows, 1)
+
+
+def regularity(mixed: Tensor) -> Tensor:
+    """Mean (log |det mixed|)² over base points, which leaves the mass free but regular."""
+    return mixed.det().abs().clamp_min(1e-12).log().square().mean()
 
 
 def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, forced: bool = False) -> ThreePoint:
-    """Least squares of the residual with the penalty.
-
-    Conservative: |mixed − 1|² at base points spread over the data. Forced: (log |det mixed|)² there, which leaves the
-    mass free but regular.
-    """
+    """Least squares of the residual with the penalty: |mixed − 1|² at a base point, or `regularity` where forced."""
     generator = torch.Generator().manual_seed(seed)
-    model = DiscreteLagrangian(samples, generator, forced=forced)
+    scales = scales_of_triples(samples)
+    inputs = scales.q_inputs + samples.dof
+    net = Network(inputs, 1, generator, nn.Softplus())
+    model = DiscreteLagrangian(scales, samples.h, net, Network(inputs, samples.dof, generator) if forced else None)
     q0, q1, q2 = samples.triples()
     rows, held = split(len(q0), generator)
     base = rows[torch.randperm(len(rows), generator=generator)[: ANCHORS if forced else 1]]
@@ -85,9 +96,7 @@ def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, for
 
     def penalty() -> Tensor:
         mixed = model.mixed(q0[base], q1[base])
-        if not forced:
-            return (mixed - eye).square().mean()
-        return mixed.det().abs().clamp_min(1e-12).log().square().mean()
+        return regularity(mixed) if forced else (mixed - eye).square().mean()
 
     train(
         lambda i: loss(rows[i]) + REGULAR * penalty(),

@@ -11,6 +11,8 @@ no torque is measured the forward model is fitted, v̇ against accelerations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor, nn
 
@@ -33,30 +35,32 @@ def acceleration(L: Tensor, q: Tensor, v: Tensor, force: Tensor | None = None) -
 
 
 class FreeLagrangian:
-    """L(q, v) = E [½|v/σ|² + net(q, v)]."""
+    """L(q, v) = E [½|v/σ|² + net(q, v)]; `kinetic` is the weight of the first term."""
 
-    def __init__(self, scales: Scales, generator: torch.Generator):
-        self.scales = scales
-        self.net = Network(scales.q_inputs + len(scales.angles), 1, generator, nn.Softplus())
+    def __init__(self, scales: Scales, network: Callable[[int], nn.Module], *, kinetic: float = 1.0):
+        self.scales, self.kinetic = scales, kinetic
+        self.net = network(scales.q_inputs + len(scales.angles))
         self.parameters = list(self.net.parameters())
 
     def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """(v, v̇) at (q, v)."""
         q, v = q.requires_grad_(), v.requires_grad_()
-        L = (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
+        L = self.kinetic * (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
         return v, acceleration(L, q, v)
 
 
 class DeepLagrangian:
-    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate."""
+    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate where asked for."""
 
-    def __init__(self, scales: Scales, generator: torch.Generator):
+    def __init__(self, scales: Scales, generator: torch.Generator, *, friction: bool = True):
         n = len(scales.angles)
         self.scales, self.index = scales, torch.tril_indices(n, n)
         self.factor = Network(scales.q_inputs, self.index.shape[1], generator)
         self.potential = Network(scales.q_inputs, 1, generator)
-        self.log_friction = torch.full((n,), -3.0, dtype=torch.float64, requires_grad=True)
-        self.parameters = [*self.factor.parameters(), *self.potential.parameters(), self.log_friction]
+        self.parameters: list[Tensor] = [*self.factor.parameters(), *self.potential.parameters()]
+        self.log_friction = torch.full((n,), -3.0 if friction else -torch.inf, dtype=torch.float64)
+        if friction:
+            self.parameters.append(self.log_friction.requires_grad_())
 
     def mass(self, q: Tensor) -> Tensor:
         """M(q) in units of the scaled velocity, (B, n, n), positive definite."""
@@ -68,8 +72,8 @@ class DeepLagrangian:
         C = C.tril(-1) + torch.diag_embed(diagonal)
         return C @ C.mT + 1e-3 * torch.eye(n, dtype=q.dtype)
 
-    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(v, v̇) at (q, v)."""
+    def equation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(M, r) of M ẇ = r + σ τ for the scaled velocity w = v/σ and a torque τ; (B, n, n) and (B, n)."""
         q = q.requires_grad_()
         w = v / self.scales.v
         M = self.mass(q)
@@ -79,14 +83,24 @@ class DeepLagrangian:
         M_q_w = torch.stack([gradient(Mw[:, i], q) for i in range(q.shape[1])], 1)
         M_dot_w = (M_q_w @ v[..., None])[..., 0]
         T_q = gradient((w.detach() * (M @ w.detach()[..., None])[..., 0]).sum(-1) / 2, q)
-        right = self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
+        return M, self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
+
+    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(v, v̇) at (q, v) without torque."""
+        M, right = self.equation(q, v)
         return v, self.scales.v * torch.linalg.solve_ex(M, right)[0]
+
+    def torque(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """The torque (B, n) of the motion, the inverse model that Lutter et al. train."""
+        M, right = self.equation(q, v)
+        return ((M @ (a / self.scales.v)[..., None])[..., 0] - right) / self.scales.v
 
 
 def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
     """Fit one network L(q, v) to accelerations."""
     generator = torch.Generator().manual_seed(seed)
-    model = FreeLagrangian(scales_of(samples, samples.motion()), generator)
+    scales = scales_of(samples, samples.motion())
+    model = FreeLagrangian(scales, lambda inputs: Network(inputs, 1, generator, nn.Softplus()))
     return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
 
 

@@ -20,11 +20,18 @@ ROWS = 2000  # that L-BFGS looks at, at most
 
 
 class Network(nn.Module):
-    """Two hidden layers; float64; weights from the given generator."""
+    """Two hidden layers unless told otherwise; float64; weights from the given generator."""
 
-    def __init__(self, inputs: int, outputs: int, generator: torch.Generator, activation: nn.Module | None = None):
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        generator: torch.Generator,
+        activation: nn.Module | None = None,
+        hidden: Sequence[int] = (WIDTH, WIDTH),
+    ):
         super().__init__()
-        sizes = (inputs, WIDTH, WIDTH, outputs)
+        sizes = (inputs, *hidden, outputs)
         layers: list[nn.Module] = []
         for a, b in pairwise(sizes):
             linear = nn.Linear(a, b, dtype=torch.float64)
@@ -54,6 +61,12 @@ class Scales:
         """Spreads of points (N, n)."""
         spread = [x.square().mean(0).sqrt().clamp_min(1e-12) for x in (q - q.mean(0), v, a)]
         return cls(tuple(angles), q.mean(0), *spread)
+
+    @classmethod
+    def unit(cls, *angles: bool, v: float = 1.0) -> Scales:
+        """No scaling, but of velocities by `v`."""
+        one = torch.ones(len(angles), dtype=torch.float64)
+        return cls(angles, 0 * one, one, v * one, one)
 
     @property
     def q_inputs(self) -> int:

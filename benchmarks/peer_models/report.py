@@ -99,13 +99,14 @@ def table(result: dict[str, Any]) -> str:
         lines += [
             "## Figures of the sources",
             "",
-            "| figure | source | here (least – largest) | seeds |",
-            "|---|---|---|---|",
+            "| figure | source | here median (least – largest) | seeds | agrees if | agrees |",
+            "|---|---|---|---|---|---|",
         ]
         for one in result["reproduced"].values():
             here = one["here"]
             shown = f"{statistics.median(here):.2e} ({min(here):.1e} – {max(here):.1e})"
-            lines.append(f"| {one['figure']} | {one['source']} | {shown} | {len(here)} |")
+            agrees = "yes" if one["agrees"] else "no"
+            lines.append(f"| {one['figure']} | {one['source']} | {shown} | {len(here)} | {one['rule']} | {agrees} |")
         lines += ["", result["reproduced_note"], ""]
     return "\n".join(lines)
 

@@ -115,12 +115,19 @@ def test_delan_loses_its_energy_to_friction_alone():
     power = (E_q * v + E_v * a).sum(-1)
     loss = (model.log_friction.exp() * w(v).square()).sum(-1)
     assert torch.allclose(power, -loss, atol=1e-12)
+    # fails if the inverse model is not the forward model's: the free motion needs no torque, and M ȧ adds to it
+    q, v = q.detach(), v.detach()
+    assert torch.allclose(model.torque(q, v, a), torch.zeros_like(a), atol=1e-12)
+    push = (model.mass(q) @ (1 / scales.v)[:, None])[..., 0] / scales.v
+    assert torch.allclose(model.torque(q, v, a + 1), push, atol=1e-12)
 
 
 def test_discrete_lagrangian_is_a_free_particle_without_its_network_and_forces_enter():
     # fails if D1 and D2 are exchanged, a scale is wrong, or the force is left out
     samples = oscillator(exact=False)
-    model = discrete.DiscreteLagrangian(samples, torch.Generator().manual_seed(0), forced=True)
+    make = torch.Generator().manual_seed(0)
+    net, force = Network(2, 1, make), Network(2, 1, make)
+    model = discrete.DiscreteLagrangian(discrete.scales_of_triples(samples), H, net, force)
     with torch.no_grad():
         for weight in model.weights:
             weight.zero_()
