@@ -1,6 +1,7 @@
 """Joint smoothing: exact derivatives, elimination of the states, both noises found, the model behind pushed motion."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -20,7 +21,7 @@ NOISE = 0.01
 
 def problem_of(level="linear", n=1, freedom=None):
     """A problem over two trajectories of different lengths with a gap, away from its minimum; and unknowns."""
-    sizes = {"scale": (1.5,) * n, "speed": (1.2,) * n, "stiffness": (1.0,) * n, "tilt": (0.0,) * n}
+    sizes: dict[str, Any] = {"scale": (1.5,) * n, "speed": (1.2,) * n, "stiffness": (1.0,) * n, "tilt": (0.0,) * n}
     angles = tuple(i == 0 for i in range(n))
     model = ContactLagrangian(
         ModelConfig(angles=angles, level=level, rate=0.2, potential_width=2, damping_width=2, **sizes)
@@ -55,6 +56,8 @@ def test_normal_equations_match_finite_differences(level, n):
     def residuals(x):
         theta, states = problem.unpack(x)
         stepped = problem._stepped(x)
+        assert stepped is not None
+        assert problem.prior is not None
         fit, defect = problem._residuals(states, stepped[0])
         return torch.cat([fit.flatten(), defect.flatten(), problem._anchor(states), problem.prior.residuals(theta)])
 
@@ -108,7 +111,7 @@ def disturbed(kick, seed=0, count=8, steps=60):
     """Noisy positions of the damped pendulum under random pushes."""
     make = torch.Generator().manual_seed(seed)
     draw = lambda *shape: torch.randn(*shape, generator=make, dtype=torch.float64)  # noqa: E731
-    sizes = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
+    sizes: dict[str, Any] = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
     truth = Stepper(
         ContactLagrangian(ModelConfig(level="linear", rate=0.2, potential_width=0, damping_width=0, **sizes))
     )
