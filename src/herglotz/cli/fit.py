@@ -45,7 +45,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--objective", choices=OBJECTIVES, default="auto",
         help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. smoothing: "
-        "every state, and a little noise in every step, for pushes, chaos, very long records. auto: the first or the "
+        "every state, and a little noise in every step, for pushes and chaos. auto: the first or the "
         "second, by the noise. raw: a plain network on |R|, which collapses, for demonstration (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(

@@ -34,9 +34,9 @@ class FitConfig:
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.
         "smoothing": every state an unknown and a little noise in every step, for noisy data that no model follows for
-        long (pushes, chaos), or of more samples than multiple shooting has memory for. "auto": the first or the second,
-        as the noise found in the data asks for. "raw": a plain network trained on ‖R‖², which collapses (always seen
-        with Adam, at some seeds with Levenberg–Marquardt); for demonstration.
+        long (pushes, chaos). "auto": the first or the second, as the noise found in the data asks for. "raw": a plain
+        network trained on ‖R‖², which collapses (always seen with Adam, at some seeds with Levenberg–Marquardt); for
+        demonstration.
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" or "adamw" for the residual objectives.
     train_fraction

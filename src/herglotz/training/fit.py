@@ -32,7 +32,7 @@ from herglotz.training.matrix_free import DENSE, MatrixFree
 from herglotz.training.residual import ResidualProblem
 from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
-from herglotz.training.smoothing_fit import fit_smoothing
+from herglotz.training.smoothing_fit import SMOOTHED, fit_smoothing
 from herglotz.training.stages import Stages
 from herglotz.training.structure import ROWS, kept_structure, nothing_told
 from herglotz.training.supervision import SupervisedProblem
@@ -89,8 +89,7 @@ def fit(
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=config.torch_dtype, device=config.device)
     train = data if config.train_fraction == 1 else data.split_time(config.train_fraction)[0]
-    if config.objective != "smoothing":
-        check_size(train)
+    check_size(train, *([SMOOTHED] if config.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if config.robust == "off" else spikes(train)
     kept = without(train, dropped)
     suspect = config.robust == "on" or bool(dropped.any())

@@ -30,6 +30,7 @@ from herglotz.training.trajectory_fit import LOST, make_prior
 ROUNDS = 8  # in which both noises are found; at first the steps' is taken as large as the data's
 FALL = 10.0  # factor by which the steps' noise falls in a round, at the most
 SETTLED = 0.1  # change of its logarithm that ends the rounds
+SMOOTHED = 20_000  # numbers in q at the most: a held-out fifth of them is solved for at once (1.3 GB, a few times)
 LEAST = 1e-2  # of the steps' noise relative to the data's: with less the states are a motion of the model
 
 
@@ -71,7 +72,7 @@ def fit_smoothing(
     *,
     robust: str = "auto",
 ) -> SmoothingFit | None:
-    """Fit parameters and all states to positions, first with much process noise, then with little.
+    """Fit parameters and all states to positions, and find both noises, the steps' from as much as the data's on.
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
     strength is then fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted with.
@@ -143,9 +144,10 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))
-    defect = problem.defects(fit.x) * problem.process * problem.sigma  # in the units of σ
-    by = root_weights(problem.defects(fit.x), problem.freedom).square()
-    w = math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
+    defect = problem.defects(fit.x)
+    by = root_weights(defect, problem.freedom).square()
+    w = problem.process * problem.sigma  # in the units of σ
+    w *= math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
     sigma = max(sigma, problem.sigma / FALL)
     return sigma, max(w / sigma, LEAST)
 

@@ -112,15 +112,15 @@ def segment_lengths(data: Trajectories) -> list[int]:
     return [*lengths, longest]
 
 
-def check_size(data: Trajectories) -> None:
-    """That the states of all segments can be solved for together, and a long trajectory be stepped through.
+def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> None:
+    """That there are no more than `most` numbers in q: what is solved for together grows with their square.
 
     Raises
     ------
     InputError
         Naming how many samples there are, how many can be, and which thinning leaves as many.
     """
-    allowed = MOST * FIRST_SEGMENT // (2 * data.dof)
+    allowed = most // data.dof
     if data.samples <= allowed:
         return
     every = math.ceil(data.samples / allowed)

@@ -166,3 +166,11 @@ def test_smoothing_takes_no_supervision():
     # fails if the setting is dropped without a word
     with pytest.raises(InputError, match="one-step objective"):
         FitConfig(objective="smoothing", supervision="qs")
+
+
+def test_too_many_samples_are_refused():
+    # fails if a long record runs out of memory at the held-out blocks instead of ending in an error with a remedy
+    t = torch.arange(20_100, dtype=torch.float64)
+    data = Trajectories.of(t, t.sin()[:, None], (len(t),))
+    with pytest.raises(InputError, match=r"at most 20000 can be.*--every 2"):
+        fit(data, FitConfig(objective="smoothing", train_fraction=1.0), progress=False)
