@@ -50,10 +50,22 @@ class FreeLagrangian:
 
 
 class DeepLagrangian:
-    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate where asked for."""
+    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate where asked for.
 
-    def __init__(self, scales: Scales, generator: torch.Generator, *, friction: bool = True):
+    The diagonal of C is softplus(net + `shift`) + `least`; with the defaults M is near 1 at the start.
+    """
+
+    def __init__(
+        self,
+        scales: Scales,
+        generator: torch.Generator,
+        *,
+        friction: bool = True,
+        shift: float = 0.54,
+        least: float = 0.0,
+    ):
         n = len(scales.angles)
+        self.shift, self.least = shift, least
         self.scales, self.index = scales, torch.tril_indices(n, n)
         self.factor = Network(scales.q_inputs, self.index.shape[1], generator)
         self.potential = Network(scales.q_inputs, 1, generator)
@@ -68,7 +80,7 @@ class DeepLagrangian:
         entries = self.factor(self.scales.of_q(q))
         C = entries.new_zeros(len(q), n, n)
         C[:, self.index[0], self.index[1]] = entries
-        diagonal = nn.functional.softplus(C.diagonal(dim1=-2, dim2=-1) + 0.54)  # softplus(0.54) = 1
+        diagonal = nn.functional.softplus(C.diagonal(dim1=-2, dim2=-1) + self.shift) + self.least  # softplus(0.54) = 1
         C = C.tril(-1) + torch.diag_embed(diagonal)
         return C @ C.mT + 1e-3 * torch.eye(n, dtype=q.dtype)
 
