@@ -48,6 +48,19 @@ def eliminate(blocks: Blocks, rhs: Tensor) -> Tensor:
     return torch.stack(u[::-1], -3)
 
 
+def diagonal_of_inverse(blocks: Blocks) -> Tensor:
+    """Diagonal of the inverse, (S, K, m), by elimination from both ends: (A⁻¹)_kk = (S_k + T_k − D_k)⁻¹."""
+    diagonal, upper, lower = (x.unbind(1) for x in blocks)
+    count = len(diagonal)
+    S, T = [diagonal[0]], [diagonal[-1]]
+    for k in range(1, count):
+        S.append(diagonal[k] - lower[k] @ torch.linalg.solve(S[-1], upper[k - 1]))
+        j = count - 1 - k
+        T.append(diagonal[j] - upper[j] @ torch.linalg.solve(T[-1], lower[j + 1]))
+    both = torch.stack(S, 1) + torch.stack(T[::-1], 1) - blocks[0]
+    return torch.linalg.inv(both).diagonal(dim1=-2, dim2=-1)
+
+
 def multiply(blocks: Blocks, u: Tensor) -> Tensor:
     """The matrix times u (..., K, m)."""
     diagonal, upper, lower = blocks

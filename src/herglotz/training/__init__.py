@@ -10,7 +10,8 @@ from herglotz.training.residual import ResidualProblem
 from herglotz.training.run import Run, load_run, save_run
 from herglotz.training.selection import Selection, select
 from herglotz.training.shooting import ShootingProblem
-from herglotz.training.smoothing import Smoothed, SmoothingProblem, smooth
+from herglotz.training.smoother import Smoothed, smooth
+from herglotz.training.smoothing import SmoothingProblem
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.uncertainty import Bands, Laplace, ensemble_bands, laplace
 

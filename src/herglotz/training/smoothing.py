@@ -12,29 +12,20 @@ model does not know, is followed; with w → 0 it is the fit of the start states
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.checks import check_positive
-from herglotz.data.trajectories import GAP
-from herglotz.errors import InputError
 from herglotz.mechanics import legendre_minus, partials
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State
-from herglotz.stepping.block_tridiagonal import Blocks
 from herglotz.training.bordered import Bordered
 from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.flat import FlatModel
-from herglotz.training.grid import SegmentGrid, segment_grid
+from herglotz.training.grid import SegmentGrid
 from herglotz.training.inputs import step_inputs
-from herglotz.training.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.lifted import all_steps, parameter_derivatives
 from herglotz.training.prior import Prior
 from herglotz.training.robust import loss, root_weights
-from herglotz.training.trajectory_fit import StatesOnly
 
 DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal
 
@@ -217,61 +208,3 @@ class SmoothingProblem:
     def _anchor(self, states: Tensor) -> Tensor:
         """Residuals of the first s of each trajectory, (S,); none where s does not enter the motion."""
         return states[:, 0, 2 * self.n :].flatten() / self.action
-
-
-@dataclass(frozen=True)
-class Smoothed:
-    """States at every sample and their standard errors, given the model."""
-
-    states: State  # (N, n), (N, n), (N,)
-    std: State  # the same shapes; s has 0 where the motion does not depend on it
-
-
-def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """Smoothed states of each trajectory, the model held.
-
-    Parameters
-    ----------
-    model
-        The dynamics; its parameters are held.
-    data
-        Positions, and inputs where the model takes them; steps may differ, samples may be missing.
-    sigma
-        Standard deviation of the noise of q, in its units.
-    process
-        Of `SmoothingProblem`. Small: the model is believed; large: the data are.
-
-    Raises
-    ------
-    InputError
-        If sigma or process is not positive, or a step has no solution near the data.
-    """
-    check_positive("sigma", sigma)
-    check_positive("process", process)
-    data = data.unwrapped()
-    grid = segment_grid(data, data.samples, GAP * data.typical_step)
-    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
-    x, n, d = problem.start(), data.dof, problem.d
-    states = StatesOnly(problem, x[: problem.P])
-    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
-    if result.reason == "not_finite":
-        where = data.source or "data"
-        raise InputError(f"{where}: the model has no step near these data, so nothing can be smoothed; fit it again")
-    x = states.full(result.x)
-    found, std = problem.states(x), data.q.new_zeros(data.samples, 2 * n + 1)
-    _, matrix, _ = problem.normal_equations(x, held=True)
-    std[:, :d] = variances(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
-    return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (found, std)))
-
-
-def variances(blocks: Blocks) -> Tensor:
-    """Diagonal of the inverse, (S, M, d), by elimination from both ends: (A⁻¹)_kk = (S_k + T_k − D_k)⁻¹."""
-    diagonal, upper, lower = (x.unbind(1) for x in blocks)
-    count = len(diagonal)
-    S, T = [diagonal[0]], [diagonal[-1]]
-    for k in range(1, count):
-        S.append(diagonal[k] - lower[k] @ torch.linalg.solve(S[-1], upper[k - 1]))
-        j = count - 1 - k
-        T.append(diagonal[j] - upper[j] @ torch.linalg.solve(T[-1], lower[j + 1]))
-    both = torch.stack(S, 1) + torch.stack(T[::-1], 1) - blocks[0]
-    return torch.linalg.inv(both).diagonal(dim1=-2, dim2=-1)

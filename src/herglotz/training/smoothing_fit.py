@@ -17,13 +17,14 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
+from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
 from herglotz.training.baseline import Baseline
 from herglotz.training.bordered import Bordered
 from herglotz.training.cross_validation import left_out_errors, simplest_not_beaten
 from herglotz.training.grid import segment_grid
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.robust import FREEDOM, heavy_tailed, root_weights
-from herglotz.training.smoothing import DAMPING, SmoothingProblem, variances
+from herglotz.training.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import LOST, make_prior
 
@@ -140,7 +141,7 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     problem = fit.problem
     misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
     used = root_weights(misfit / problem.sigma, problem.freedom).square()
-    taken = float(variances(matrix.blocks).flatten(0, 1)[problem.node, : problem.n].sum()) / problem.sigma**2
+    taken = float(diagonal_of_inverse(matrix.blocks).flatten(0, 1)[problem.node, : problem.n].sum()) / problem.sigma**2
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))

@@ -12,21 +12,20 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.mechanics import legendre_minus
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.first_states import first_states
 from herglotz.training.flat import FlatModel
 from herglotz.training.grid import segment_grid
 from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.lifted import Path
 from herglotz.training.prior import Prior
-from herglotz.training.robust import FAR, FEW, FREEDOM, MAD, far_out, heavy_tailed, root_weights, scale_of
+from herglotz.training.robust import FAR, FEW, FREEDOM, far_out, heavy_tailed, scale_of
 from herglotz.training.shooting import ShootingProblem
 from herglotz.training.stages import Stages
 
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
-START = 8  # samples that a robust start state is read from
 MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 
@@ -168,7 +167,7 @@ def fit_trajectories(
         prior = make_prior(model, base, departures[0])
         problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, used=used, s=s)
         if before is None:
-            start, states = theta, _first_states(problem, theta)
+            start, states = theta, first_states(problem, theta)
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
@@ -277,41 +276,6 @@ def _optimise(
         ),
     )
     return result, theta if frozen else problem.unpack(result.x)[0]
-
-
-def _first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
-    """Segment states from the first two samples of each, p by FL⁻; from a robust cubic where one may be an outlier."""
-    i, data = problem.grid.start_sample, problem.data
-    q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
-    with torch.no_grad():
-        s = torch.zeros_like(data.t[i]) if problem.s is None else problem.s[i]
-        u = None if problem.u is None else problem.u[:, 0]
-        L_d = problem.flat.at(theta, u)
-        q, p, _ = legendre_minus(L_d, q0, q1, s, data.t[i + 1] - data.t[i])
-    return problem.states(q, p, s)
-
-
-def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Positions at `rows` and at the samples after, (S, n) each, on cubics through eight samples by Student's t."""
-    first, second = data.q[rows].clone(), data.q[rows + 1].clone()
-    fits = rows + START < data.samples
-    inside = data.trajectory[(rows + START - 1).clamp_max(data.samples - 1)] == data.trajectory[rows]
-    here = (fits & inside).nonzero()[:, 0]
-    if not len(here):
-        return first, second
-    near = rows[here, None] + torch.arange(START, device=rows.device)
-    x = data.t[near] - data.t[rows[here]][:, None]
-    A = torch.stack([x**k for k in range(4)], -1)[:, None]  # (S, 1, START, 4)
-    q = data.q[near].mT[..., None]  # (S, n, START, 1)
-    c = torch.linalg.lstsq(A.expand(*q.shape[:2], -1, -1), q).solution
-    for _ in range(10):
-        r = A @ c - q
-        scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(q.dtype).tiny)
-        by = root_weights(r / scale, FREEDOM)
-        c = torch.linalg.lstsq(by * A, by * q).solution
-    values = (A @ c)[..., 0]
-    first[here], second[here] = values[..., 0], values[..., 1]
-    return first, second
 
 
 def _noise(problem: ShootingProblem, path: Path) -> float:

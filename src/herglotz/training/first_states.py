@@ -1,0 +1,48 @@
+"""States at the beginnings of segments, read from the samples there."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.mechanics import legendre_minus
+from herglotz.training.robust import FREEDOM, MAD, root_weights
+from herglotz.training.shooting import ShootingProblem
+
+START = 8  # samples that a robust start state is read from
+
+
+def first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
+    """Segment states from the first two samples of each, p by FL⁻; from a robust cubic where one may be an outlier."""
+    i, data = problem.grid.start_sample, problem.data
+    q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
+    with torch.no_grad():
+        s = torch.zeros_like(data.t[i]) if problem.s is None else problem.s[i]
+        u = None if problem.u is None else problem.u[:, 0]
+        L_d = problem.flat.at(theta, u)
+        q, p, _ = legendre_minus(L_d, q0, q1, s, data.t[i + 1] - data.t[i])
+    return problem.states(q, p, s)
+
+
+def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Positions at `rows` and at the samples after, (S, n) each, on cubics through eight samples by Student's t."""
+    first, second = data.q[rows].clone(), data.q[rows + 1].clone()
+    fits = rows + START < data.samples
+    inside = data.trajectory[(rows + START - 1).clamp_max(data.samples - 1)] == data.trajectory[rows]
+    here = (fits & inside).nonzero()[:, 0]
+    if not len(here):
+        return first, second
+    near = rows[here, None] + torch.arange(START, device=rows.device)
+    x = data.t[near] - data.t[rows[here]][:, None]
+    A = torch.stack([x**k for k in range(4)], -1)[:, None]  # (S, 1, START, 4)
+    q = data.q[near].mT[..., None]  # (S, n, START, 1)
+    c = torch.linalg.lstsq(A.expand(*q.shape[:2], -1, -1), q).solution
+    for _ in range(10):
+        r = A @ c - q
+        scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(q.dtype).tiny)
+        by = root_weights(r / scale, FREEDOM)
+        c = torch.linalg.lstsq(by * A, by * q).solution
+    values = (A @ c)[..., 0]
+    first[here], second[here] = values[..., 0], values[..., 1]
+    return first, second

@@ -1,0 +1,62 @@
+"""Smoothed states with their standard errors, the model held."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from herglotz.data import Trajectories
+from herglotz.data.checks import check_positive
+from herglotz.data.trajectories import GAP
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
+from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
+from herglotz.training.grid import segment_grid
+from herglotz.training.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.trajectory_fit import StatesOnly
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """States at every sample and their standard errors, given the model."""
+
+    states: State  # (N, n), (N, n), (N,)
+    std: State  # the same shapes; s has 0 where the motion does not depend on it
+
+
+def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
+    """Smoothed states of each trajectory, the model held.
+
+    Parameters
+    ----------
+    model
+        The dynamics; its parameters are held.
+    data
+        Positions, and inputs where the model takes them; steps may differ, samples may be missing.
+    sigma
+        Standard deviation of the noise of q, in its units.
+    process
+        Of `SmoothingProblem`. Small: the model is believed; large: the data are.
+
+    Raises
+    ------
+    InputError
+        If sigma or process is not positive, or a step has no solution near the data.
+    """
+    check_positive("sigma", sigma)
+    check_positive("process", process)
+    data = data.unwrapped()
+    grid = segment_grid(data, data.samples, GAP * data.typical_step)
+    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
+    x, n, d = problem.start(), data.dof, problem.d
+    states = StatesOnly(problem, x[: problem.P])
+    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
+    if result.reason == "not_finite":
+        where = data.source or "data"
+        raise InputError(f"{where}: the model has no step near these data, so nothing can be smoothed; fit it again")
+    x = states.full(result.x)
+    found, std = problem.states(x), data.q.new_zeros(data.samples, 2 * n + 1)
+    _, matrix, _ = problem.normal_equations(x, held=True)
+    std[:, :d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
+    return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (found, std)))
