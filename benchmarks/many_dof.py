@@ -69,13 +69,13 @@ class Row:
 
 def told(**settings: Any) -> FitConfig:
     """Train on everything; the model is judged on other trajectories."""
-    return FitConfig(train_fraction=1.0, objective="residual", **settings)
+    return FitConfig(**{"train_fraction": 1.0, "objective": "residual", **settings})
 
 
 LINKS: dict[str, Any] = {"features": ("pendulums",), "order": 4}
 CENTRAL = told(level="linear", features=("central",), alike=True, order=4)
 SPRINGS = told(level="linear", features=("chain",), alike=True, order=4)
-PLAIN = told()
+PLAIN = told(objective="auto")
 JOINTS = told(level="forced", coupled=True, **LINKS)
 ROWS = [
     Row("double pendulum, hinges, nothing told", hinged, 0.02, 20, 50, PLAIN, 50, False, 1e-4),
@@ -83,10 +83,12 @@ ROWS = [
     Row("double pendulum, hinges, 100 × 100", hinged, 0.02, 100, 99, JOINTS, 50, False, 1e-4),
     Row("double pendulum, one rate, 20 × 50", lambda: scene("double_pendulum"), 0.02, 20, 49,
         told(level="linear", **LINKS), 50, False, 1e-4),
+    Row("Kepler, drag, nothing told", lambda: scene("kepler"), 0.02, 20, 100, PLAIN, 200, True, 1e-4),
     Row("Kepler, drag", lambda: scene("kepler"), 0.02, 20, 100, CENTRAL, 200, True, 1e-4),
     Row("Kepler, drag, larger step", lambda: scene("kepler"), 0.05, 20, 100, CENTRAL, 200, True, 1e-4),
     Row("Kepler, drag, larger step, 4 model steps", lambda: scene("kepler"), 0.05, 5, 60,
         replace(CENTRAL, objective="trajectory", substeps=4), 200, True, 1e-4),
+    Row("chain of 10, nothing told", lambda: scene("chain", masses=10), 0.1, 10, 40, PLAIN, 200, True, 1e-4),
     Row("chain of 10", lambda: scene("chain", masses=10), 0.1, 10, 40, SPRINGS, 200, True, 1e-4),
     Row("chain of 10, larger step", lambda: scene("chain", masses=10), 0.2, 10, 40, SPRINGS, 200, True, 1e-4),
     Row("chain of 10, larger step, 2 model steps", lambda: scene("chain", masses=10), 0.2, 4, 30,
@@ -175,8 +177,8 @@ FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),
 def table(results: dict) -> str:
     """One line a figure: median, range over the seeds, target."""
     lines = [
-        "| case | h | figure | median | min … max | seeds | parameters | fit, CPU s | target | met |",
-        "|---" * 10 + "|",
+        "| case | h | figure | median | min … max | seeds | parameters | fit, CPU s | target | met | commit |",
+        "|---" * 11 + "|",
     ]
     for name, row in results.items():
         for figure_, target in row["figures"].items():
@@ -185,8 +187,9 @@ def table(results: dict) -> str:
             cpu = statistics.median(x["cpu_s"] for x in row["seeds"])
             spread = f"{min(values):.1e} … {max(values):.1e}"
             met = "yes" if middle <= target else "**no**"
-            lines.append(f"| {name} | {row['h']} | {figure_} | {middle:.1e} | {spread} | {len(values)} | "
-                         f"{row['seeds'][0]['parameters']} | {cpu:.0f} | {target:g} | {met} |")  # fmt: skip
+            cells = [name, row["h"], figure_, f"{middle:.1e}", spread, len(values), row["seeds"][0]["parameters"],
+                     f"{cpu:.0f}", f"{target:g}", met, row["commit"]]  # fmt: skip
+            lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join(lines) + "\n"
 
 
@@ -215,7 +218,7 @@ def main() -> None:
     path = RESULTS / "many_dof.json"
     stored: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"rows": {}}
     commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS).stdout
-    stored |= {"commit": commit.strip(), "torch": torch.__version__, "processor": platform.machine()}
+    stored = {"rows": stored["rows"], "torch": torch.__version__, "processor": platform.machine()}
     wanted = lambda name: not arguments.only or any(word in name for word in arguments.only)  # noqa: E731
     jobs: list[tuple[str, float, int, dict[str, float], Callable[[int], dict]]] = []
     for row in ROWS:
@@ -225,7 +228,7 @@ def main() -> None:
     for name, h, seeds, figures, run in jobs:
         if wanted(name):
             found = [run(seed) for seed in range(seeds)]
-            stored["rows"][name] = {"h": h, "figures": figures, "seeds": found}
+            stored["rows"][name] = {"h": h, "figures": figures, "seeds": found, "commit": commit.strip()}
             order = [j[0] for j in jobs]
             stored["rows"] = dict(sorted(stored["rows"].items(), key=lambda item: order.index(item[0])))
             write_atomically(path, json.dumps(stored, indent=1).encode() + b"\n")

@@ -4,7 +4,7 @@ LNN (arXiv:2003.04630), double pendulum with m = l = 1, g = 9.8: accelerations a
 |v| < 10, error |v̇| (L1), fresh points every step. Energy error at t = 100 over the largest potential energy 29.4, of
 40 starts with q uniform and 0 < v < 0.1; about half of these motions exceed |v| = 10, up to 15, where nothing was
 trained. The source trains three layers of 600 units with 512 points for 600 000 steps, on a graphics processor; here
-two of 128 with 64 points for 45 000, Adam 5e-3 falling as a cosine.
+two of 128 with 64 points for 135 000, Adam 5e-3 falling as a cosine.
 
 LNN as measured in arXiv:2211.10830, Kepler: network and orbits of `discrete.kepler`, accelerations at 51 states, Adam
 on all of them (3e-3 for 1000 steps, none for 1000, 3e-4 after that), mean square over both halves of the rate. The
@@ -45,7 +45,7 @@ def _energy(y: Tensor) -> Tensor:
 def double_pendulum(seed: int, effort: float = 1.0) -> dict[str, float]:
     """Energy error of an LNN, and the error of its accelerations."""
     make = torch.Generator().manual_seed(seed)
-    equation, steps, batch = Equation(relative=False), math.ceil(45_000 * effort), 64
+    equation, steps, batch = Equation(relative=False), math.ceil(135_000 * effort), 64
 
     def rand(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=make, dtype=torch.float64)

@@ -24,11 +24,11 @@ class ModelConfig:
     a learned matrix or through `input_map` (n · m numbers, row by row), measured from 0 or, with `input_zero`, from a
     learned zero of each.
     `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
-    coordinates have one mass, and their potential is made of features alone; `coupled` friction (forced level) may
-    brake differences of speeds. `order` 4 adds what the rule lacks of the exact L_d, from the features
-    (`herglotz.models.fourth`); forces stay of order 2.
-    Without a `baseline` the correction is the whole of A: no kinetic term, no
-    potential; it is there to show why a baseline is needed (trap 2).
+    coordinates have one mass, and their potential is made of features alone; `diagonal`: each coordinate has a mass of
+    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds. `order` 4 adds
+    what the rule lacks of the exact L_d, from the features (`herglotz.models.fourth`); forces stay of order 2.
+    Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
+    baseline is needed (trap 2).
     """
 
     angles: tuple[bool, ...] = (True,)
@@ -56,6 +56,7 @@ class ModelConfig:
     features: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
     alike: bool = False
+    diagonal: bool = False
     coupled: bool = False
     order: int = 2
 
@@ -83,8 +84,10 @@ class ModelConfig:
         networks = self.potential_width or self.mass_width or self.correction_width or not self.baseline
         if self.order == 4 and (networks or self.level in ("affine", "full")):
             raise InputError("order 4 is for features, without networks, at the levels conservative, linear and forced")
-        if not self.baseline and (self.features or self.known or self.alike):
-            raise InputError("a model without a baseline has no features; leave features, known and alike out")
+        if not self.baseline and (self.features or self.known or self.alike or self.diagonal):
+            raise InputError("a model without a baseline has no features; leave features, known, alike, diagonal out")
+        if self.diagonal and self.mass_width:
+            raise InputError("a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False")
         self._check_features()
         if self.input_zero and not self.inputs:
             raise InputError("input_zero is the zero of inputs; set inputs to their number")

@@ -113,6 +113,24 @@ def revolute(angles: Sequence[bool]) -> list[str]:
     return _waves(angles, 1, len(angles))
 
 
+def lengths(angles: Sequence[bool]) -> list[str]:
+    """What coordinates that are no angles are often made of, by themselves and in pairs.
+
+    Powers 2, 3 and 4 of each difference of two, 3 and 4 of each coordinate. Of two or three coordinates also those
+    powers of sums, a potential of the distance r = |q|, and forces across the velocity (a magnetic field, a frame that
+    turns).
+    """
+    n = len(angles)
+    pairs = [(i + 1, j + 1) for i, j in combinations(range(n), 2)]
+    names = [f"(q{i} - q{j})^{power}" for power in (2, 3, 4) for i, j in pairs]
+    names += [f"q{i + 1}^{power}" for power in (3, 4) for i in range(n)]
+    if 1 < n <= 3:
+        names += [f"(q{i} + q{j})^{power}" for power in (3, 4) for i, j in pairs]
+        names += [name for name in central(angles) if name != "r^2"]  # the baseline's
+        names += [f"q{i} v{j} - q{j} v{i}" for i, j in pairs]
+    return names
+
+
 def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
     """The waves of k·q with |k_i| ≤ highest and Σ|k_i| ≤ total, but those of V that the baseline has."""
     which = [i + 1 for i, angle in enumerate(angles) if angle]
@@ -133,6 +151,7 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "pendulums": pendulums,
     "harmonics": harmonics,
     "revolute": revolute,
+    "lengths": lengths,
 }
 
 

@@ -66,7 +66,7 @@ class ContactLagrangian(nn.Module):
         known_still, known_moving = sorted_features(c.known, c.angles)
         fixed, zero = c.alike or c.order == 4, (0.0,) * c.dof
         stiffness, tilt = (zero, zero) if c.order == 4 else (c.stiffness, c.tilt)
-        self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike)
+        self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike, c.diagonal)
         self.potential = Potential(
             *sizes, stiffness, tilt, c.potential_width, c.potential_depth, make, act,
             FeaturePotential(still, known_still, c.dof) if still or known_still else None, fixed,

@@ -21,15 +21,18 @@ class Kinetic(nn.Module):
     """K = Δᵀ m Δ / 2h with Δ = q1 − q0 and a constant mass matrix m = C Cᵀ, C₁₁ = 1.
 
     Positions do not determine the scale of L_d (gauge), so the first entry of the mass is fixed at 1. `alike`: m = 1,
-    with no parameter.
+    with no parameter; `diagonal`: no mass between coordinates.
     """
 
-    def __init__(self, dof: int, alike: bool = False):
+    def __init__(self, dof: int, alike: bool = False, diagonal: bool = False):
         super().__init__()
         self.dof = dof
-        for name, size in (("log_diagonal", dof - 1), ("off_diagonal", dof * (dof - 1) // 2)):
+        for name, size, fixed in (
+            ("log_diagonal", dof - 1, alike),
+            ("off_diagonal", dof * (dof - 1) // 2, alike or diagonal),
+        ):
             zero = torch.zeros(size, dtype=torch.float64)
-            setattr(self, name, nn.Parameter(zero)) if not alike else self.register_buffer(name, zero, persistent=False)
+            setattr(self, name, nn.Parameter(zero)) if not fixed else self.register_buffer(name, zero, persistent=False)
         self.log_diagonal: Tensor
         self.off_diagonal: Tensor
 

@@ -49,6 +49,7 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
             features=("1", *config.features) if dragged(config) else config.features if network != "plain" else (),
             known=config.known if network != "plain" else (),
             alike=config.alike and network != "plain",
+            diagonal=config.diagonal and network != "plain",
             coupled=config.coupled,
             order=config.order,
         )

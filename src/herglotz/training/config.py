@@ -85,12 +85,14 @@ class FitConfig:
     features
         What L = K − V may be made of beside its terms, as text: `"cos(q1 - q2) v1 v2"`, part of K;
         `"(q2 - q1)^4 + (q3 - q2)^4"`, without velocities part of V; or one of the names chain, sites, central,
-        pendulums, harmonics, revolute. Each has one coefficient, learned. See `herglotz.models.features`.
+        pendulums, harmonics, revolute, lengths. Each has one coefficient, learned. See `herglotz.models.features`.
     known
         What is known of K and V, the same way, with its numbers (the first mass is 1): `"-9.81 cos(q1)"` is a
         pendulum's V. Nothing of it is learned.
     alike
         All coordinates have one mass, and their potential is made of features alone: chains.
+    diagonal
+        Each coordinate has a mass of its own, and none is between two: bodies, not the joints of one.
     coupled
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
     order
@@ -127,6 +129,7 @@ class FitConfig:
     features: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
     alike: bool = False
+    diagonal: bool = False
     coupled: bool = False
     order: int = 2
     substeps: int = 1

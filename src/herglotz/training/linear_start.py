@@ -76,7 +76,7 @@ class LinearFit:
         return LinearFit(self.R[which], self.J[which], self.names)
 
     def solve(self, columns: Tensor) -> Tensor:
-        """Coefficients (F,) of unit size, zero outside `columns` (F,) bool."""
+        """Coefficients (F,) of unit size, zero outside `columns` (F,) bool; all are where none can be had."""
         n = self.R.shape[1]
         R, J = self.R[..., columns], self.J[..., columns]
         Jk, x = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n), R.new_zeros(0)
@@ -88,6 +88,8 @@ class LinearFit:
             size = size.clamp_min(1e-12 * float(size.max()))
             # All of R and J in one thin factor: R = Q₁ U, J = Q₂ U with Q₁ᵀQ₁ + Q₂ᵀQ₂ = 1; x = U⁻¹ y, least |Q₁ y|.
             Q, U = torch.linalg.qr(torch.cat([top, bottom]) / size)
+            if not bool(torch.isfinite(Q).all()):  # each has a scale of its own, and some had none
+                return self.R.new_zeros(len(self.names))
             y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
             x = torch.linalg.lstsq(U, y[:, None]).solution[:, 0] / size
             Jk = J @ x

@@ -1,13 +1,16 @@
-"""What two or three joints are made of, where nobody says it: a mass that depends on the angles, or a constant one.
+"""What several coordinates are made of, where nobody says it.
 
 Every planar chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary
-`revolute` (`herglotz.models.features`). Both structures are solved as linear problems (`linear_start`) without a fifth
-of the data at a time; the richer one is taken where it predicts that fifth better, beyond the spread of the fifths. A
-short one-step fit then leaves out the features that the data do not need, and tells noise from what the rule lacks.
+`revolute` (`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and
+springs, powers and distances in the dictionary `lengths`. Either starts as a linear problem (`linear_start`). For
+joints the one with a constant mass is solved too, without a fifth of the data at a time; the richer one is taken where
+it predicts that fifth better, beyond the spread of the fifths. A short one-step fit then leaves out the features that
+the data do not need, and tells noise from what the rule lacks.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -15,7 +18,9 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.models.features import revolute
+from herglotz.data.roughness import roughness
+from herglotz.models.features import lengths, revolute
+from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.build import build_model
 from herglotz.training.config import FitConfig
@@ -28,20 +33,35 @@ from herglotz.training.residual import ResidualProblem
 from herglotz.training.stages import Stages
 from herglotz.training.trajectory_fit import make_prior
 
-MOST = 3  # coordinates: the dictionary's size grows as 3ⁿ n²
+MOST, MOST_LENGTHS = 3, 12  # coordinates: the dictionary of joints grows as 3ⁿ n²
 TRIPLES, ENOUGH = 4000, 5  # triples that tell the structures apart; residuals a coefficient, at least
+NUMBERS = 3e7  # in the derivatives of the linear problem: 240 MB
+NEAR = 0.02  # of the RMS distance: powers of r below 0 are no candidates where the data come nearer
 THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shorter ones
 ROWS = 50  # residuals a coefficient that the one-step fit takes
-BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks
+MISSED = 2.0  # more than so many times the noise is force that the dictionary of lengths has not
+BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks,
+EXPLAINED = 1e-7  # if the rule lacks anything: one-step error relative to the size of the motion
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
+COUPLING = "coupling.viscous"
 
 
 def nothing_told(data: Trajectories, told: FitConfig) -> bool:
-    """Whether the structure of these data is left to `structured`: joints without motors, and no word about them."""
-    free = told.level == "auto" and not (told.features or told.known or told.alike or told.mass_width or told.coulomb)
+    """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
+    said = told.features or told.known or told.alike or told.diagonal or told.mass_width or told.coulomb
+    free = told.level == "auto" and not said
     plain = told.order == 2 and told.objective != "raw" and told.supervision == "q" and told.optimiser == "lm"
     driven = data.u is not None and told.use_inputs
-    return free and plain and not driven and 1 < data.dof <= MOST and any(data.angles)
+    return free and plain and not driven and 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)
+
+
+def dictionary(data: Trajectories) -> tuple[str, ...]:
+    """The features that these coordinates are tried with."""
+    if any(data.angles):
+        return tuple(revolute(data.angles))
+    r = data.q.norm(dim=1)
+    away = len(set(data.units)) == 1 and float(r.min()) > NEAR * float(r.square().mean().sqrt())
+    return tuple(name for name in lengths(data.angles) if away or not name.startswith("r^"))
 
 
 def kept_structure(
@@ -72,45 +92,66 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: flo
     noisy
         One-step error, relative to the size of the motion, above which it is noise.
     """
-    names = tuple(revolute(data.angles))
-    found = _linear(data, base, names)
-    if found is None:
+    joints, names = any(data.angles), dictionary(data)
+    linear = _linear(data, base, names)
+    if linear is None:
         return config, base
-    every, fit = found
-    constant = torch.tensor([name != KINETIC for name in fit.names])
-    x, poor, good = of_first(
-        fit.solve(torch.ones_like(constant)), _held_out(fit, constant), _held_out(fit, torch.ones_like(constant))
-    )
-    start, held_out = fit.start(x), {0.0: poor, 1.0: good}
-    if start is None or simplest_not_beaten(held_out) == 0.0:
+    every, fit = linear
+    (x,) = of_first(fit.solve(_columns(fit, data.angles)))
+    start = fit.start(x)
+    if start is None or (joints and not _mass_turns(fit)):
         return config, base
-    base = _with(base, {name: tuple(values.tolist()) for name, values in start.items()})
-    rich = replace(config, level="forced", coupled=True, features=names, order=4)
-    base, kept, rms = _short_fit(data.thinned(every), base, rich, every * base.max_step)
-    if not any("v" in name for name in kept):
+    first = _with(base, {name: tuple(values.tolist()) for name, values in start.items()}, names)
+    rich = replace(config, level="forced", coupled=joints, diagonal=not joints, features=names, order=4)
+    found, kept, rms = _short_fit(data.thinned(every), first, rich, every * base.max_step)
+    if not any("v" in name for name in kept) if joints else not kept:
         return config, base
     rich = replace(rich, features=kept)
     if rms > noisy * max(base.scale):
-        return replace(rich, order=2, objective="trajectory"), base
-    if rms > BETTER * float(fit.errors(x).square().mean().sqrt()):
-        return replace(rich, order=2), base  # and a correction network for the rest
-    return replace(rich, objective="residual" if config.objective == "auto" else config.objective), base
+        if not joints and rms > MISSED * 6**0.5 * roughness(data):
+            return config, base
+        return replace(rich, order=2, objective="trajectory"), found
+    if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * max(base.scale)):
+        return replace(rich, order=2), found  # and a correction network for the rest
+    return replace(rich, objective="residual" if config.objective == "auto" else config.objective), found
 
 
 def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit] | None:
     """The thinning whose one-step errors are least beside the motion's curvature, and the linear problem there."""
     best: tuple[float, int, LinearFit] | None = None
     for every in THINNED:
-        t = data.thinned(every).triples(every * base.max_step).spread_out(TRIPLES)
-        if len(t) * data.dof < ENOUGH * (len(names) + data.dof**2):
+        n = data.dof
+        most = min(TRIPLES, int(NUMBERS / (n * n * (len(names) + n * (n + 4)))))
+        t = data.thinned(every).triples(every * base.max_step).spread_out(most)
+        if len(t) * n < ENOUGH * (len(names) + n * n):
             break
         fit = LinearFit.of(data.angles, names, t)
-        x = fit.solve(torch.ones(len(fit.names), dtype=torch.bool))
+        x = fit.solve(_columns(fit, data.angles))
         moved = t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
             best = score, every, fit
     return None if best is None else best[1:]
+
+
+def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
+    """The columns that these coordinates may have, (F,) bool: joints all, others no mass or friction between them.
+
+    A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has masses
+    between all coordinates and no springs; of its diagonal masses one set alone will do.
+    """
+    if any(angles):
+        return torch.ones(len(fit.names), dtype=torch.bool)
+    i, j = pairs(len(angles), torch.device("cpu"))
+    diagonal = iter((i == j).tolist())
+    return torch.tensor([next(diagonal) if name == "mass" else name != COUPLING for name in fit.names])
+
+
+def _mass_turns(fit: LinearFit) -> bool:
+    """Whether the data show that the mass depends on the angles."""
+    constant = torch.tensor([name != KINETIC for name in fit.names])
+    poor, good = of_first(_held_out(fit, constant), _held_out(fit, torch.ones_like(constant)))
+    return simplest_not_beaten({0.0: poor, 1.0: good}) == 1.0
 
 
 def _held_out(fit: LinearFit, columns: Tensor) -> Tensor:
@@ -131,7 +172,8 @@ def _short_fit(
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    moving, still = problem.flat.index(KINETIC), problem.flat.index(POTENTIAL)[2 * n :]
+    still = problem.flat.index(POTENTIAL)[2 * n :]
+    moving = problem.flat.index(KINETIC) if KINETIC in problem.flat.names else still[:0]
     features = [name for name in config.features if "v" not in name] + [name for name in config.features if "v" in name]
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
     relative = A * problem.sigma**2 / r.square().mean()
@@ -144,12 +186,21 @@ def _short_fit(
     stay = set(kept.tolist())
     for name, where in ((KINETIC, moving), (POTENTIAL, still)):
         values[name] = tuple(float(x[i]) for i in where.tolist() if i in stay)
-    return _with(base, values), tuple(named[i] for i in kept.tolist()), float(r.square().mean().sqrt())
+    left = tuple(named[i] for i in kept.tolist())
+    return _with(base, values, left), left, float(r.square().mean().sqrt())
 
 
-def _with(base: Baseline, values: dict[str, tuple[float, ...]]) -> Baseline:
-    """The baseline with these starting values by parameter; its own three under their names."""
-    rest = {k: v for k, v in values.items() if v and k not in ("potential.stiffness", "potential.tilt", "damping.rate")}
+def _with(base: Baseline, values: dict[str, tuple[float, ...]], features: tuple[str, ...]) -> Baseline:
+    """The baseline with these starting values by parameter; its own three under their names.
+
+    Without features of the velocity the constant mass has its parameters at another place.
+    """
+    own = ("potential.stiffness", "potential.tilt", "damping.rate")
+    rest = {name: x for name, x in values.items() if x and name not in own}
+    if not any(base.angles):
+        rest = {name: x for name, x in rest.items() if name not in ("kinetic.base.off_diagonal", COUPLING)}
+    if not any("v" in name for name in features):
+        rest = {name.replace("kinetic.base.", "kinetic."): x for name, x in rest.items()}
     return replace(
         base, stiffness=values["potential.stiffness"], tilt=values["potential.tilt"],
         rate=values.get("damping.rate", (0.0,))[0], start=rest,

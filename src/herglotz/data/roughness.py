@@ -1,0 +1,35 @@
+"""What no smooth motion explains of recorded positions: an upper bound on their noise, without a model."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import torch
+
+if TYPE_CHECKING:
+    from herglotz.data.trajectories import Trajectories
+
+SAMPLES, DEGREE = 9, 5  # in a row, and of the polynomial through them
+MOST = 4000  # windows that are looked at
+
+
+def roughness(data: Trajectories) -> float:
+    """RMS residual of polynomials in time through nine samples in a row, in units of q; inf where there are fewer.
+
+    Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Steps may differ. Angles
+    should be `unwrapped()`.
+    """
+    firsts = [
+        torch.arange(first, first + length - SAMPLES + 1)
+        for first, length in zip(data.offsets, data.lengths, strict=True)
+        if length >= SAMPLES
+    ]
+    if not firsts:
+        return float("inf")
+    rows = torch.cat(firsts)
+    rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
+    t, q = data.t[rows].double().cpu(), data.q[rows].double().cpu()
+    x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
+    Q = torch.linalg.qr(torch.stack([x**k for k in range(DEGREE + 1)], -1)).Q
+    r = q - Q @ (Q.mT @ q)
+    return float((r.square().mean() * SAMPLES / (SAMPLES - DEGREE - 1)).sqrt())
