@@ -3,6 +3,7 @@
 import sys
 from dataclasses import replace
 from functools import cache
+from typing import Any
 
 import pytest
 import torch
@@ -126,7 +127,8 @@ def test_bodies_find_their_masses_and_springs(noise):
     model = build_model(base, config, "potential")
     assert config.diagonal
     assert "(q1 - q2)^2" in config.features
-    mass = getattr(model.kinetic, "base", model.kinetic).mass().detach()
+    kinetic: Any = getattr(model.kinetic, "base", model.kinetic)
+    mass = kinetic.mass().detach()
     assert float(mass[1, 1]) == pytest.approx(2.0, rel=1e-4 if not noise else 0.05)
     assert float(mass[0, 1]) == 0.0
     assert config.objective == ("residual" if not noise else "trajectory")
