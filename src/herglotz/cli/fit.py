@@ -82,7 +82,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--feature", action="append", default=[], metavar="TEXT",
         help="what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of K), "
-        "'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics); may be given again",
+        "'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics, revolute, lengths); may be "
+        "given again",
     )  # fmt: skip
     parser.add_argument(
         "--known", action="append", default=[], metavar="TEXT",
@@ -90,6 +91,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "pendulum's V: no velocity is in it. May be given again",
     )  # fmt: skip
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
+    parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument(
         "--order", type=int, choices=(2, 4), default=2,
@@ -118,7 +120,7 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        coupled=arguments.coupled, order=arguments.order, substeps=arguments.substeps,
+        diagonal=arguments.diagonal, coupled=arguments.coupled, order=arguments.order, substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)

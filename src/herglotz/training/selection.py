@@ -173,7 +173,7 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
     """The levels that are compared where none is named.
 
     All but the full one; the forced one alone where forces are told; where inputs are recorded and used, the forced one
-    and "auto", which adds dry friction to it; and "auto" where that is none of these: for joints
+    and "auto", which adds dry friction to it; and "auto" where that is none of these: for several coordinates
     (`herglotz.training.structure`).
     """
     if data.u is not None and config.use_inputs and not config.coulomb:

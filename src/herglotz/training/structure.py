@@ -41,6 +41,7 @@ THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shor
 ROWS = 50  # residuals a coefficient that the one-step fit takes
 MISSED = 2.0  # more than so many times the noise is force that the dictionary of lengths has not
 BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks,
+EXACT = 1e-8  # errors below this are rounding: relative to the size of the motion, as in `fit`
 EXPLAINED = 1e-7  # if the rule lacks anything: one-step error relative to the size of the motion
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
@@ -176,7 +177,7 @@ def _short_fit(
     moving = problem.flat.index(KINETIC) if KINETIC in problem.flat.names else still[:0]
     features = [name for name in config.features if "v" not in name] + [name for name in config.features if "v" in name]
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
-    relative = A * problem.sigma**2 / r.square().mean()
+    relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.cat([still, moving]), r.numel())
     values = {name: tuple(x[problem.flat.index(name)].tolist()) for name in problem.flat.names}
     own = values[POTENTIAL][: 2 * n]  # −k, b of each angle; k/2, b of the others

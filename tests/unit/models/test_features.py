@@ -140,6 +140,22 @@ def test_libraries_stand_for_lists_of_features():
                 parse(text, angles)
 
 
+def test_a_diagonal_mass_has_no_other_entries():
+    # fails if masses between coordinates are learned all the same, or the first is no longer 1
+    sizes: dict[str, Any] = {"scale": (1.0,) * 3, "speed": (1.0,) * 3, "stiffness": (1.0,) * 3, "tilt": (0.0,) * 3}
+    settings: dict[str, Any] = {"angles": (False,) * 3, "potential_width": 0, "diagonal": True, **sizes}
+    model: Any = ContactLagrangian(ModelConfig(**settings))
+    assert "kinetic.off_diagonal" not in dict(model.named_parameters())
+    with torch.no_grad():
+        model.kinetic.log_diagonal.copy_(torch.tensor([0.1, -0.2]))
+    expected = torch.tensor([1.0, math.exp(0.2), math.exp(-0.4)], dtype=torch.float64).diag()
+    torch.testing.assert_close(model.kinetic.mass().detach(), expected)
+    with pytest.raises(InputError, match="mass that depends on position is not diagonal"):
+        ModelConfig(**settings, mass_width=4)
+    with pytest.raises(InputError, match="leave features, known, alike, diagonal out"):
+        ModelConfig(**{**settings, "baseline": False, "correction_width": 4})
+
+
 def test_one_coefficient_for_a_whole_sum():
     # fails if the springs of a chain are learned one by one, or a known feature is learned
     angles = (False,) * 5
