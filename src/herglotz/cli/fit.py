@@ -151,6 +151,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     rows = [
         ("data", data.summary()),
         ("trained on", f"{kept} of {total} samples by the {m.get('objective')} objective, {m.get('level')} level"),
+        ("features", features_in_words(result.config.features)),
         ("extrapolation RMS", f"{_show(m.get('extrapolation_rms'), unit)}  free run over the unseen samples"),
         ("training RMS", _show(m.get("train_rms"), unit)),
         ("one-step RMS", _show(m.get("one_step_rms"), unit)),
@@ -164,6 +165,14 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
+
+
+def features_in_words(names: tuple[str, ...], most: int = 5) -> str:
+    """What the model is made of beside its terms, told or found; "None" without."""
+    if not names:
+        return "None"
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
 
 
 def _show(value: Any, unit: str) -> str:

@@ -94,6 +94,18 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
 
 
+def test_fit_says_what_it_found(tmp_path, capsys):
+    # fails if what the fit found with nothing told stays hidden, or --diagonal does not reach the model
+    csv, folder = tmp_path / "two.csv", tmp_path / "run"
+    made = ["simulate", "chain", "--param", "masses=2", "--trajectories", "4", "--steps", "24", "--h", "0.1"]
+    assert main([*made, "--out", str(csv)]) == 0
+    assert main(["fit", str(csv), "--out", str(folder), "--no-plots"]) == 0
+    assert "(q1 - q2)^2" in next(x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("features"))
+    told = ["--level", "forced", "--diagonal", "--feature", "(q1 - q2)^2", "--out", str(tmp_path / "told")]
+    assert main(["fit", str(csv), *told, "--no-plots", "--objective", "residual"]) == 0
+    assert "kinetic.off_diagonal" not in dict(load_run(tmp_path / "told").model.named_parameters())
+
+
 def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped, or resume fits again
     folder = tmp_path / "run"
     arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
