@@ -52,6 +52,16 @@ def hinged() -> Scene:
     return replace(free, name="hinges", flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
 
 
+def charged() -> Scene:
+    """Kepler's problem with drag in a magnetic field across the plane: q̈ = −q/|q|³ + 0.8 (q̇₂, −q̇₁) − 0.05 q̇."""
+
+    def slopes(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        turned = torch.stack([p[..., 1], -p[..., 0]], -1)
+        return p, 0.8 * turned - 0.05 * p - q * (q * q).sum(-1, keepdim=True) ** -1.5, torch.zeros_like(s)
+
+    return replace(scene("kepler"), name="charged", flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
+
+
 @dataclass(frozen=True)
 class Row:
     """One case: data, what the fit is told, and its target."""
@@ -84,6 +94,7 @@ ROWS = [
     Row("double pendulum, one rate, 20 × 50", lambda: scene("double_pendulum"), 0.02, 20, 49,
         told(level="linear", **LINKS), 50, False, 1e-4),
     Row("Kepler, drag, nothing told", lambda: scene("kepler"), 0.02, 20, 100, PLAIN, 200, True, 1e-4),
+    Row("charged particle, drag, nothing told", charged, 0.02, 20, 100, PLAIN, 200, True, 1e-4),
     Row("Kepler, drag", lambda: scene("kepler"), 0.02, 20, 100, CENTRAL, 200, True, 1e-4),
     Row("Kepler, drag, larger step", lambda: scene("kepler"), 0.05, 20, 100, CENTRAL, 200, True, 1e-4),
     Row("Kepler, drag, larger step, 4 model steps", lambda: scene("kepler"), 0.05, 5, 60,

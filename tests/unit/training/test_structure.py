@@ -13,6 +13,7 @@ from herglotz.errors import InputError
 from herglotz.models.features import lengths, parse, revolute
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
+from herglotz.systems.reference import reference_flow
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.build import build_model
@@ -156,6 +157,21 @@ def test_distances_need_one_unit_and_a_way_from_zero():
         assert len({str(parse(name, (False,) * n)) for name in names}) == len(names)
     assert len(lengths((False,) * 2)) == 3 + 4 + 2 + 5 + 1
     assert len(lengths((False,) * 10)) == 3 * 45 + 20
+
+
+def test_a_magnetic_field_is_found():
+    # fails if a force across the velocity is no candidate, or its coefficient or that of 1/r is misread
+    def slopes(q, p, s):
+        turned = torch.stack([p[..., 1], -p[..., 0]], -1)
+        return p, 0.8 * turned - 0.05 * p - q * (q * q).sum(-1, keepdim=True) ** -1.5, torch.zeros_like(s)
+
+    charged = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
+    data = simulate(charged, trajectories=8, steps=60, h=0.02, seed=0)
+    config, base = structured(data, estimate_baseline(data), FitConfig().resolved(data), NOISY)
+    assert config.features == ("r^-1", "q1 v2 - q2 v1")
+    assert base.start[KINETIC][0] == pytest.approx(0.4, rel=1e-4)  # of K: half the field
+    assert base.start["potential.features.sum.coefficient"][-1] == pytest.approx(-1.0, rel=1e-4)
+    assert base.start["friction.viscous"] == pytest.approx((0.05, 0.05), rel=1e-2)
 
 
 def test_a_planet_is_learned_with_nothing_told():
