@@ -24,7 +24,7 @@ from typing import Any
 import measured_coverage
 import torch
 from measured_free import AIR_TRACK, PENDULUM, disturbed, extrapolation, noise, one_trajectory, outliers
-from measured_windows import DFKI, DOUBLE, double_pendulum, driven_pendulum
+from measured_windows import DFKI, driven_pendulum
 
 from herglotz.data.files import write_atomically
 
@@ -50,7 +50,6 @@ ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] =
     "disturbed": ((), disturbed),
     "real_pendulum": ((PENDULUM,), extrapolation(PENDULUM)),
     "air_track": ((AIR_TRACK,), extrapolation(AIR_TRACK)),
-    "double_pendulum": (DOUBLE, double_pendulum),
     "driven_pendulum": (DFKI, driven_pendulum),
     "coverage_simulated": ((), measured_coverage.simulated),
     "coverage_real": ((measured_coverage.REAL,), measured_coverage.real),

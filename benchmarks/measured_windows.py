@@ -1,14 +1,11 @@
 """Windows of a measured run that the fit has not seen, each started from positions and velocities of the record.
 
-* double_pendulum: two of three runs train (first seconds, every 4th frame), the third tests: RMS of both angles after
-  0.1, 0.25 and 0.5 s over 120 windows.
 * driven_pendulum: two runs of the DFKI motor train, the third tests: free runs over 120 windows with the measured
   torque, from the same start states as the authors' identified model.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -16,11 +13,9 @@ from torch import Tensor
 
 from herglotz.data import Trajectories, load
 from herglotz.models import ContactLagrangian
-from herglotz.models.features import harmonics
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit
 
-DOUBLE = tuple(f"ibm_double_pendulum/{i}.csv" for i in (2, 3, 4))
 DFKI = tuple(
     f"dfki_pendulum/control_method_{name}__data_measured.csv"
     for name in ("energy_shaping", "pd__system_identification", "sac")
@@ -45,28 +40,6 @@ def momenta(model: ContactLagrangian, q: Tensor, v: Tensor, s: Tensor) -> Tensor
 
 def window_rows(data: Trajectories, steps: int, count: int = 120) -> Tensor:
     return torch.linspace(10, data.samples - steps - 11, count).round().long()
-
-
-def double_pendulum(seed: int, folder: Path) -> dict[str, float]:
-    runs = [load(folder / name).thinned(4) for name in DOUBLE]
-    test = runs.pop(seed % 3)
-    train = Trajectories.cat([replace(_first(run, 600), source=run.source) for run in runs])
-    config = FitConfig(train_fraction=1.0, seed=seed, features=tuple(harmonics(train.angles)), level="linear")
-    run = fit(train, config, progress=False)
-    rows = window_rows(test, 50)
-    q, v = starts(test, rows)
-    s = torch.zeros_like(q[:, 0])
-    with torch.no_grad():
-        out = run.stepper.rollout(q, momenta(run.model, q, v, s), s, h=test.typical_step, steps=50)
-    error = out.q - test.q[rows[:, None] + torch.arange(51)]
-    return {
-        **{f"rms_{t}s": float(error[:, round(100 * t)].square().mean().sqrt()) for t in (0.1, 0.25, 0.5)},
-        "train_rms": run.metrics["train_rms"],
-    }
-
-
-def _first(data: Trajectories, count: int) -> Trajectories:
-    return replace(data, t=data.t[:count], q=data.q[:count], lengths=(count,))
 
 
 def driven_pendulum(seed: int, folder: Path) -> dict[str, float]:

@@ -34,7 +34,7 @@ from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
 from herglotz.training.smoothing_fit import SMOOTHED, fit_smoothing
 from herglotz.training.stages import Stages
-from herglotz.training.structure import ROWS, kept_structure, nothing_told
+from herglotz.training.structure import ROWS, kept_structure, nothing_told, start_of_features
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.trajectory_fit import TrajectoryFit, check_size, fit_trajectories, make_prior
 
@@ -100,6 +100,8 @@ def fit(
     stages = Stages(progress, checkpoint, _key(data, told if free else config), resume)
     if free:
         config, base = kept_structure(kept, base, config, NOISY, stages)
+    elif config.features:
+        base = start_of_features(kept, base, config)
     fitted = _fit_training_part(kept, base, config, stages, FREEDOM if suspect else None)
     fitted = replace(fitted, states=with_dropped(fitted, train, dropped))
     if fitted.used is not None:

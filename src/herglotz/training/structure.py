@@ -19,7 +19,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import roughness
-from herglotz.models.features import lengths, revolute
+from herglotz.models.feature_potential import baseline_features
+from herglotz.models.features import expand, lengths, revolute
 from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.build import build_model
@@ -115,6 +116,28 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: flo
     if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * max(base.scale)):
         return replace(rich, order=2), found  # and a correction network for the rest
     return replace(rich, objective="residual" if config.objective == "auto" else config.objective), found
+
+
+def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:
+    """The baseline with starting values for the features that a user names, from one linear problem.
+
+    A search from a constant mass ends in another valley at some data sets. As it was where that problem is not the
+    model's: shared or known coefficients, a mass network, inputs, s in L, features that the baseline has too.
+    """
+    names = tuple(expand(config.features, data.angles))
+    other = config.known or config.alike or config.mass_width or config.coulomb or data.u is not None
+    own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
+    if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
+        return base
+    linear = _linear(data, base, names)
+    start = None if linear is None else linear[1].start(*of_first(linear[1].solve(_columns(linear[1], data.angles))))
+    if start is None:
+        return base
+    left_out = {COUPLING} if not config.coupled else set()
+    left_out |= {"friction.viscous"} if config.level != "forced" else set()
+    left_out |= {"kinetic.base.off_diagonal"} if config.diagonal else set()
+    values = {name: tuple(x.tolist()) for name, x in start.items() if name not in left_out}
+    return replace(_with(base, values, names), rate=base.rate)
 
 
 def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit] | None:

@@ -19,7 +19,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.build import build_model
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.pruning import prune
-from herglotz.training.structure import KINETIC, dictionary, nothing_told, structured
+from herglotz.training.structure import KINETIC, dictionary, nothing_told, start_of_features, structured
 
 NOISY = 3e-4
 
@@ -62,6 +62,23 @@ def test_one_linear_problem_finds_the_double_pendulum(gaps):
     assert float(start[KINETIC][moving.index("cos(1q1 - 1q2) v1 v2")]) == pytest.approx(0.5, abs=0.05)
     plain = found.solve(torch.tensor([name != KINETIC for name in found.names]))
     assert float(found.errors(x).norm()) < 1e-2 * float(found.errors(plain).norm())
+
+
+def test_features_that_are_named_start_where_the_data_say():
+    # fails if the search starts from a constant mass, values land at other parameters, or other models are touched
+    data = double_pendulum()
+    base = estimate_baseline(data)
+    for told in (FitConfig(features=("pendulums",), level="forced", coupled=True, order=4),
+                 FitConfig(features=("pendulums",), level="linear")):  # fmt: skip
+        found = start_of_features(data, base, told)
+        model = build_model(found, told, "potential")
+        kinetic: Any = model.kinetic
+        assert float(kinetic.sum.coefficient.detach()) == pytest.approx(0.5, abs=0.05)
+        assert float(kinetic.base.mass().detach()[1, 1]) == pytest.approx(0.5, abs=0.05)
+        assert found.rate == base.rate
+    for other in ({"known": ("cos(2q1)",)}, {"level": "affine"}, {"features": ("cos(q1)",)}, {"mass_width": 4}):
+        told = FitConfig(**{"features": ("pendulums",), "level": "linear", **other})
+        assert start_of_features(data, base, told) is base
 
 
 def test_the_data_decide():
