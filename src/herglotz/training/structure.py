@@ -126,6 +126,7 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     """
     names = tuple(expand(config.features, data.angles))
     other = config.known or config.alike or config.mass_width or config.coulomb or data.u is not None
+    other = other or config.objective == "raw"  # a network alone
     own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
         return base

@@ -76,7 +76,8 @@ def test_features_that_are_named_start_where_the_data_say():
         assert float(kinetic.sum.coefficient.detach()) == pytest.approx(0.5, abs=0.05)
         assert float(kinetic.base.mass().detach()[1, 1]) == pytest.approx(0.5, abs=0.05)
         assert found.rate == base.rate
-    for other in ({"known": ("cos(2q1)",)}, {"level": "affine"}, {"features": ("cos(q1)",)}, {"mass_width": 4}):
+    for other in ({"known": ("cos(2q1)",)}, {"level": "affine"}, {"features": ("cos(q1)",)}, {"mass_width": 4},
+                  {"objective": "raw"}):  # fmt: skip
         told = FitConfig(**{"features": ("pendulums",), "level": "linear", **other})
         assert start_of_features(data, base, told) is base
 
