@@ -192,6 +192,22 @@ def test_a_magnetic_field_is_found():
     assert base.start["friction.viscous"] == pytest.approx((0.05, 0.05), rel=1e-2)
 
 
+def test_a_dictionary_that_misses_is_not_taken_for_noise():
+    # fails if forces that no feature makes count as noise of the data: the networks are then left out of exact data
+    centres = torch.tensor([[0.0, 0.0], [0.9, 0.7], [-0.6, 0.8]], dtype=torch.float64)
+
+    def slopes(q, p, s):
+        d = q[..., None, :] - centres
+        pull = 4.0 * d * torch.exp(-6.0 * d.square().sum(-1, keepdim=True))
+        return p, -pull.sum(-2) - 0.5 * q - 0.05 * p, torch.zeros_like(s)
+
+    wells = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
+    data, told = simulate(wells, trajectories=6, steps=50, h=0.1, seed=0), FitConfig()
+    config, base = structured(data, estimate_baseline(data), told.resolved(data), NOISY)
+    assert not config.features
+    assert not base.start
+
+
 def test_a_planet_is_learned_with_nothing_told():
     # fails if the distance is not found: free runs then leave the orbit (the networks' end in NaN)
     data = simulate(scene("kepler"), trajectories=6, steps=60, h=0.02, seed=0)
