@@ -34,7 +34,7 @@ from herglotz.training.robust import FREEDOM
 from herglotz.training.run import Run, box_of
 from herglotz.training.smoothing_fit import SMOOTHED, fit_smoothing
 from herglotz.training.stages import Stages
-from herglotz.training.structure import ROWS, kept_structure, nothing_told, start_of_features
+from herglotz.training.structure import EXACT, ROWS, kept_structure, nothing_told, start_of_features
 from herglotz.training.supervision import SupervisedProblem
 from herglotz.training.trajectory_fit import TrajectoryFit, check_size, fit_trajectories, make_prior
 
@@ -42,7 +42,6 @@ PROBE = 40  # iterations of the flexible fit that measures the noise
 NOISY = 3e-4  # a one-step error above this fraction of the motion's size is noise, not the fit: 40 iterations reach it
 COVERED, HEAT = 4, 30  # restarts of a single layer, and the iterations after which the best of them goes on
 APART = 7919  # between the seeds of the restarts
-EXACT = 1e-8  # σ of exact data relative to the motion's size
 
 
 def fit(

@@ -42,7 +42,7 @@ THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shor
 ROWS = 50  # residuals a coefficient that the one-step fit takes
 MISSED = 2.0  # more than so many times the noise is force that the dictionary of lengths has not
 BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks,
-EXACT = 1e-8  # errors below this are rounding: relative to the size of the motion, as in `fit`
+EXACT = 1e-8  # σ of exact data relative to the motion's size: errors below are rounding
 EXPLAINED = 1e-7  # if the rule lacks anything: one-step error relative to the size of the motion
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
@@ -98,15 +98,14 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: flo
     linear = _linear(data, base, names)
     if linear is None:
         return config, base
-    every, fit = linear
-    (x,) = of_first(fit.solve(_columns(fit, data.angles)))
+    every, fit, x = linear
     start = fit.start(x)
     if start is None or (joints and not _mass_turns(fit)):
         return config, base
     first = _with(base, {name: tuple(values.tolist()) for name, values in start.items()}, names)
     rich = replace(config, level="forced", coupled=joints, diagonal=not joints, features=names, order=4)
     found, kept, rms = _short_fit(data.thinned(every), first, rich, every * base.max_step)
-    if not any("v" in name for name in kept) if joints else not kept:
+    if not (_moving(kept) if joints else kept):
         return config, base
     rich = replace(rich, features=kept)
     if rms > noisy * max(base.scale):
@@ -131,7 +130,7 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
         return base
     linear = _linear(data, base, names)
-    start = None if linear is None else linear[1].start(*of_first(linear[1].solve(_columns(linear[1], data.angles))))
+    start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
     left_out = {COUPLING} if not config.coupled else set()
@@ -141,9 +140,9 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     return replace(_with(base, values, names), rate=base.rate)
 
 
-def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit] | None:
-    """The thinning whose one-step errors are least beside the motion's curvature, and the linear problem there."""
-    best: tuple[float, int, LinearFit] | None = None
+def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit, Tensor] | None:
+    """The thinning whose one-step errors are least beside the motion's curvature, the linear problem, its solution."""
+    best: tuple[float, int, LinearFit, Tensor] | None = None
     for every in THINNED:
         n = data.dof
         most = min(TRIPLES, int(NUMBERS / (n * n * (len(names) + n * (n + 4)))))
@@ -151,12 +150,17 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
         if len(t) * n < ENOUGH * (len(names) + n * n):
             break
         fit = LinearFit.of(data.angles, names, t)
-        x = fit.solve(_columns(fit, data.angles))
+        (x,) = of_first(fit.solve(_columns(fit, data.angles)))
         moved = t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
-            best = score, every, fit
+            best = score, every, fit, x
     return None if best is None else best[1:]
+
+
+def _moving(features: Sequence[str]) -> list[str]:
+    """Those with velocities, which join the kinetic term."""
+    return [name for name in features if "v" in name]
 
 
 def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
@@ -199,7 +203,7 @@ def _short_fit(
     _, A, _ = problem.normal_equations(result.x)
     still = problem.flat.index(POTENTIAL)[2 * n :]
     moving = problem.flat.index(KINETIC) if KINETIC in problem.flat.names else still[:0]
-    features = [name for name in config.features if "v" not in name] + [name for name in config.features if "v" in name]
+    features = [name for name in config.features if "v" not in name] + _moving(config.features)
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.cat([still, moving]), r.numel())
@@ -224,7 +228,7 @@ def _with(base: Baseline, values: dict[str, tuple[float, ...]], features: tuple[
     rest = {name: x for name, x in values.items() if x and name not in own}
     if not any(base.angles):
         rest = {name: x for name, x in rest.items() if name not in ("kinetic.base.off_diagonal", COUPLING)}
-    if not any("v" in name for name in features):
+    if not _moving(features):
         rest = {name.replace("kinetic.base.", "kinetic."): x for name, x in rest.items()}
     return replace(
         base, stiffness=values["potential.stiffness"], tilt=values["potential.tilt"],
