@@ -3,10 +3,14 @@
 import pytest
 import torch
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.stepping import State, Stepper
+from herglotz.systems import scene
+from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,
     PointSource,
+    Propagated,
     RightHamiltonian,
     commutation_defect,
     generating_function,
@@ -14,14 +18,11 @@ from herglotz.mechanics import (
     jet,
     left_generating_function,
     left_hamilton_jacobi_residual,
-    partials,
     projected_flow,
     projected_step,
     right_equations,
     right_step,
 )
-from herglotz.stepping import Propagated, State, Stepper
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):

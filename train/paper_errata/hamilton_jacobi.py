@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.stepping import State, Stepper
+from herglotz.systems import scene
+from herglotz.theory import (
     LeftLagrangian,
     Quadratic,
     contact_vector_field,
@@ -13,13 +16,10 @@ from herglotz.mechanics import (
     hamilton_jacobi_residual,
     jet,
     left_hamilton_jacobi_residual,
-    partials,
     prolongation,
     riccati_step,
 )
-from herglotz.mechanics.continuous import derivatives, jacobian
-from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
+from herglotz.theory.continuous import derivatives, jacobian
 from paper_errata.erratum import (
     OSCILLATOR,
     Erratum,
