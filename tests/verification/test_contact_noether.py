@@ -7,8 +7,8 @@ import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.network import Network
+from herglotz.scenes import left, midpoint_heun, scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import left, midpoint_heun, scene
 from herglotz.theory import (
     EvolutionStepper,
     dissipation_defect,

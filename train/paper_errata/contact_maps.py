@@ -7,8 +7,8 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.mechanics import Partials, mixed_hessian, momentum_minus, partials
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.theory import (
     LeftHamiltonian,
     contact_product_point,

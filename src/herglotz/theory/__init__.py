@@ -7,6 +7,7 @@ from herglotz.theory.continuous import contact_vector_field, derivatives, evolut
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
 from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
 from herglotz.theory.evolution import EvolutionStepper
+from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
     GeneratingFunction,
@@ -54,7 +55,6 @@ from herglotz.theory.jacobi import (
     sharp,
     sharp_bivector,
 )
-from herglotz.theory.jets import Function, Jet, jet, prolongation
 from herglotz.theory.left import LeftLagrangian, left_momenta
 from herglotz.theory.legendre_dual import fiber_derivative, fiber_inverse, legendre_dual
 from herglotz.theory.legendrian import (
@@ -86,9 +86,9 @@ __all__ = [
     "Curve",
     "EvolutionStepper",
     "Function",
+    "FunctionGerm",
     "GeneratingFunction",
     "HopfLax",
-    "Jet",
     "LeftHamiltonian",
     "LeftLagrangian",
     "LegendrianDefect",
@@ -121,6 +121,7 @@ __all__ = [
     "fiber_inverse",
     "flat",
     "generating_function",
+    "germ",
     "hamilton_jacobi_residual",
     "hat",
     "herglotz_acceleration",
@@ -132,7 +133,6 @@ __all__ = [
     "invariance_defect",
     "inverse_cayley",
     "jacobi_bracket",
-    "jet",
     "joined_action",
     "left_equations",
     "left_generating_function",

@@ -12,8 +12,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from herglotz.theory.continuous import Hamiltonian, gradient
+from herglotz.theory.function_germ import Function, prolongation
 from herglotz.theory.jacobi import Field, join
-from herglotz.theory.jets import Function, prolongation
 
 
 def energy_on_section(H: Hamiltonian, F: Function, q: Tensor) -> tuple[Tensor, Tensor]:

@@ -20,8 +20,8 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import contact_form
 from herglotz.theory.continuous import jacobian
+from herglotz.theory.function_germ import Function
 from herglotz.theory.jacobi import Triple, join, sharp_bivector, split
-from herglotz.theory.jets import Function
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from herglotz.mechanics import (
     step_derivative,
 )
 from herglotz.mechanics.contact import flow_derivative
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.theory import contact_vector_field, right_hamiltonian
 
 

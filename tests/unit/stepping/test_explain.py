@@ -7,9 +7,9 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import regularity
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, StepError, Stepper, explain_step
 from herglotz.stepping.explain import longest_step
-from herglotz.systems import scene
 from herglotz.theory import LeftHamiltonian, RightHamiltonian
 from herglotz.verify import verify
 

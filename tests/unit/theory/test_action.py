@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.theory import curve_action, herglotz_action
 
 

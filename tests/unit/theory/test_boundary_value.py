@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import Status, StepError, Stepper
 from herglotz.stepping.block_tridiagonal import multiply, solve_blocks
-from herglotz.systems import scene
 from herglotz.theory import boundary_value, herglotz_action, initial_value
 
 

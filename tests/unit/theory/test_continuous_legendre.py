@@ -7,7 +7,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_form, flow_derivative
-from herglotz.systems import reference_flow, scene
+from herglotz.scenes import reference_flow, scene
 from herglotz.theory import (
     contact_vector_field,
     derivatives,

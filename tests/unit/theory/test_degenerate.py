@@ -7,8 +7,8 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import momentum_jacobian, partials
+from herglotz.scenes import damped_oscillator, midpoint_heun, reference_flow, strang
 from herglotz.stepping import State, Status, StepError, Stepper
-from herglotz.systems import damped_oscillator, midpoint_heun, reference_flow, strang
 from herglotz.theory import (
     ConstrainedStepper,
     LegendrianStepper,

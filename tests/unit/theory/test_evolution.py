@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import reference_flow, scene
 from herglotz.stepping import State, Status, StepError
-from herglotz.systems import reference_flow, scene
 from herglotz.theory import (
     EvolutionStepper,
     commutation_defect,

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.theory import (
     commutation_defect,
     contact_vector_field,

@@ -7,8 +7,8 @@ import torch
 
 from herglotz.mechanics import autograd_partials, partials
 from herglotz.mechanics.regularity import left_hessian
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,

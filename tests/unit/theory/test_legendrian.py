@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.theory import (
     contact_complement,
     contact_product_point,

@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import reference_flow
 from herglotz.stepping import Status, StepError
-from herglotz.systems import reference_flow
 from herglotz.theory import BodyState, RigidBodyStepper
 from herglotz.theory.rotations import exp_so3, hat
 
