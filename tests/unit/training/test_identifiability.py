@@ -58,11 +58,15 @@ def test_two_names_for_one_force():
 
 def test_equal_directions_are_told_apart_whatever_basis_rounding_chose():
     # fails if the basis of a null space depends on rounding, or two directions that share no parameter are mixed
-    first, second = torch.tensor([[3.0, 0, -4, 0, 0], [0, 1, 0, 2, -2]], dtype=torch.float64) / torch.tensor([[5.0], [3]])
+    first, second = torch.tensor([[3.0, 0, -4, 0, 0], [0, 1, 0, 2, -2]], dtype=torch.float64) / torch.tensor(
+        [[5.0], [3]]
+    )
     for angle in torch.linspace(0.0, 3.0, 25, dtype=torch.float64):
-        turned = torch.stack([angle.cos() * first + angle.sin() * second, angle.cos() * second - angle.sin() * first], 1)
+        turned = torch.stack(
+            [angle.cos() * first + angle.sin() * second, angle.cos() * second - angle.sin() * first], 1
+        )
         basis = sparse_basis(turned + 1e-14 * torch.randn(5, 2, generator=torch.Generator().manual_seed(0)).double())
-        found = sorted(((v * v.sum().sign()).tolist() for v in basis.T))
+        found = sorted((v * v.sum().sign()).tolist() for v in basis.T)
         expected = sorted((v * v.sum().sign()).tolist() for v in (first, second))
         torch.testing.assert_close(torch.tensor(found), torch.tensor(expected), rtol=0, atol=1e-12)
 
