@@ -9,8 +9,8 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, Prior, SmoothingProblem, fit
 from herglotz.training.cross_validation import left_out_errors
 from herglotz.training.grid import segment_grid
