@@ -72,7 +72,7 @@ MUTANTS = [
     ("theory/hamilton_jacobi.py", "return join(q1, p1, s1) - join(*prolongation(S1, q1))", "return join(q1, p1, s1) - join(*prolongation(S1, q))", f"{V}/test_discrete_hamilton_jacobi.py"),
     ("mechanics/regularity.py", "torch.minimum(*beside) / size", "size / torch.minimum(*beside)", f"{K}/test_explain.py"),
     ("theory/rotations.py", "0.5 * _sinc(0.25 * x) ** 2", "0.5 * _sinc(x) ** 2", f"{T}/test_rotations.py"),
-    # systems
+    # scenes
     ("scenes/exact.py", "- (D23 * Y_s).sum(-1)", "", f"{S}/test_exact.py"),
     ("scenes/exact.py", "inverse - p0[..., :, None]", "inverse + p0[..., :, None]", f"{S}/test_exact.py"),
     ("scenes/exact.py", ".real > 0).all(-1)", ".real.prod(-1) > 0)", f"{S}/test_exact.py::test_beyond_a_conjugate_point_is_nan_with_a_reason"),

@@ -74,7 +74,7 @@ class NumericallyExact:
     right half-plane), so a step of many periods is not safe. L_d can be differentiated twice and its first partials
     once; a further derivative raises, and so does one with respect to h.
 
-    Source: section 1 of `mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
+    Source: section 1 of `docs/mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
     """
 
     motion: Motion

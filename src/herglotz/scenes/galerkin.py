@@ -41,7 +41,7 @@ class GalerkinLobatto:
     result is NaN. At a stationary point the first derivatives are those of the action with the inside held fixed, and
     the second ones its Schur complement. Results can be differentiated once more.
 
-    Source: trap 1 of `mathematics.md`.
+    Source: trap 1 of `docs/mathematics.md`.
     """
 
     L: Lagrangian

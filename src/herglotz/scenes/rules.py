@@ -1,7 +1,7 @@
 """Quadrature rules: a continuous Lagrangian L(q, v, s) becomes a discrete one, L_d(q0, q1, s0, h).
 
 With v = (q1 − q0)/h and q̄ = (q0 + q1)/2. Once there is damping the order depends on *where s is taken* (trap 1 of
-`mathematics.md`); ORDERS says what each rule reaches, and a test measures it.
+`docs/mathematics.md`); ORDERS says what each rule reaches, and a test measures it.
 """
 
 from __future__ import annotations

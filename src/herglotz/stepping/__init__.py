@@ -3,6 +3,7 @@
 from herglotz.stepping.composition import Composition, adjoint_pair, kahan_li, suzuki, yoshida
 from herglotz.stepping.events import Event
 from herglotz.stepping.explain import explain_step
+from herglotz.stepping.linearise import Linearised
 from herglotz.stepping.newton import Solution, Status, solve, solve_step
 from herglotz.stepping.stepper import Crossings, Rollout, State, Step, StepError, Stepper, step_sizes
 
@@ -10,6 +11,7 @@ __all__ = [
     "Composition",
     "Crossings",
     "Event",
+    "Linearised",
     "Rollout",
     "Solution",
     "State",

@@ -87,8 +87,8 @@ def projected_step(
 def commutation_defect(flow: Flow, S0: Function, S1: Function, q: Tensor) -> Tensor:
     """Φ̃(γ^k(q)) − γ^{k+1}(Φ̃^γ(q)), shape (..., 2n+1), for any map Φ̃ of T*Q × R; its first n components are zero.
 
-    For the flow of an L_d it is zero on an open set of q exactly if S solves the discrete Hamilton–Jacobi equation
-    there.
+    For the flow of an L_d, S solves the right and the left discrete Hamilton–Jacobi equation on an open set of q
+    exactly where this defect is zero; the right equation alone does not suffice (erratum E10).
 
     Source: Theorem 3 of the paper; γ^{k+1} has dS^{k+1} (erratum E8).
     """
@@ -113,7 +113,7 @@ def riccati_step(P: Partials, S: Quadratic) -> Quadratic:
     Quadratic
         Not finite at a caustic, where A + cα is singular.
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
     c = P.c
     pivot = P.D11 + c[..., None, None] * S.alpha
