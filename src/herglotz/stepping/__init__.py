@@ -1,10 +1,12 @@
 """Time steppers: batched Newton, steps, rollouts."""
 
+from herglotz.mechanics.newton import solve
 from herglotz.stepping.composition import Composition, adjoint_pair, kahan_li, suzuki, yoshida
 from herglotz.stepping.events import Event
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised
-from herglotz.stepping.newton import Solution, Status, solve, solve_step
+from herglotz.stepping.newton import Solution, solve_step
+from herglotz.stepping.state import Status
 from herglotz.stepping.stepper import Crossings, Rollout, State, Step, StepError, Stepper, step_sizes
 
 __all__ = [

@@ -15,8 +15,17 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.stepping.engine import Engine
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import Rollout, State, Step, StepError, check_h, check_state, step_sizes, throw_failure
+from herglotz.stepping.state import (
+    Rollout,
+    State,
+    Status,
+    Step,
+    StepError,
+    check_h,
+    check_state,
+    step_sizes,
+    throw_failure,
+)
 
 
 @runtime_checkable

@@ -14,12 +14,13 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
+from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
 from herglotz.stepping.equation import End, Equation, ModelEquation, PartialsEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
-from herglotz.stepping.newton import Found, Increments, Status, find_root, solve, status_of
-from herglotz.stepping.state import State, Step
+from herglotz.stepping.newton import Increments, find_root, status_of
+from herglotz.stepping.state import State, Status, Step
 
 
 class Engine:
@@ -147,7 +148,7 @@ def _attach(
     """Give the solved x its derivative: one Newton step, which is zero in value and dx = −J⁻¹ dF in slope."""
     q0, p0, s0 = state
     F = momentum_residual(_evaluate(L_d, q0, x, s0, h, increments), p0)
-    x = x - solve(J, F - F.detach())
+    x = attached(x, J, F)
     P = _evaluate(L_d, q0, x, s0, h, increments)
     return x, End(momentum_plus(P), P.L, P.c)
 
@@ -174,9 +175,5 @@ def _compensated(state: State, change: State, low: State | None) -> tuple[State,
 
 
 def _report(new: State, c: Tensor, status: Tensor, residual: Tensor, iterations: int, good: bool) -> Step:
-    """The step, NaN in the samples that failed; `good`: none did."""
-    if not good:
-        failed = status != Status.CONVERGED
-        nan = torch.where(failed, torch.nan, torch.zeros_like(new.s))
-        new, c = State(new.q + nan[..., None], new.p + nan[..., None], new.s + nan), c + nan
-    return Step(new, c, status, residual, iterations)
+    """The step; `good`: no sample failed."""
+    return (Step if good else Step.of)(new, c, status, residual, iterations)

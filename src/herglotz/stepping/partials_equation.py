@@ -15,14 +15,7 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-
-
-class Point(NamedTuple):
-    """The step equation at one trial."""
-
-    F: Tensor  # (..., n)
-    J: Tensor | None  # (..., n, n) ∂F/∂q1, where it was asked for
-    rest: Any  # what `end` and `push` go on with
+from herglotz.mechanics.newton import Point
 
 
 class End(NamedTuple):

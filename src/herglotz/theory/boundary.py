@@ -15,10 +15,9 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
-from herglotz.mechanics.root import find_root
+from herglotz.mechanics.newton import find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import Rollout, State, Step, StepError, step_sizes
+from herglotz.stepping.state import Rollout, State, Status, Step, StepError, step_sizes
 from herglotz.stepping.stepper import Stepper
 from herglotz.theory.action import curve_action, curve_partials
 from herglotz.theory.caustics import Opening, opening

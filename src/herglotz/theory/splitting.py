@@ -13,8 +13,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.stepping.composition import Composition
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import Rollout, State, Step
+from herglotz.stepping.state import Rollout, State, Status, Step
 from herglotz.theory.continuous import gradient
 
 Scalar = Callable[[Tensor], Tensor]  # (..., n) → (...)
@@ -79,9 +78,7 @@ class ContactSplitting:
         p = c1[..., None] * (p + half[..., None] * self.force(q1))
         finite = torch.isfinite(q1).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s)
         status = torch.where(finite, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
-        nan = torch.where(finite, 0.0, torch.nan).to(s)
-        new = State(q1 + nan[..., None], p + nan[..., None], s + nan)
-        return Step(new, c0 * c1 + nan, status, torch.zeros_like(s), 0)
+        return Step.of(State(q1, p, s), c0 * c1, status, torch.zeros_like(s), 0)
 
     def step(self, state: State, h: Tensor | float) -> Step:
         """One step of h > 0, scalar or (...)."""
