@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
@@ -79,13 +80,33 @@ def herglotz_residual(
 
 
 def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
-    """F = D1 + c p0 (+ F⁻), the equation that a step solves for q1; shape (..., n)."""
+    """F = D1 + c p0 (+ F⁻), the equation that a step solves for q1; shape (..., n).
+
+    Where dry friction holds a coordinate, F⁻ is a set, and F is the distance from it: 0 where friction suffices.
+    """
+    F = unheld_residual(P, p0)
+    held = None if P.force is None else P.force.held
+    return F if held is None else F - F.clamp(-held, held)
+
+
+def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
+    """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3 (+ ∂F⁻/∂q1), shape (..., n, n). Equal to M where F = 0. Needs order 2.
+
+    A coordinate that dry friction holds keeps to Δ = q1 − q0 = 0; its row is that equation's, times J's diagonal.
+    """
+    J = unheld_jacobian(P, p0)
+    held = None if P.force is None else P.force.held
+    return J if held is None else torch.where((held > 0)[..., None], torch.diag_embed(J.diagonal(0, -2, -1)), J)
+
+
+def unheld_residual(P: Partials, p0: Tensor) -> Tensor:
+    """F with no impulse of what dry friction holds; shape (..., n)."""
     F = P.D1 + P.c[..., None] * p0
     return F if P.force is None else F + P.force.minus
 
 
-def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:
-    """J = ∂F/∂q1 = D1D2 + p0 ⊗ D2D3 (+ ∂F⁻/∂q1), shape (..., n, n). Equal to M where F = 0. Needs order 2."""
+def unheld_jacobian(P: Partials, p0: Tensor) -> Tensor:
+    """∂F/∂q1 of the same, (..., n, n)."""
     J = P.D12 + p0[..., :, None] * P.D23[..., None, :]
     return J if P.force is None else J + P.force.minus_2
 

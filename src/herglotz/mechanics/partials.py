@@ -69,6 +69,9 @@ class Forces:
     plus_1: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q0
     plus_2: Tensor = ABSENT  # (..., n, n) ∂F⁺/∂q1
     plus_3: Tensor = ABSENT  # (..., n) ∂F⁺/∂s0
+    # (..., n) the impulse that dry friction can hold where a coordinate stands still (q1 = q0), 0 where it slides:
+    # F⁻ then is any value between minus − held and minus + held. None: no friction is set-valued.
+    held: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,11 @@ def step_derivative(
     if P.force is not None:
         F_q0, F_s0 = F_q0 + P.force.minus_1, F_s0 + P.force.minus_3[..., None]
         p1_q0, p1_q1, p1_s0 = p1_q0 + P.force.plus_1, p1_q1 + P.force.plus_2, p1_s0 + P.force.plus_3[..., None]
-    dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, p0), torch.cat([F_q0, F_p0, F_s0], -1))[0]
+    J = momentum_jacobian(P, p0)
+    if P.force is not None and P.force.held is not None:  # Δ = q1 − q0 = 0 in place of F = 0
+        rows = (P.force.held > 0)[..., None]
+        F_q0, F_p0, F_s0 = torch.where(rows, -J, F_q0), torch.where(rows, 0.0, F_p0), torch.where(rows, 0.0, F_s0)
+    dq1 = -torch.linalg.solve_ex(J, torch.cat([F_q0, F_p0, F_s0], -1))[0]
     zero = torch.zeros_like(F_p0)
     dp1 = p1_q1 @ dq1 + torch.cat([p1_q0, zero, p1_s0], -1)
     ds1 = (P.D2[..., None, :] @ dq1)[..., 0, :] + torch.cat([P.D1, zero[..., 0], P.c[..., None]], -1)

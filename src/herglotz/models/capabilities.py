@@ -22,6 +22,7 @@ class Capabilities:
     position_features: bool  # named features in the potential
     friction: bool  # forces F⁻, F⁺ of friction and inputs
     dry_friction: bool
+    sticking: bool  # dry friction is set-valued
     coupling: bool  # friction between joints
     inputs: int  # m
 
@@ -39,7 +40,7 @@ class Capabilities:
     def by_terms(self) -> bool:
         """Whether the step equation is known term by term (`herglotz.stepping.equation`); else jets evaluate it."""
         whole = self.baseline and self.constant_mass and self.known_damping and self.order == 2
-        return whole and not (self.action_flow or self.coupling)
+        return whole and not (self.action_flow or self.coupling or self.sticking)
 
     @property
     def explicit(self) -> bool:

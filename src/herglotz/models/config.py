@@ -20,9 +20,9 @@ class ModelConfig:
     `scale` and `speed` are typical sizes of q and v (data units); `stiffness`, `tilt` and `rate` start the
     baseline.
     A width of 0 leaves that network out; `mass_width` > 0 makes the mass depend on position, `action_width` counts the
-    units of the full level, `coulomb` adds dry friction to the forced level's viscous one, and its `inputs` act through
-    a learned matrix or through `input_map` (n · m numbers, row by row), measured from 0 or, with `input_zero`, from a
-    learned zero of each.
+    units of the full level, `coulomb` adds dry friction to the forced level's viscous one, set-valued with `sticking`
+    (a joint can stand still), and its `inputs` act through a learned matrix or through `input_map` (n · m numbers, row
+    by row), measured from 0 or, with `input_zero`, from a learned zero of each.
     `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
     coordinates have one mass, and their potential is made of features alone; `diagonal`: each coordinate has a mass of
     its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds. `order` 4 adds
@@ -50,6 +50,7 @@ class ModelConfig:
     mass_depth: int = 1
     action_width: int = 4
     coulomb: bool = False
+    sticking: bool = False
     inputs: int = 0
     input_map: tuple[float, ...] = ()
     input_zero: bool = False
@@ -77,6 +78,8 @@ class ModelConfig:
             raise InputError(f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'")
         if self.level != "forced" and (self.coulomb or self.inputs or self.input_map):
             raise InputError(f"coulomb and inputs are forces; set level='forced', not '{self.level}'")
+        if self.sticking and not self.coulomb:
+            raise InputError("sticking is of dry friction; set coulomb=True")
         if self.level != "forced" and self.coupled:
             raise InputError(f"coupled is friction between joints; set level='forced', not '{self.level}'")
         if self.order not in (2, 4):

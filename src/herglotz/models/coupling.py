@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor, nn
 
@@ -36,12 +38,12 @@ class CoupledFriction(nn.Module):
         f = -v @ b
         minus, plus = own.minus + (c * h / 2)[..., None] * f, own.plus + (h / 2)[..., None] * f
         if own.minus_2 is None:
-            return Forces(minus, plus)
+            return replace(own, minus=minus, plus=plus)
         assert own.minus_1 is not None
         assert own.plus_1 is not None
         assert own.plus_2 is not None
         before, after = (c / 2)[..., None, None] * b, b / 2
-        return Forces(
-            minus, plus, own.minus_1 + before, own.minus_2 - before, own.minus_3,
-            own.plus_1 + after, own.plus_2 - after, own.plus_3,
+        return replace(
+            own, minus=minus, plus=plus, minus_1=own.minus_1 + before, minus_2=own.minus_2 - before,
+            plus_1=own.plus_1 + after, plus_2=own.plus_2 - after,
         )  # fmt: skip

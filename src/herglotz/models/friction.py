@@ -22,6 +22,9 @@ class Friction(nn.Module):
     is found, not forced. Only the widths v_s and v_st, which cannot be 0, are logarithms (above a
     floor). f is taken at the velocity of
     the step in both forces, so the step stays order 2, and linear in q1 where friction is viscous alone.
+    With `sticking` dry friction is set-valued, −(τ + ε e^{−(v/v_st)²}) Sgn(v) in place of the tanh, and the whole of it
+    is in F⁻ = c (h/2) f + c h f_dry (Moreau's implicit time-stepping): a joint stands still, Δ = 0 exactly, while
+    |F⁻| ≤ c h (τ + ε) suffices to hold it, and friction's work f_dry Δ is never positive.
     The map G is learned from 0, or given; u₀ is 0, or learned: the zero of the sensors that recorded u.
     """
 
@@ -29,13 +32,14 @@ class Friction(nn.Module):
         super().__init__()
         n, m = config.dof, config.inputs
         zeros = lambda *shape: torch.zeros(*shape, dtype=torch.float64)  # noqa: E731
-        self.inputs, self.dry = m, config.coulomb
+        self.inputs, self.dry, self.sticking = m, config.coulomb, config.sticking
         self.viscous = nn.Parameter(zeros(n))
         if self.dry:
             speed = torch.tensor(config.speed, dtype=torch.float64)
             self.register_buffer("sharpest", SHARPEST * speed, persistent=False)
             self.coulomb, self.breakaway = nn.Parameter(zeros(n)), nn.Parameter(zeros(n))
-            self.log_smooth = nn.Parameter((SMOOTH * speed).log())
+            if not self.sticking:
+                self.log_smooth = nn.Parameter((SMOOTH * speed).log())
             self.log_stribeck = nn.Parameter((STRIBECK * speed).log())
         self.sharpest: Tensor
         self.input_map: Tensor
@@ -44,6 +48,15 @@ class Friction(nn.Module):
         elif m:
             self.input_map = nn.Parameter(zeros(n, m))
         self.input_zero = nn.Parameter(zeros(m)) if config.input_zero else None
+
+    def grip(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Set-valued friction's |f| = τ⁺ + ε⁺ e^{−(v/v_st)²} at the velocity v, and its slope, (..., n) each.
+
+        The positive parts τ⁺ and ε⁺ of τ and ε: friction that pushes would create energy.
+        """
+        x = v / (self.sharpest + self.log_stribeck.exp())
+        bump = self.breakaway.relu() * (-(x * x)).exp()
+        return self.coulomb.relu() + bump, -2 * bump * x / (self.sharpest + self.log_stribeck.exp())
 
     @property
     def widths(self) -> tuple[Tensor, Tensor]:
@@ -59,7 +72,7 @@ class Friction(nn.Module):
         """f, (..., n), with ∂f_i/∂v_i as its only tangent; u None: no input acts."""
         x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
         f = x * -self.viscous
-        if self.dry:
+        if self.dry and not self.sticking:
             smooth, stribeck = self.widths
             slow = x * (1 / stribeck)
             f = f - ((-(slow * slow)).exp() * self.breakaway + self.coulomb) * (x * (1 / smooth)).tanh()
@@ -82,12 +95,19 @@ class Friction(nn.Module):
         f = self.force(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
         minus, plus = before * f.value, after * f.value
+        held, grip_slope = None, torch.zeros_like(v)
+        if self.dry and self.sticking:
+            grip, grip_slope = self.grip(v)
+            whole = (c * h)[..., None]
+            minus, held = minus - whole * grip * v.sign(), torch.where(v == 0, whole * grip, 0.0)
+            grip_slope = grip_slope * v.sign()
         if order == 1:
-            return Forces(minus, plus)
+            return Forces(minus, plus, held=held)
         slope = f.gradient[0]  # ∂f/∂q1 = slope / h
-        minus_2, plus_2 = torch.diag_embed((c / 2)[..., None] * slope), torch.diag_embed(slope / 2)
+        minus_2 = torch.diag_embed((c / 2)[..., None] * slope - c[..., None] * grip_slope)
+        plus_2 = torch.diag_embed(slope / 2)
         zero = torch.zeros_like(minus)
-        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero)
+        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero, held)
 
     def applied(self, u: Tensor) -> Tensor:
         """G (u − u₀), (..., n)."""

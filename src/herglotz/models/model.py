@@ -125,6 +125,7 @@ class ContactLagrangian(nn.Module):
             position_features=self.potential.features is not None,
             friction=self.friction is not None,
             dry_friction=self.friction is not None and not self.friction.linear,
+            sticking=self.friction is not None and self.friction.sticking,
             coupling=self.coupling is not None,
             inputs=self.inputs,
         )
@@ -268,6 +269,11 @@ class DrivenLagrangian:
 
     model: ContactLagrangian
     u: Tensor  # (..., m)
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """The model's."""
+        return self.model.capabilities
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """L_d, shape (...)."""

@@ -147,7 +147,10 @@ def _attach(
 ) -> tuple[Tensor, End]:
     """Give the solved x its derivative: one Newton step, which is zero in value and dx = −J⁻¹ dF in slope."""
     q0, p0, s0 = state
-    F = momentum_residual(_evaluate(L_d, q0, x, s0, h, increments), p0)
+    P = _evaluate(L_d, q0, x, s0, h, increments)
+    F = momentum_residual(P, p0)
+    if P.force is not None and P.force.held is not None and not increments:  # what is held has q1 = q0
+        F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
     x = attached(x, J, F)
     P = _evaluate(L_d, q0, x, s0, h, increments)
     return x, End(momentum_plus(P), P.L, P.c)

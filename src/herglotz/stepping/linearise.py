@@ -76,8 +76,10 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
             form = PartialsEquation(driven_by(L_d, u), q, p, s, h, 1, increments)
             x = delta if increments else q + delta
         point = form(x, False)
-        end = form.end(x, point)
-        return point.F, end.p1, end.L
+        end, F = form.end(x, point), point.F
+        if isinstance(form, PartialsEquation) and point.rest.force is not None and point.rest.force.held is not None:
+            F = torch.where(point.rest.force.held > 0, delta, F)  # what dry friction holds has Δ = 0
+        return F, end.p1, end.L
 
     return functions
 

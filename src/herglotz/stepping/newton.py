@@ -14,6 +14,7 @@ from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solv
 from herglotz.mechanics.newton_one import newton_one, newton_step, norm
 from herglotz.stepping.partials_equation import End, Equation, PartialsEquation
 from herglotz.stepping.state import Status
+from herglotz.stepping.stick_slip import stick_slip
 
 ROUNDING = 1e3  # machine epsilons of the size: below that a move is rounding
 
@@ -79,6 +80,12 @@ def find_root(
     equation: Equation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
 ) -> Found:
     """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
+    sticky = stick_slip(equation)
+    if sticky is not None:
+        rules, z = Rules(tol, max_iterations), sticky.start()
+        found = newton(sticky, z, rules, _Sizes(sticky, q0, increments).tensors)
+        x = sticky.unknown(found.x)
+        return found._replace(x=x, point=equation(x, order == 2), mixed=False)
     x = guess - q0 if increments else guess
     rules = Rules(tol, max_iterations, keep=order == 1)
     sizes = _Sizes(equation, q0, increments)

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from herglotz.mechanics import Partials
-from herglotz.models import ContactLagrangian
+from herglotz.models import Capabilities, ContactLagrangian
 
 
 class FlatModel:
@@ -58,6 +58,11 @@ class FixedModel:
 
     def __init__(self, flat: FlatModel, theta: Tensor, u: Tensor | None = None):
         self.flat, self.theta, self.u = flat, theta, u
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """The model's."""
+        return self.flat.model.capabilities
 
     def at(self, u: Tensor) -> FixedModel:
         """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
