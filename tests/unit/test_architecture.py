@@ -53,6 +53,7 @@ def test_only_the_door_differentiates_lagrangians():
         "mechanics/partials.py",  # the door
         "mechanics/contact.py",  # the derivative of a flow
         "mechanics/continuous.py",  # a continuous Hamiltonian
+        "stepping/linearise.py",  # the derivative of a step
         "training/residual.py",  # with respect to parameters
         "training/matrix_free.py",  # the same
         "training/supervision.py",  # the same
