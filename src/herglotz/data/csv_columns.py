@@ -48,7 +48,8 @@ def assign(
         If a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named column is absent.
     """
     names, units = _parse(cells, where)
-    key = {name: name.casefold() if len(name) > 1 else name for name in names}  # "Time" means time, but a single "V" may be a volume
+    # "Time" means time, but a single "V" may be a volume.
+    key = {name: name.casefold() if len(name) > 1 else name for name in names}
     for asked in (() if time is None else (time,)) + tuple(coordinates or ()):
         if asked not in names:
             raise InputError(f"{where}: there is no column {quote(asked)}; the columns are {', '.join(names)}")

@@ -24,8 +24,8 @@ def spikes(data: Trajectories) -> Tensor:
 
     A sample (or a run of two or three) is compared with the cubic in time through its eight neighbours (deleted
     residuals, Cook & Weisberg 1982). A spike exceeds the misfit of its neighbours, so that fast smooth motion is kept,
-    and the noise. The worst spikes are removed and the rest is judged anew, until none is left. Spikes within four samples of
-    one another may hide each other; a robust loss serves those. Angles should be `unwrapped()`.
+    and the noise. The worst spikes are removed and the rest is judged anew, until none is left. Spikes within four
+    samples of one another may hide each other; a robust loss serves those. Angles should be `unwrapped()`.
     """
     found = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, length in zip(data.offsets, data.lengths, strict=True):
