@@ -51,7 +51,7 @@ class FlowProblem:
         self.prior = Prior(model, low, high, departure=None)
 
     def start(self) -> Tensor:
-        """The parameters (P,)."""
+        """Return the parameters, (P,)."""
         return self.flat.get()
 
     def residuals(self, theta: Tensor) -> Tensor:
