@@ -44,7 +44,7 @@ class Regularity:
         return getattr(self, name) < bound  # NaN, undefined because of another failure, is not this failure
 
     def report(self) -> list[str]:
-        """Return one line for every failed condition of every sample: `sample (3,), h = 5: c = 0: FL⁻ is not defined`."""
+        """Return a line for every failed condition of a sample: `sample (3,), h = 5: c = 0: FL⁻ is not defined`."""
         lines = []
         for name, statement in CONDITIONS.items():
             for index in self.lost(name).nonzero().tolist():
