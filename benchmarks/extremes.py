@@ -30,8 +30,8 @@ from herglotz.export import export_c
 from herglotz.export.c_wrapper import FLAGS, compiler
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.plots.style import new_figure
+from herglotz.scenes import Scene, scene
 from herglotz.stepping import Rollout, State, Stepper
-from herglotz.systems import Scene, scene
 
 Row = dict[str, Any]
 DOUBLE = torch.float64

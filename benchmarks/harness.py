@@ -28,8 +28,8 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DATA = ROOT.parent / "shared" / "data"  # measured recordings; data/README.md says where to get them
 DIGITS = 6  # significant ones of a stored number: more than any table shows
-PACKED = 30  # dictionaries in a list from which on the list is stored as a table
-COLOURS, DPI = 64, 110  # of pictures: enough for lines and text, a third of the size
+PACKED, ABSENT = 30, "-"  # dictionaries from which on they are stored as a table; what a row has not
+COLOURS, DPI = 32, 100  # of pictures: enough for lines and text, a third of the size
 
 
 def parser(text: str | None, *, quick: bool = False) -> argparse.ArgumentParser:
@@ -105,17 +105,25 @@ def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
 
 
 def _json(value: Any, depth: int) -> str:
-    """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper."""
-    if isinstance(value, dict) and depth < 2 and value:
-        inside = (f"{json.dumps(k, ensure_ascii=False)}: {_json(v, depth + 1)}" for k, v in value.items())
-        return "{\n" + ",\n".join(" " * (depth + 1) + x for x in inside) + "\n" + " " * depth + "}"
-    if isinstance(value, list) and value and all(isinstance(x, dict) for x in value):
-        if len(value) < PACKED:
-            return "[\n" + ",\n".join(" " * (depth + 1) + _json(x, 9) for x in value) + "\n" + " " * depth + "]"
-        columns = list(dict.fromkeys(k for x in value for k in x))
-        rows = (json.dumps(_rounded([x.get(k) for k in columns]), ensure_ascii=False) for x in value)
-        return f'{{"columns": {json.dumps(columns)}, "rows": [\n' + ",\n".join(rows) + "]}"
+    """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper; many alike as a table."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    alike = len(inside) > 0 and all(isinstance(x, dict) for x in inside)
+    if alike and len(inside) >= PACKED:
+        columns = list(dict.fromkeys(k for x in inside for k in x))
+        rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
+        packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
+        return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
+    if (isinstance(value, dict) and depth < 2 and value) or (isinstance(value, list) and alike):
+        return _lines(value, depth + 1)
     return json.dumps(_rounded(value), ensure_ascii=False)
+
+
+def _lines(value: Any, depth: int) -> str:
+    """A dictionary or a list, each of its values on a line of its own."""
+    if isinstance(value, dict):
+        pairs = (f"{json.dumps(k, ensure_ascii=False)}: {_json(v, depth)}" for k, v in value.items())
+        return "{\n" + ",\n".join(pairs) + "}"
+    return "[\n" + ",\n".join(_json(v, 9) for v in value) + "]"
 
 
 def _rounded(value: Any) -> Any:
@@ -127,10 +135,15 @@ def _rounded(value: Any) -> Any:
 
 
 def _unpacked(found: dict[str, Any]) -> Any:
-    """A list of dictionaries from its table; every dictionary has all columns."""
+    """The dictionaries of a table."""
     if found.keys() != {"columns", "rows"}:
         return found
-    return [dict(zip(found["columns"], row, strict=True)) for row in found["rows"]]
+
+    def one(row: list[Any]) -> dict[str, Any]:
+        return {k: v for k, v in zip(found["columns"], row, strict=True) if v != ABSENT}
+
+    rows = found["rows"]
+    return {k: one(row) for k, row in rows.items()} if isinstance(rows, dict) else [one(row) for row in rows]
 
 
 def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:

@@ -19,7 +19,7 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from herglotz.data import Trajectories, simulate
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import select
 from herglotz.training.selection import CANDIDATES
 

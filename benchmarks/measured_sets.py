@@ -31,8 +31,8 @@ from torch import Tensor
 from benchmarks.peers.rollouts import rk4
 from herglotz.data import Trajectories, load, simulate
 from herglotz.models import ContactLagrangian
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import Bands, FitConfig, Run, ensemble_bands, fit, laplace
 
 PENDULUM = "schmidt_lipson_2009/real_pend_h_1.txt"

@@ -228,15 +228,15 @@ def eager_rows(quick: bool) -> list[Row]:
     rows.append(row("torch.func step / eager step, n=2, 16x2, B=1", least=15, **timed))
     for n in (1, 2, 8):
         model, state, steps = model_of(n, 0), start(n, 1, torch.float64), 30 if quick else 200
-        eager = (rolls(s, state, steps) for s in (Stepper(model), Stepper(model, explicit=False)))
-        timed = alternate(*eager, repeats, (steps, steps))
+        explicit, implicit = (rolls(s, state, steps) for s in (Stepper(model), Stepper(model, explicit=False)))
+        timed = alternate(explicit, implicit, repeats, (steps, steps))
         rows.append(row(f"Newton / explicit step, eager, n={n}, B=1", least=4, **timed))
         with tempfile.TemporaryDirectory() as folder:
             text = export_c(model, Path(folder, "a.h"), h=H).read_text()
         newton = CompiledStepper(c_source(model, read_metadata(text, ""), "a.h", explicit=False))
         one, many = State(*(x[0] for x in state)), 5000 if quick else 50000
-        forms = (rolls(s, one, many) for s in (compile_c(model, h=H), newton))
-        timed = alternate(*forms, 3 if quick else 9, (many, many))
+        explicit, implicit = (rolls(s, one, many) for s in (compile_c(model, h=H), newton))
+        timed = alternate(explicit, implicit, 3 if quick else 9, (many, many))
         what = f"Newton / explicit step, C, n={n}, B=1 (Newton starts at the solution: one evaluation, no more)"
         rows.append(row(what, least=2, **timed))
     return rows

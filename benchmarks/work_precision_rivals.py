@@ -304,7 +304,6 @@ def neural(case: Case, quick: bool) -> list[Timed]:
                 for x in _settings(method, dtype)[:7]:
                     label = f"{width} × {layers}, {_label(method, x, setup, dtype)}"
                     point = {"kind": f"neural ODE, {method}", "setting": label, "dtype": dtype}
-                    point |= {"width": width, "depth": layers}
                     found.append(_classic(point, library, case, y, method, x, weights.flops))
     case.seconds["neural ODE"] = time.process_time() - began
     return found

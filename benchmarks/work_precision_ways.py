@@ -24,14 +24,14 @@ from benchmarks.harness import seconds
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_aoti, export_onnx, load_onnx, load_pt2
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper, kahan_li, suzuki, yoshida
 from herglotz.stepping.guess import EQUAL
-from herglotz.systems import scene
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
-from herglotz.tune.kicks import can_kick, fit_kicks
-from herglotz.tune.kicks_c import CompiledKicks
+from herglotz.tune.kick_composition import can_kick, fit_kicks
+from herglotz.tune.kick_composition_c import CompiledKicks
 from herglotz.tune.reference import JITTER, draw_starts, record
 
 CHECKS = 4  # times at which errors are taken
@@ -404,7 +404,7 @@ def _evaluations(model: Any, case: Case, h: float) -> tuple[float, float]:
     return each / h, each / h * 2 * weights * (1 + n if explicit else 1 + n + n * (n + 1) / 2)
 
 
-def _forms(case: Case, model: Any, h: float, kind: str, label: str, **notes: Any) -> list[Timed]:
+def _forms(case: Case, model: Any, h: float, kind: str, label: str) -> list[Timed]:
     """A model as compiled C, in both precisions."""
     evaluations, flops = _evaluations(model, case, h)
     found = []
@@ -413,7 +413,7 @@ def _forms(case: Case, model: Any, h: float, kind: str, label: str, **notes: Any
         number = getattr(torch, dtype)
         more = {"h": h, "dtype": dtype, "artefact": "C", "evaluations_per_time": evaluations, "flops_per_time": flops}
         error = rolled(case, stepper, h, number)
-        point = {"kind": kind, "setting": f"{label}, h {h:.4g}, C {dtype}", **error, **more, **notes}
+        point = {"kind": kind, "setting": f"{label}, h {h:.4g}, C {dtype}", **error, **more}
         found.append(_native(point, stepper, case, h, number))
     return found
 
@@ -445,12 +445,11 @@ def _own(case: Case, quick: bool) -> list[Timed]:
     found += [
         t for t in _forms(case, rounded, h, "learned, bf16 weights", "bf16 weights") if "float32" in t.point["setting"]
     ]
-    for name, write, read in (("ONNX", export_onnx, load_onnx), ("AOTInductor", export_aoti, load_pt2)):
-        if quick and write is export_aoti:  # compiles for a minute
-            continue
+    formats = (("ONNX", "a.onnx", export_onnx, load_onnx), ("AOTInductor", "a.pt2", export_aoti, load_pt2))
+    for name, file, write, read in formats[:1] if quick else formats:  # AOTInductor compiles for a minute
         try:
             with tempfile.TemporaryDirectory() as folder:
-                stepper = read(write(model, Path(folder) / "model", h=h))
+                stepper = read(write(model, Path(folder) / file, h=h))
             point = {"kind": f"learned, {name}", "setting": f"own model, {name}", **plain, "artefact": name}
             found.append(_eager({**point, **rolled(case, stepper, h)}, stepper, case, h, inputs_of(case)))
         except (InputError, RuntimeError) as error:
@@ -485,9 +484,7 @@ def _distilled(case: Case, quick: bool) -> list[Timed]:
             start = widened(case.run.model, width, depth)
             model, _ = distil(start, before, after, m * setup.h, iterations=5 if quick else 50)
             model.requires_grad_(False)
-            found += _forms(
-                case, model, m * setup.h, "learned, distilled", f"{width} × {depth}", width=width, depth=depth
-            )
+            found += _forms(case, model, m * setup.h, "learned, distilled", f"{width} × {depth}")
         found += _forms(case, case.run.model, m * setup.h, "learned, no re-training", "own model at a larger step")
     case.seconds["distil"] = time.process_time() - began
     return found
