@@ -26,7 +26,8 @@ from herglotz.models import ContactLagrangian
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
-from herglotz.stepping import Event, State, Stepper, boundary_value
+from herglotz.stepping import Event, State, Stepper
+from herglotz.theory import boundary_value
 from herglotz.training import FitConfig, fit
 
 HINGES = torch.tensor([[0.2, -0.1], [-0.1, 0.1]]).double()  # two viscous hinges 0.1, angles from the vertical
