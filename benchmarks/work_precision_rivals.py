@@ -130,7 +130,7 @@ def _pointer(x: Tensor | None) -> ctypes.c_void_p:
 
 def dop853_source() -> str:
     """One step of DOP853, with and without its error, every coefficient written out, from the tables in scipy."""
-    from scipy.integrate._ivp import dop853_coefficients as dop
+    from scipy.integrate._ivp import dop853_coefficients as dop  # pyright: ignore[reportMissingImports]
 
     def total(weights: Any) -> str:
         return " + ".join(f"(real){float(w)!r} * k[{j}][d]" for j, w in enumerate(weights) if w)

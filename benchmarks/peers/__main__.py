@@ -123,9 +123,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--peers", help=f"with commas (default: all of {', '.join(PEERS)})")
     parser.add_argument("--seeds", type=int, default=5, help="seeds 0, 1, … of data and weights (default 5)")
     parser.add_argument("--budget", type=float, help=f"seconds of processor time a network fit (default {BUDGET:g})")
-    parser.add_argument(
-        "--again", action="store_true", help="measure the chosen cells (or the figures) anew"
-    )
+    parser.add_argument("--again", action="store_true", help="measure the chosen cells (or the figures) anew")
     parser.add_argument("--reproduce", action="store_true", help="only the figures of the sources")
     parser.add_argument("--redraw", action="store_true", help="only the table and the figure")
     arguments = parser.parse_args(argv)

@@ -172,7 +172,7 @@ def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
 def integrator(field: Callable[[Tensor], Tensor], h: float, parts: int) -> Callable[[Tensor], Tensor]:
     """One step of length h: torchdiffeq's fixed-step rk4 where it is installed, else the classical one."""
     try:
-        from torchdiffeq import odeint
+        from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
     except ImportError:
         return lambda y: rk4(field, y, h, parts)
     times = torch.linspace(0.0, h, parts + 1, dtype=torch.float64)

@@ -71,16 +71,15 @@ def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from phlearn.phnns import HamiltonianNN, PseudoHamiltonianNN, R_estimator
-        from phlearn.phnns import train as phlearn_train
+        from phlearn import phnns  # pyright: ignore[reportMissingImports]
 
     began, n, h = time.process_time(), samples.dof, samples.h
     with torch.random.fork_rng():
         torch.manual_seed(seed)  # the package draws from the global generator
-        friction = R_estimator([False] * n + [True] * n, torch.float64)
+        friction = phnns.R_estimator([False] * n + [True] * n, torch.float64)
         friction.pick_rs = friction.pick_rs.double()
-        H = HamiltonianNN(2 * n, WIDTH).double()
-        model = PseudoHamiltonianNN(2 * n, hamiltonian_est=H, dissipation_est=friction, ttype=torch.float64)
+        H = phnns.HamiltonianNN(2 * n, WIDTH).double()
+        model = phnns.PseudoHamiltonianNN(2 * n, hamiltonian_est=H, dissipation_est=friction, ttype=torch.float64)
         weights = [x for x in (*H.parameters(), *friction.parameters()) if x.requires_grad]
         motions = samples.exact or [m for q in samples.q if (m := differences(q, h, samples.noisy)) is not None]
         first = torch.cat([torch.cat([m.q, m.p], -1)[:-1] for m in motions])
@@ -99,7 +98,7 @@ def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
                 group["lr"] = LEARNING_RATE * (0.5 + 0.5 * math.cos(math.pi * used)) + 1e-6
             with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
                 warnings.simplefilter("ignore")
-                _, value = phlearn_train(
+                _, value = phnns.train(
                     model, "srk4", packed(rows), optimiser, packed(held), epochs=1, batch_size=64, verbose=False
                 )
             if value is not None and value < best:
@@ -138,7 +137,7 @@ def train_sindy(samples: Samples, seed: int, budget: float) -> Flow:  # noqa: AR
     """Sparse regression (STLSQ) on rates over `library`; the threshold with the least validation error."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import pysindy
+        import pysindy  # pyright: ignore[reportMissingImports]
 
         motion, n = samples.motion(), samples.dof
         terms, rates = library(motion.q, motion.v, samples.angles).numpy(), motion.a.numpy()
