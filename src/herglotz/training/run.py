@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -19,6 +19,9 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
+
+if TYPE_CHECKING:
+    from herglotz.training.predict import Prediction
 
 FORMAT = 1
 
@@ -73,6 +76,12 @@ class Run:
     def stepper(self) -> Stepper:
         """The trained time stepper, with Newton's tolerance as tuned."""
         return Stepper(self.model, tol=self.setting.get("tol"))
+
+    def predict(self, data: Trajectories, **settings: Any) -> Prediction:
+        """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
+        from herglotz.training.predict import predict
+
+        return predict(self, data, **settings)
 
 
 def save_run(run: Run, folder: str | Path) -> None:
