@@ -73,6 +73,17 @@ class Prediction:
         each = self.rms_per_coordinate
         return None if each is None else (sum(x * x for x in each) / len(each)) ** 0.5
 
+    def motion(self) -> Trajectories | None:
+        """The predicted motion as far as it was reached; None where no trajectory has three samples."""
+        reached = torch.isfinite(torch.cat([self.states.q, self.states.p], -1)).all(-1)
+        counts = [int(reached[a : a + k].sum()) for a, k in zip(self.data.offsets, self.data.lengths, strict=True)]
+        spans = [(a, k) for a, k in zip(self.data.offsets, counts, strict=True) if k >= 3]
+        if not spans:
+            return None
+        rows = torch.cat([torch.arange(a, a + k) for a, k in spans])
+        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
+        return _rows(whole, rows, tuple(k for _, k in spans))
+
     def metrics(self) -> dict[str, Any]:
         """The numbers, for JSON."""
         each = self.rms_per_coordinate
@@ -132,9 +143,10 @@ def predict(
         data = _windows(data, warmup, windows, horizon)
     for b, length in enumerate(data.lengths):
         if length < warmup + 2:
+            thinned = f", every {every} of the recording" if every > 1 else ""
             raise InputError(
-                f"{data.source or 'data'}: trajectory {b} has {length} samples (every {every} of the recording); "
-                f"a warm-up of {warmup} needs at least {warmup + 2}: use --warmup {max(3, length - 2)} or a longer one"
+                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs at "
+                f"least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
             )
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
