@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import partials, step_derivative
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 
 def multipliers(system, rule, h):

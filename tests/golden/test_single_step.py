@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.mechanics import autograd_partials, partials
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 
 RTOL = 1e-12
 

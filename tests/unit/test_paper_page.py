@@ -11,7 +11,7 @@ TESTS = {path.name: path.read_text(encoding="utf-8") for path in (ROOT / "tests"
 
 def test_every_function_on_the_page_exists():
     # fails if a function is renamed and the page is not
-    names = set(re.findall(r"`((?:mechanics|systems|stepping|plots)\.[\w.]+)`", PAGE))
+    names = set(re.findall(r"`((?:mechanics|scenes|stepping|plots)\.[\w.]+)`", PAGE))
     assert len(names) > 60
     for name in sorted(names):
         module, _, attribute = name.rpartition(".")

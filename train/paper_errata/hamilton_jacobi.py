@@ -10,16 +10,16 @@ from herglotz.mechanics import (
     Quadratic,
     contact_vector_field,
     generating_function,
+    germ,
     hamilton_jacobi_residual,
-    jet,
     left_hamilton_jacobi_residual,
     partials,
     prolongation,
     riccati_step,
 )
 from herglotz.mechanics.continuous import derivatives, jacobian
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from paper_errata.erratum import (
     OSCILLATOR,
     Erratum,
@@ -71,15 +71,15 @@ def e7() -> Erratum:
     q0 = tensor(0.8)
 
     def residual(q1: Tensor) -> Tensor:
-        a, b = jet(S0, q0), jet(S1, q1)
+        a, b = germ(S0, q0), germ(S1, q1)
         return hamilton_jacobi_residual(b.S, a.S, b.dS, q1, H_plus(q0, b.dS, a.S, h))
 
-    q1 = s.flow(q0, jet(S0, q0).dS, jet(S0, q0).S, h)[0]
+    q1 = s.flow(q0, germ(S0, q0).dS, germ(S0, q0).S, h)[0]
     on, off = size(residual(q1)), [size(residual(q1 + d)) for d in (0.1, 0.2)]
     pair = q1 + 0.1
     slope = jacobian(lambda y: residual(y)[..., None], pair)[1][..., 0, :]
-    at = jet(S1, pair)
-    D2H = partials(H_plus, q0, at.dS, jet(S0, q0).S, h).D2
+    at = germ(S1, pair)
+    D2H = partials(H_plus, q0, at.dS, germ(S0, q0).S, h).D2
     predicted = -(at.d2S @ (pair - D2H)[..., None])[..., 0]
     return Erratum(
         "E7",
@@ -104,9 +104,9 @@ def e8() -> Erratum:
     assert s.H_minus is not None
     P = partials(s.L_d, tensor(0.0), tensor(0.0), tensor(0.0)[0], h, order=2)
     S0 = Quadratic(tensor(1.0)[:, None], tensor(0.5), tensor(0.25)[0])
-    at = jet(S0, x0.q)
+    at = germ(S0, x0.q)
     q1, p1, _ = s.flow(x0.q, at.dS, at.S, h)
-    section = [size(jet(S, q1).dS - p1) for S in (S0, riccati_step(P, S0))]
+    section = [size(germ(S, q1).dS - p1) for S in (S0, riccati_step(P, S0))]
     left = partials(LeftLagrangian(s.L_d), x0.q, x1.q, x1.s, h)
     D3 = [
         size(partials(H, a, b, c, h).D3 + left.D3)
