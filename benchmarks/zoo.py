@@ -1,4 +1,4 @@
-"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--limit S] [--out FOLDER] [--json]`.
+"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER] [--json]`.
 
 Each system is drawn from (SEED, index): potential, friction, inputs, step, noise and number of recordings. `herglotz
 fit` runs with its default flags in a process of its own, and is judged by free runs over the unseen third of its
@@ -17,14 +17,14 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from benchmarks.zoo_systems.drawing import draw
-from benchmarks.zoo_systems.judging import outcome, relative, score
-from benchmarks.zoo_systems.known import fit_known
-from benchmarks.zoo_systems.ours import fit_ours, plain
-from benchmarks.zoo_systems.prediction import own_predictions
-from benchmarks.zoo_systems.report import commit, report, shares
-from benchmarks.zoo_systems.sindy import fit_sindy
-from benchmarks.zoo_systems.systems import ZooSystem
+from zoo_systems.drawing import draw
+from zoo_systems.judging import outcome, relative, score
+from zoo_systems.ours import fit_ours, plain
+from zoo_systems.prediction import MechanismModel, own_predictions
+from zoo_systems.report import commit, report, shares
+from zoo_systems.sindy import fit_sindy
+from zoo_systems.systems import ZooSystem
+
 from herglotz.data.files import write_atomically
 
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
@@ -33,7 +33,7 @@ KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", 
 def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     """One row of the results."""
     row = of.facts()
-    for name, fit in (("known", fit_known), ("sindy", fit_sindy)):
+    for name, fit in (("known", lambda of: MechanismModel(of.fitted)), ("sindy", fit_sindy)):
         began = time.process_time()
         found = own_predictions(of, fit(of))
         row[name] = {"score": score(of, found), "relative": relative(of, found), "cpu_s": time.process_time() - began}
@@ -59,7 +59,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=30, metavar="N", help="systems 0 to N - 1 (default %(default)s)")
     parser.add_argument("--only", type=int, nargs="+", metavar="I", help="these systems alone")
     parser.add_argument("--limit", type=float, default=300, metavar="S", help="processor time of a fit (default 300 s)")
-    parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="folder for rows and runs (default runs/zoo)")
+    parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="rows and runs (default %(default)s)")
     parser.add_argument("--report", type=Path, metavar="FILE", help="write the table there (.md)")
     parser.add_argument("--again", action="store_true", help="keep rows of other commits too")
     parser.add_argument("--json", action="store_true", help="print the rows and shares as JSON")

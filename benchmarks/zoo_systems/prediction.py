@@ -1,4 +1,4 @@
-"""Free runs of an equation of motion: the start state is read from a warm-up by least squares, the rest is predicted."""
+"""Free runs of an equation of motion, from a start state that is read from a warm-up by least squares."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Protocol
 
 import numpy as np
 
-from benchmarks.zoo_systems.mechanisms import Array, Mechanism
-from benchmarks.zoo_systems.systems import TRAIN, Recording, ZooSystem
+from zoo_systems.mechanisms import Array, Mechanism
+from zoo_systems.systems import TRAIN, Recording, ZooSystem
 
 SMOOTH, DRY = 2 * np.pi / 60, 2 * np.pi / 250  # longest inner step, natural units; dry friction is split, of order 2
 LOST = 1e6  # a motion beyond this has diverged
@@ -71,9 +71,9 @@ def roll(model: EquationModel, q: Array, v: Array, t: Array, u: Array) -> Array:
 
 def start_states(model: EquationModel, t: Array, q: Array, u: Array, weight: Array, iterations: int = 12) -> Array:
     """(B, 2n) states at t[0] from which the model passes the samples q (B, K, n) nearest, by Levenberg–Marquardt."""
-    B, K, n = q.shape
+    B, n = len(q), q.shape[-1]
     x = _first_guess(t, q)
-    offsets = 1e-6 * np.concatenate([np.tile(weight, 2)])  # of finite differences
+    offsets = 1e-6 * np.tile(weight, 2)  # of finite differences
     damping = np.full(B, 1e-6)
     residual = _misfit(model, x, t, q, u, weight)
     for _ in range(iterations):

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks.zoo_systems.judging import OUTCOMES, SILENT
+from zoo_systems.judging import OUTCOMES, SILENT
 
 Row = dict[str, Any]
 
@@ -38,14 +38,15 @@ def report(rows: Sequence[Row], seed: int, limit: float) -> str:
         f"`python benchmarks/zoo.py --draw {seed} --count {len(rows)} --limit {limit:g}` at commit {commits}.",
         "",
         "Numbers are errors of free runs over the noise (1: a perfect model; without noise over 1e-4 of the size), the",
-        "worse of two: the unseen third of the training recordings, and three recordings from unseen starts. In brackets:",
-        "over the size of the motion. Known: the true equation with its numbers fitted. Time: of our fit, processor.",
+        "worse of two: the unseen third of the training recordings, and three recordings from unseen starts. In",
+        "brackets: over the size of the motion. Known: the true equation with its numbers fitted. Time: of our fit,",
+        "on one processor.",
         "",
         "| share | " + " | ".join(shares(rows)) + " |",
         "|---" * (len(shares(rows)) + 1) + "|",
         f"| of {len(rows)} | " + " | ".join(f"{100 * x:.0f} %" for x in shares(rows).values()) + " |",
         "",
-        f"Medians: ours {medians['ours']:.3g}, SINDy {medians['sindy']:.3g}, known {medians['known']:.3g}; {cpu:.0f} s.",
+        "Medians: " + ", ".join(f"{name} {value:.3g}" for name, value in medians.items()) + f"; {cpu:.0f} s.",
         "",
         "| | system | samples | outcome | ours | SINDy | known | time, s | what the fit said |",
         "|---" * 9 + "|",

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.zoo_systems.mechanisms import Array, Mechanism
+from zoo_systems.mechanisms import Array, Mechanism
 
 EXACT = 1e-4  # of the size of a motion: what "at the noise" means where there is no noise
 TRAIN = 0.667  # of each training recording, in samples: the default of `fit`
@@ -29,6 +29,7 @@ class ZooSystem:
     seed: int
     index: int
     mechanism: Mechanism
+    fitted: Mechanism  # its structure, with the numbers fitted to the training part
     friction: str
     driven: bool
     samples_per_period: float
@@ -46,7 +47,8 @@ class ZooSystem:
         """What it is, in one line."""
         drive = ", driven" if self.driven else ""
         noise = f"{100 * self.noise:.1f} % noise" if self.noise else "exact"
-        return f"{self.mechanism.kind} {self.mechanism.n}, {self.friction}{drive}, {self.samples_per_period:.0f}/period, {noise}"
+        what = f"{self.mechanism.kind} {self.mechanism.n}, {self.friction}{drive}"
+        return f"{what}, {self.samples_per_period:.0f}/period, {noise}"
 
     @property
     def floor(self) -> Array:

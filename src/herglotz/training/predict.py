@@ -145,8 +145,8 @@ def predict(
         if length < warmup + 2:
             thinned = f", every {every} of the recording" if every > 1 else ""
             raise InputError(
-                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs at "
-                f"least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
+                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
+                f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
             )
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
