@@ -1,4 +1,4 @@
-"""Eight discrete steps against 17-digit values, and the Riccati recursion (section 4 of mathematics.md)."""
+"""Eight discrete steps against 17-digit values, and the Riccati recursion (section 4 of docs/mathematics.md)."""
 
 import pytest
 import torch

@@ -1,4 +1,4 @@
-"""One exact step against 50-digit values (section 4 of mathematics.md)."""
+"""One exact step against 50-digit values (section 4 of docs/mathematics.md)."""
 
 import pytest
 import torch

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian, GeneratingFunction, generating_function
+from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.theory import GeneratingFunction, generating_function
 
 if TYPE_CHECKING:
     from herglotz.training import Run

@@ -11,11 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from herglotz.mechanics import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 from herglotz.models import ContactLagrangian
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
+from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 
 if TYPE_CHECKING:
     from herglotz.training import Run

@@ -23,7 +23,7 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
     g
         Gravity over length, 1/s².
     gamma
-        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `mathematics.md`).
+        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
     """
 
     def potential(q: Tensor) -> Tensor:

@@ -23,7 +23,7 @@ from herglotz.scenes.scene import Scene
 class DrivenRule:
     """L_d at the torque `torque`; `at(u)` is the one of a step with the torque u, (..., 1).
 
-    Source: section 6 of `mathematics.md`, time-dependent L_d.
+    Source: section 6 of `docs/mathematics.md`, time-dependent L_d.
     """
 
     rule: Callable[[Tensor | float], DiscreteLagrangian]

@@ -15,11 +15,11 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
-from herglotz.mechanics.continuous import jacobian
 from herglotz.scenes.motion import Motion, lagrangian_motion, state_change
 from herglotz.scenes.reference import integrate
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
+from herglotz.theory.continuous import jacobian
 
 PIECES = 2  # of the step; conjugate points are looked for at the end of each
 MISS = 1e-11  # of q1, relative to the positions, that Newton may leave: a Taylor step in q1 takes the rest
@@ -74,7 +74,7 @@ class NumericallyExact:
     right half-plane), so a step of many periods is not safe. L_d can be differentiated twice and its first partials
     once; a further derivative raises, and so does one with respect to h.
 
-    Source: section 1 of `mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
+    Source: section 1 of `docs/mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
     """
 
     motion: Motion

@@ -21,7 +21,7 @@ from herglotz.scenes.special import as_step, expm1w
 class ExactLinearDrag:
     """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension, with closed-form derivatives.
 
-    Source: section 3 of `mathematics.md`, where γ/(e^{γh} − 1) is 1/(hφ(γh)).
+    Source: section 3 of `docs/mathematics.md`, where γ/(e^{γh} − 1) is 1/(hφ(γh)).
     """
 
     m: float
@@ -65,7 +65,7 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
     InputError
         If m ≤ 0.
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
     if not m > 0:
         raise InputError(f"linear_drag: mass m must be > 0, got {m}")

@@ -14,7 +14,7 @@ from herglotz.scenes.scene import Scene
 
 
 def nonlinear_action(damping: float = 1.0) -> Scene:
-    """The two-degree-of-freedom system of section 4 of `mathematics.md`.
+    """The two-degree-of-freedom system of section 4 of `docs/mathematics.md`.
 
     Parameters
     ----------

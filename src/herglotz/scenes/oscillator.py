@@ -27,7 +27,7 @@ class ExactOscillator:
     evaluated in increments, (√E q0 − q1)² − (1 − C)(E q0² + q1²) for the bracket, so that small steps do not cancel.
     Isotropic in any dimension. Singular at the conjugate points ωh = π, 2π, …
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
 
     m: float
@@ -88,7 +88,7 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
     InputError
         If m ≤ 0.
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
     if not m > 0:
         raise InputError(f"damped_oscillator: mass m must be > 0, got {m}")

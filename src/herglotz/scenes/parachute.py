@@ -28,7 +28,7 @@ class ExactParachute:
 
     The second line is the one evaluated: its terms stay finite as λ → 0.
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
 
     m: float
@@ -88,7 +88,7 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
     InputError
         If m ≤ 0 or lam = 0.
 
-    Source: section 3 and erratum E9 of `mathematics.md`.
+    Source: section 3 and erratum E9 of `docs/mathematics.md`.
     """
     if not m > 0:
         raise InputError(f"parachute: mass m must be > 0, got {m}")

@@ -28,7 +28,7 @@ def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
     InputError
         If m ≤ 0 or lam = 0.
 
-    Source: section 3 of `mathematics.md`; the parachute's formulas, which are analytic in λg, at g = 0.
+    Source: section 3 of `docs/mathematics.md`; the parachute's formulas, which are analytic in λg, at g = 0.
     """
     if not m > 0:
         raise InputError(f"quadratic_drag: mass m must be > 0, got {m}")

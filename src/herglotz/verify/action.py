@@ -12,20 +12,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import flow_derivative, mixed_hessian, partials
+from herglotz.mechanics.regularity import left_hessian, scaled_margin
+from herglotz.stepping import State
+from herglotz.theory import (
     GeneratingFunction,
-    flow_derivative,
     generating_function,
     hamilton_jacobi_residual,
     left_hamilton_jacobi_residual,
     left_hamiltonian,
-    mixed_hessian,
-    partials,
     right_hamiltonian,
     right_hamiltonian_on_flow,
 )
-from herglotz.mechanics.regularity import left_hessian, scaled_margin
-from herglotz.stepping import State
 from herglotz.verify.report import Check
 from herglotz.verify.subject import Subject
 from herglotz.verify.walk import worst

@@ -5,17 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
-    LeftHamiltonian,
-    herglotz_residual,
-    left_equations,
-    mixed_hessian,
-    momentum_jacobian,
-    momentum_plus,
-    partials,
-)
+from herglotz.mechanics import herglotz_residual, mixed_hessian, momentum_jacobian, momentum_plus, partials
 from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import solve
+from herglotz.theory import LeftHamiltonian, left_equations
 from herglotz.verify.report import Check
 from herglotz.verify.subject import Subject
 from herglotz.verify.walk import Walk, worst
