@@ -29,7 +29,7 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     g
         Gravity, m/s².
     gamma
-        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `mathematics.md`).
+        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
 
     Raises
     ------

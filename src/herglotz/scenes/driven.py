@@ -26,7 +26,7 @@ from herglotz.scenes.scene import Scene, State
 class DrivenRule:
     """L_d at the input `u0`; `at(u)` is the one of a step with the input u, (..., 1).
 
-    Source: section 6 of `mathematics.md`, time-dependent L_d.
+    Source: section 6 of `docs/mathematics.md`, time-dependent L_d.
     """
 
     rule: Callable[[Tensor | float], DiscreteLagrangian]

@@ -21,7 +21,7 @@ External = Callable[[Tensor, Tensor], Tensor]  # (q, v), (..., n) each → f, (.
 class ForcedRule:
     """A rule for L with the forces of the midpoint, F⁻ = F⁺ = (h/2) f((q0 + q1)/2, (q1 − q0)/h): of order 2 at c = 1.
 
-    Source: section 4 of `mathematics.md`, discrete forces.
+    Source: trap 4 of `docs/mathematics.md`, discrete forces.
     """
 
     rule: DiscreteLagrangian

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -18,11 +18,23 @@ from herglotz.training.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.trajectory_fit import StatesOnly
 
-if TYPE_CHECKING:
-    from herglotz.training.run import Run
-
 WARMUP = 20  # samples from which the state is estimated
 BELIEVED = 0.1  # noise of a step relative to the data's in the warm-up, as in `smooth`: the model is believed
+
+
+class Trained(Protocol):
+    """What `predict` needs of a run."""
+
+    @property
+    def model(self) -> ContactLagrangian: ...  # noqa: D102
+    @property
+    def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
+    @property
+    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
+    @property
+    def stepper(self) -> Stepper: ...  # noqa: D102
 
 
 @dataclass(frozen=True)
@@ -102,7 +114,7 @@ class Prediction:
 
 
 def predict(
-    run: Run, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
+    run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
 ) -> Prediction:
     """Score a run on another recording.
 
@@ -165,7 +177,7 @@ def predict(
     return Prediction(data, state, warmup, every, most, outside)
 
 
-def _of_the_run(run: Run, data: Trajectories) -> Trajectories:
+def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
     wanted, where = run.data, data.source or "data"
     if data.dof == wanted.dof == 1:

@@ -6,7 +6,7 @@ import json
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,9 +19,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
-
-if TYPE_CHECKING:
-    from herglotz.training.predict import Prediction
+from herglotz.training.predict import Prediction, predict
 
 FORMAT = 1
 
@@ -79,8 +77,6 @@ class Run:
 
     def predict(self, data: Trajectories, **settings: Any) -> Prediction:
         """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
-        from herglotz.training.predict import predict
-
         return predict(self, data, **settings)
 
 
