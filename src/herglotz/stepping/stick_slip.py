@@ -48,14 +48,14 @@ class StickSlip:
 
     def start(self) -> Tensor:
         """The z of the equation that is linear in Δ, F + J Δ at rest: exact for n = 1, by Gauss–Seidel for more."""
-        z = self.F / self.stiffness
+        z = alone = self.F / self.stiffness
         couples = self.J / self.stiffness[..., None]
         n = z.shape[-1]
         for _ in range(SWEEPS if n > 1 else 0):
             for i in range(n):
                 delta = self.increment(z)
                 others = (couples[..., i, :] * delta).sum(-1) - couples[..., i, i] * delta[..., i]
-                z = torch.cat([z[..., :i], (self.F / self.stiffness)[..., i, None] + others[..., None], z[..., i + 1 :]], -1)
+                z = torch.cat([z[..., :i], (alone[..., i] + others)[..., None], z[..., i + 1 :]], -1)
         return z
 
     def increment(self, z: Tensor) -> Tensor:
