@@ -17,13 +17,13 @@ from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Rollout, State, Status, Step, step_sizes
+from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
 
 
 class CompiledStepper:
     """The flow Φ̃ of a generated header, sample by sample on one thread.
 
-    Results are those of `Stepper`, without derivatives.
+    Results are those of `Stepper`; `linearise` gives their derivatives, autograd does not see them.
 
     Parameters
     ----------
@@ -45,8 +45,7 @@ class CompiledStepper:
         self.dtype: torch.dtype = getattr(torch, self.metadata["dtype"])
         self.h: float = self.metadata["h"]
         self.inputs: int = self.metadata["inputs"]
-        name, dtype = self.metadata["name"], self.metadata["dtype"]
-        self._library = build(header, name, dtype, inputs=self.inputs > 0)
+        self._library = build(header, self.metadata["name"])
 
     def init(
         self,
@@ -99,6 +98,34 @@ class CompiledStepper:
         out = self._rollout(q, p, s, h, None if u is None else u.expand(*s.shape, u.shape[-1])[..., None, :])
         outside = None if out.outside is None else out.outside[..., 0]
         return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS, outside)
+
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step with its derivatives, as `Stepper.linearise`; NaN where the step failed.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`.
+
+        Raises
+        ------
+        InputError
+            As `step`.
+        """
+        q, p, s = state
+        self._check(q, p, s)
+        batch, size = s.shape, 2 * self.dof + 1
+        h = spread_h(self._checked_h(h), s).contiguous()
+        u = self._inputs(None if u is None else u.expand(*batch, u.shape[-1]), batch)
+        new = lambda *shape: torch.full((*batch, *shape), torch.nan, dtype=self.dtype)  # noqa: E731
+        after, sigma, residual = State(new(self.dof), new(self.dof), new()), new(), new()
+        status = torch.full(batch, int(Status.DIVERGED), dtype=torch.uint8)
+        by_state, by_input, by_h = new(size, size), new(size, self.inputs), new(size)
+        starts = (x.contiguous() for x in state)
+        outputs = (*after, sigma, status, residual, by_state, by_input, by_h)
+        self._call("herglotz_jacobians", s.numel(), *starts, h, u, *outputs)
+        step = Step(after, sigma, status, residual, MAX_ITERATIONS)
+        return Linearised(step, by_state, by_h, by_input if u is not None else None)
 
     def rollout(
         self,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import inspect
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -28,6 +28,18 @@ Parts = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # what `StepParts
 LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
 # u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
+
+
+def pushed(model: ContactLagrangian) -> ContactLagrangian:
+    """The model with the forces of its inputs as its inputs: G is the unit matrix, u₀ is 0. Changed in place."""
+    friction, n = model.friction, model.config.dof
+    if model.config.inputs and friction is not None:
+        model.config = replace(model.config, inputs=n, input_map=())
+        eye = torch.eye(n, dtype=friction.viscous.dtype, device=friction.viscous.device)
+        friction.inputs, friction.input_zero = n, None
+        del friction.input_map
+        friction.register_buffer("input_map", eye)
+    return model
 
 
 class Terms:
@@ -139,7 +151,7 @@ class StepParts(nn.Module):
     model
         Not changed.
     explicit
-        Whether the step needs no iteration: then F and J are zeros, and the guess is the solution.
+        Whether the step needs no iteration: then the guess is the solution, and J is not known.
     """
 
     def __init__(self, model: ContactLagrangian, explicit: bool):
@@ -168,13 +180,16 @@ class StepParts(nn.Module):
         guess, F, J, dp, L, E = form((q, p, s, h), ends, delta, x, u)
         return guess.clone(), F.clone(), J.clone(), dp.clone(), L.clone(), E.expand(s.shape).clone()
 
-    def _explicit(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        q, _, _, h = start
+    def _explicit(self, start: Start, ends: Ends, delta: Tensor, _: Tensor, u: tuple[Tensor, ...]) -> Parts:
+        h = start[3]
         frog = Leapfrog(self.model, inverse, lambda _: ends[1])
         move = frog(*start, ends[0], u[0] if u else None, True)
         assert move.dp is not None
-        zero = torch.zeros_like(q)
-        return move.delta, zero, zero[..., None] * zero[..., None, :], move.dp, move.L, frog.constants(h).c_minus_1
+        maker = model_equation(self.model, fold=False)
+        assert maker is not None
+        F = maker.at(*start, u[0] if u else None, True, ends[0])(delta, False).F  # for FL⁺, not for the step
+        J = F[..., None] * torch.zeros_like(F)[..., None, :]
+        return move.delta, F, J, move.dp, move.L, frog.constants(h).c_minus_1
 
     def _by_terms(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
         maker = model_equation(self.model, fold=False)
@@ -187,8 +202,11 @@ class StepParts(nn.Module):
             force = self.model.friction.value_and_slope(v, u[0] if u else None)[0]
         end = form.end(x, Point(point.F, point.J, (v, mv, N, damping, force)))
         E = form.constants.c_minus_1 if damping is None else damping[1]
+        dp = end.dp
+        if dp is None:  # F is not quite 0: what x adds to p1 is what it takes from F
+            dp = (form.end(delta, point).p1 + point.F) - start[1]
         assert point.J is not None
-        return form.leap(), point.F, point.J, end.p1 - start[1] if end.dp is None else end.dp, end.L, E
+        return form.leap(), point.F, point.J, dp, end.L, E
 
     def _by_jets(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
         model, potential = self.model, self.model.potential
@@ -200,7 +218,7 @@ class StepParts(nn.Module):
         finally:
             model.potential = potential
         end = form.end(delta, point)
-        dp = (end.p1 + point.F) - start[1]  # F is not quite 0: what x adds to p1 is what it takes from F
+        dp = (end.p1 + point.F) - start[1]  # as F is not quite 0
         assert point.J is not None
         return self._leap(*start, ends[0]), point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3
 
