@@ -20,7 +20,6 @@ from herglotz.export.equation import Equations, pushed
 from herglotz.export.lower.c import StepInC, model_source
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.explicit import has_leapfrog
 
 MARK = "herglotz-metadata: "
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
@@ -70,6 +69,7 @@ TOP = """\
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
 #define hz_BOXED {boxed} /* a box of the fitted data is recorded */
+#define hz_DERIVATIVES {derivatives} /* hz_step_jacobian is there */
 #define hz_WIDE {wide} /* batches go by registers of samples */
 
 typedef {real} hz_real;
@@ -150,19 +150,31 @@ def export_c(
     """
     path = Path(path)
     name = _identifier(path.stem) if name is None else name
-    entries = _entries(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
+    entries = described(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
     write_atomically(path, c_source(model, entries, path.name).encode())
     return path
 
 
-def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True) -> str:
-    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two."""
+def c_source(
+    model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True, derivatives: bool = True
+) -> str:
+    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two.
+
+    Without `derivatives` NAME_step_jacobian is left out: it is most of the work.
+    """
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
-    step = StepInC(equations, explicit and has_leapfrog(model))
-    emitted = model_source(step, equations, lanes=entries["dof"] <= MAX_WIDE)
+    step = StepInC(equations, explicit and model.capabilities.explicit)
+    emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
     types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
-    parts = [_top(entries, step.explicit), types, _constants(model, entries), number_tests, functions, products]
+    parts = [
+        _top(entries, step.explicit, derivatives),
+        types,
+        _constants(model, entries),
+        number_tests,
+        functions,
+        products,
+    ]
     parts += [emitted.tables, _inputs(model, dtype), emitted.scalars, run]
     if emitted.lanes:
         parts += ["#ifdef hz_LANE_BYTES\n#define hz_BATCHED", emitted.lanes, batch, "#endif\n"]
@@ -200,7 +212,7 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
     return entries
 
 
-def _entries(
+def described(
     model: ContactLagrangian,
     h: float,
     box: Mapping[str, Sequence[float]] | None,
@@ -211,6 +223,7 @@ def _entries(
     tolerance: float | None,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
+    """The checked entries of the comment at the top, from the arguments of `export_c`."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
@@ -234,7 +247,7 @@ def _identifier(stem: str) -> str:
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
 
 
-def _top(entries: Mapping[str, Any], explicit: bool) -> str:
+def _top(entries: Mapping[str, Any], explicit: bool, derivatives: bool) -> str:
     """The comment, the guard, and what the preprocessor decides by."""
     inputs = entries["inputs"]
     return TOP.format(
@@ -250,6 +263,7 @@ def _top(entries: Mapping[str, Any], explicit: bool) -> str:
         single=int(entries["dtype"] == "float32"),
         explicit=int(explicit),
         boxed=int(entries["box"] is not None),
+        derivatives=int(derivatives),
         wide=int(entries["dof"] <= MAX_WIDE),
         real="float" if entries["dtype"] == "float32" else "double",
     )

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
-import tempfile
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
+from herglotz.export.c_header import MAX_ITERATIONS, c_source, described, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.models import ContactLagrangian
@@ -31,6 +30,8 @@ class CompiledStepper:
         What `export_c` wrote.
     path
         Where it came from, for messages.
+    whole
+        Gives the header with derivatives, where this one has none.
 
     Raises
     ------
@@ -38,7 +39,7 @@ class CompiledStepper:
         If the text is not such a header, or no C compiler is there to compile it.
     """
 
-    def __init__(self, header: str, path: PathLike = "header"):
+    def __init__(self, header: str, path: PathLike = "header", whole: Callable[[], str] | None = None):
         self.metadata = read_metadata(header, path)
         self.path = str(path)
         self.dof: int = self.metadata["dof"]
@@ -46,6 +47,8 @@ class CompiledStepper:
         self.h: float = self.metadata["h"]
         self.inputs: int = self.metadata["inputs"]
         self._library = build(header, self.metadata["name"])
+        self._whole = whole
+        self._differentiates = self._library if whole is None else None
 
     def init(
         self,
@@ -123,7 +126,10 @@ class CompiledStepper:
         by_state, by_input, by_h = new(size, size), new(size, self.inputs), new(size)
         starts = (x.contiguous() for x in state)
         outputs = (*after, sigma, status, residual, by_state, by_input, by_h)
-        self._call("herglotz_jacobians", s.numel(), *starts, h, u, *outputs)
+        if self._differentiates is None:  # built on first use: most steppers are not differentiated
+            assert self._whole is not None
+            self._differentiates = build(self._whole(), self.metadata["name"])
+        self._call("herglotz_jacobians", s.numel(), *starts, h, u, *outputs, library=self._differentiates)
         step = Step(after, sigma, status, residual, MAX_ITERATIONS)
         return Linearised(step, by_state, by_h, by_input if u is not None else None)
 
@@ -224,12 +230,12 @@ class CompiledStepper:
         check_range(h, self.metadata["h_range"])
         return h
 
-    def _call(self, function: str, *arguments: Tensor | int | None) -> None:
+    def _call(self, function: str, *arguments: Tensor | int | None, library: ctypes.CDLL | None = None) -> None:
         converted = (
             ctypes.c_long(x) if isinstance(x, int) else ctypes.c_void_p(None if x is None else x.data_ptr())
             for x in arguments
         )
-        getattr(self._library, function)(*converted)
+        getattr(library or self._library, function)(*converted)
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor, finite: bool = True) -> None:
         check_state(q, p, s, self.dof, self.dtype, finite=finite)
@@ -290,11 +296,12 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, the source is not usable, or a term of the model has no C yet.
+        If there is no compiler, or the source is not usable.
     """
     if not isinstance(source, ContactLagrangian):
         return load_c(source)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
-    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        path = export_c(source, Path(folder, "stepper.h"), h=h, box=box, units=units, dtype=dtype, tolerance=tolerance)
-        return CompiledStepper(path.read_text(), "compiled model")
+    entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
+    kept = copy.deepcopy(source)  # the model may be trained on
+    header = c_source(kept, entries, "stepper.h", derivatives=False)
+    return CompiledStepper(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

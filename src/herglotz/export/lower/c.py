@@ -193,7 +193,7 @@ class Emitted(NamedTuple):
     slopes: str  # the derivative of a step
 
 
-def model_source(step: StepInC, equations: Equations, lanes: bool) -> Emitted:
+def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: bool) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program = Program(tables=step.program.tables)
     q = program.given("q", step.n)
@@ -203,7 +203,7 @@ def model_source(step: StepInC, equations: Equations, lanes: bool) -> Emitted:
     head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
     texts = TYPES.format(push="  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else "", problem=step.members("P"),
                          terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
-    slopes = _slopes_source(equations, step)
+    slopes = _slopes_source(equations, step) if derivatives else ""
     tables = "".join(
         f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
         for row, name in step.program.tables.items()

@@ -88,7 +88,7 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.rsub.Scalar: lambda x, y: c.subtract(y, x),
         aten.mul.Tensor: c.multiply, aten.mul.Scalar: c.multiply,
         aten.div.Tensor: c.divide, aten.div.Scalar: c.divide,
-        aten.addcmul.default: lambda a, x, y, value=1: c.add(a, c.multiply(c.multiply(x, y), value)),
+        aten.addcmul.default: c.add_product,
         aten.neg.default: lambda x: c.multiply(x, -1.0),
         aten.reciprocal.default: lambda x: c.divide(1.0, x),
         aten.pow.Tensor_Scalar: c.power,
@@ -168,6 +168,18 @@ class _Numbers:
         if all(not isinstance(a, Ref) and a == 0.0 for a in x.flat):
             return self.multiply(y, -1.0)
         return self.program.elementwise("{0} - {1}", fold, x, y)
+
+    def add_product(self, a: Any, x: Any, y: Any, value: float = 1) -> np.ndarray:
+        """The sum a + value x y, in one operation where none of its numbers can be left out."""
+        a, x, y = np.broadcast_arrays(_atoms(a), _atoms(x), _atoms(y))
+        simple = lambda v: not isinstance(v, Ref) and v in (0.0, 1.0, -1.0)  # noqa: E731
+        whole = all(isinstance(v, Ref) for v in x.flat) and not any(simple(v) for v in y.flat)
+        if abs(value) == 1 and whole and all(isinstance(v, Ref) or v != 0.0 for v in a.flat):
+            form = "{0} + {1} * {2}" if value == 1 else "{0} - {1} * {2}"
+            return self.program.elementwise(form, lambda *_: None, a, x, y)
+        if value == -1:
+            return self.subtract(a, self.multiply(x, y))
+        return self.add(a, self.multiply(self.multiply(x, y), value))
 
     def multiply(self, x: Any, y: Any) -> np.ndarray:
         x, y = _atoms(x), _atoms(y)

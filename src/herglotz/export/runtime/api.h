@@ -94,6 +94,7 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residu
   return status | outside | hz_outside_box(state);
 }
 
+#if hz_DERIVATIVES
 /* hz_step with its derivatives, by the implicit-function theorem: rows are (q, p, s) after the step.
 
    by_state   (2 hz_N + 1, 2 hz_N + 1)  along (q, p, s) before it
@@ -142,6 +143,7 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_rea
   }
   return status;
 }
+#endif
 
 /* `steps` equal steps. Inputs u are (steps, hz_M), where the model takes some; none act where u is null.
    Entry 0 of each output is the start, entry k the state after k * every steps; the outputs hold

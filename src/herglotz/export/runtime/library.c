@@ -106,6 +106,7 @@ void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *
   }
 }
 
+#if hz_DERIVATIVES
 /* Steps of `batch` samples with their derivatives; h and u are one a sample. Outputs arrive full of NaN. */
 void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
     const hz_real *u, hz_real *q_out, hz_real *p_out, hz_real *s_out, hz_real *sigma_out, unsigned char *status_out,
@@ -124,6 +125,7 @@ void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz
     if (!(status & 15)) store(&x, b, q_out, p_out, s_out, sigma_out);
   }
 }
+#endif
 
 void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_real *s0, const hz_real *h,
     long h_sample, const hz_real *u, long u_sample, hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
