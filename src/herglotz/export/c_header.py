@@ -16,9 +16,10 @@ import torch
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
-from herglotz.export.equation import Equations, pushed
+from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, model_source
 from herglotz.export.metadata import describe
+from herglotz.export.step_parts import pushed
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "

@@ -1,6 +1,6 @@
 """A traced step as C: the pieces that the runtime calls, cut by what each number depends on.
 
-The step of a model is one traced function (`herglotz.export.equation.StepParts`). Its numbers fall into pieces that
+The step of a model is one traced function (`herglotz.export.step_parts.StepParts`). Its numbers fall into pieces that
 run at different times, and hand on what a later piece reads as members of two structures:
 
     prepare    what depends on h alone               members of NAME_problem, kept while h stays
@@ -21,6 +21,7 @@ import numpy as np
 from herglotz.export.equation import Equations, input_count
 from herglotz.export.lower.interpret import interpret
 from herglotz.export.lower.program import NAME, Program, Ref, literal
+from herglotz.export.step_parts import potential, step_parts
 
 PREPARE, BEGIN, EVALUATE, GAINS = range(4)
 Outputs = Mapping[str, Any]  # the place written to → its number, or the list of its numbers
@@ -47,7 +48,7 @@ class StepInC:
             "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}),
         }  # fmt: skip
         given = {name: self.program.given(name, size) for name, size in names.items()}
-        graph = equations.step_parts(explicit)
+        graph = step_parts(equations.model, explicit)
         arrays = interpret(self.program, graph, list(given.values()))
         guess, F, J, dp, ds, E = (list(x.ravel()) for x in arrays)
         self.earliest = self._earliest({name: given[name][0].statement for name in given})
@@ -197,7 +198,7 @@ def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: 
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program = Program(tables=step.program.tables)
     q = program.given("q", step.n)
-    graph = equations.potential
+    graph = potential(equations)
     V, slope = (np.full(n, 0.0, object) for n in (1, step.n)) if graph is None else interpret(program, graph, [q])
     outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
     head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
