@@ -145,9 +145,16 @@ class StepParts(nn.Module):
         end = form.end(delta, point)
         dp = (end.p1 + point.F) - start[1]  # as F is not quite 0
         assert point.J is not None
-        return self._leap(*start, ends[0]), point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3
+        return (
+            self._leap(start[0], start[1], start[3], ends[0]),
+            point.F,
+            point.J,
+            dp,
+            end.L + (end.p1 * (x - delta)).sum(-1),
+            point.rest.D3,
+        )
 
-    def _leap(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, here: Field) -> Tensor:
+    def _leap(self, q: Tensor, p: Tensor, h: Tensor, here: Field) -> Tensor:
         """The step with the mass at q = 0 and no network of (q̄, v): a guess."""
         model = self.model
         if not model.config.baseline:
