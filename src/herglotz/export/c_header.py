@@ -25,6 +25,7 @@ from herglotz.models import ContactLagrangian
 MARK = "herglotz-metadata: "
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
 MAX_ITERATIONS = 30
+MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
 MAX_WIDE = 24  # coordinates; with more, registers of n x n matrices outgrow the stack that some threads have
 
 TOP = """\
@@ -161,8 +162,9 @@ def c_source(
 ) -> str:
     """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two.
 
-    Without `derivatives` NAME_step_jacobian is left out: it is most of the work.
+    Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
     """
+    derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
     step = StepInC(equations, explicit and model.capabilities.explicit)
     emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_ITERATIONS, c_source, described, read_metadata
+from herglotz.export.c_header import MAX_DERIVATIVES, MAX_ITERATIONS, c_source, described, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.models import ContactLagrangian
@@ -113,8 +113,10 @@ class CompiledStepper:
         Raises
         ------
         InputError
-            As `step`.
+            As `step`, and beyond 8 coordinates.
         """
+        if self.dof > MAX_DERIVATIVES:
+            raise InputError(f"C has no derivatives beyond {MAX_DERIVATIVES} coordinates; use Stepper.linearise")
         q, p, s = state
         self._check(q, p, s)
         batch, size = s.shape, 2 * self.dof + 1

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from herglotz.export.equation import Equations, FieldAt, example, field_like, inverse
+from herglotz.export.equation import Equations, FieldAt, example, field_like
 from herglotz.export.trace import Graph, traced
 from herglotz.models import ContactLagrangian
 from herglotz.models.feature_kinetic import FeatureKinetic
@@ -107,7 +107,7 @@ class StepParts(nn.Module):
 
     def _explicit(self, start: Start, ends: Ends, delta: Tensor, _: Tensor, u: tuple[Tensor, ...]) -> Parts:
         h = start[3]
-        frog = Leapfrog(self.model, inverse, lambda _: ends[1])
+        frog = Leapfrog(self.model, field=lambda _: ends[1])
         move = frog(*start, ends[0], u[0] if u else None, True)
         assert move.dp is not None
         maker = model_equation(self.model, fold=False)

@@ -83,3 +83,11 @@ def test_order_4_stays_small(tmp_path):
         ["sh", "-c", limit, "sh", *command], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr[:2000]
+
+
+def test_many_coordinates_have_no_derivative_in_c(tmp_path):
+    # fails if the elimination of a large Jacobian is written out: tens of thousands of lines
+    path = export_c(small(9), tmp_path / "stepper.h", h=0.1, name="arm")
+    text = path.read_text()
+    assert "#define arm_DERIVATIVES 0" in text
+    assert "arm_slopes(const" not in text
