@@ -40,12 +40,17 @@ class Engine:
         self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
 
     def __call__(
-        self, state: State, h: Tensor, guess: Tensor, u: Tensor | None = None, low: State | None = None
+        self,
+        state: State,
+        h: Tensor,
+        guess: Tensor | None = None,
+        u: Tensor | None = None,
+        low: State | None = None,
     ) -> tuple[Step, State | None]:
         """The step with input u, and the rounding errors to carry on; `low` is what the step before has handed on."""
         if self.leapfrog is not None:
             return self._explicit(self.leapfrog, state, h, u, low)
-        return self._implicit(state, h, guess, u, low)
+        return self._implicit(state, h, state.q if guess is None else guess, u, low)
 
     def _explicit(
         self, frog: Leapfrog, state: State, h: Tensor, u: Tensor | None, low: State | None
