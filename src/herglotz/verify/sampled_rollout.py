@@ -1,4 +1,4 @@
-"""The rollouts on which one-step identities are measured, and the checks of single steps."""
+"""Rollouts with the derivative of every step, and the checks of single steps on them."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from herglotz.verify.subject import Subject
 
 
 @dataclass(frozen=True)
-class Walk:
-    """B rollouts of K steps with the derivative of every step, all measured on the map itself."""
+class SampledRollout:
+    """B rollouts of K steps with the derivative of every step, measured on the map itself."""
 
     q: Tensor  # (B, K+1, n)
     p: Tensor  # (B, K+1, n)
@@ -26,7 +26,7 @@ class Walk:
 
     @property
     def ok(self) -> Tensor:
-        """(B, K) whether the step converged and everything about it is finite."""
+        """Return whether each step converged with finite c and derivative, (B, K)."""
         finite = torch.isfinite(self.derivative).all(-1).all(-1) & torch.isfinite(self.c)
         return (self.status == Status.CONVERGED) & finite
 
@@ -36,13 +36,13 @@ class Walk:
         return self.c.shape[-1]
 
 
-def walk(subject: Subject, steps: int) -> Walk:
+def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     """Roll out from the subject's states and differentiate every step by autograd."""
     states, c, status = [subject.states], [], []
     with torch.no_grad():
         for _ in range(steps):
             step = subject.step(states[-1], subject.h)
-            # A failed sample stays where it was: it is counted, and its neighbours need finite inputs.
+            # A failed sample keeps its last state: its status counts it, and a batch needs finite inputs.
             bad = ~(torch.isfinite(step.state.q).all(-1) & torch.isfinite(step.state.p).all(-1))
             bad = bad | ~torch.isfinite(step.state.s)
             old = states[-1]
@@ -59,31 +59,31 @@ def walk(subject: Subject, steps: int) -> Walk:
     s = torch.stack([x.s for x in states], 1)
     start = (x[:, :-1].flatten(0, 1) for x in (q, p, s))
     _, D = flow_derivative(subject.flow(), *start)
-    return Walk(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
+    return SampledRollout(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
 
 
 def worst(values: Tensor) -> float:
-    """The largest entry; NaN, which fails every bound, if there is none or one is NaN."""
+    """Return the largest entry; NaN, which fails every bound, where `values` is empty or has a NaN."""
     return float(values.max()) if values.numel() else float("nan")
 
 
-def convergence(w: Walk) -> Check:
-    """Every step of every rollout converged."""
+def convergence(w: SampledRollout) -> Check:
+    """Check that every step of every rollout converged."""
     failed = w.status != Status.CONVERGED
     counts = ", ".join(f"{int((w.status == k).sum())} {k.name}" for k in Status if k and bool((w.status == k).any()))
     return Check.at_most("converged", "every step converges (share failed)", float(failed.double().mean()), 0.0, counts)
 
 
-def positive_factor(w: Walk) -> Check:
-    """Conformal factor c > 0 at every step: orientation is kept and FL⁻ exists."""
+def positive_factor(w: SampledRollout) -> Check:
+    """Check c > 0 at every step, so that FL⁻ exists and orientation is kept."""
     c = w.c[w.ok]
     return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
 
 
-def contact(w: Walk, bound: float, force: Forces | None = None) -> Check:
-    """DΦ̃ᵀ η(x1) = c η(x0) − F⁻dq0 − F⁺dq1, relative to the terms that cancel; without forces a contact map.
+def contact(w: SampledRollout, bound: float, force: Forces | None = None) -> Check:
+    """Check DΦ̃ᵀ η(x1) = c η(x0) − F⁻dq0 − F⁺dq1, relative to the terms that cancel.
 
-    The forces, where the subject has any, are those of the steps that are ok.
+    Without forces this is the contact property. `force` holds the forces at the steps that are ok.
     """
     p0, p1 = w.p[:, :-1][w.ok], w.p[:, 1:][w.ok]
     D, c = w.derivative[w.ok], w.c[w.ok]
@@ -98,8 +98,8 @@ def contact(w: Walk, bound: float, force: Forces | None = None) -> Check:
     return Check.at_most("contact", claim, worst(defect.abs().amax(-1) / size), bound)
 
 
-def volume(w: Walk, bound: float) -> Check:
-    """Volume factor det DΦ̃ = c^{n+1}, relative."""
+def volume(w: SampledRollout, bound: float) -> Check:
+    """Check the volume factor det DΦ̃ = c^{n+1}, relative."""
     n = w.q.shape[-1]
     ratio = torch.linalg.det(w.derivative[w.ok]) / w.c[w.ok] ** (n + 1)
     return Check.at_most("volume", "volume: det DΦ̃ = c^(n+1)", worst((ratio - 1).abs()), bound)
