@@ -33,8 +33,8 @@ def energy(q, p, s):
 
 
 def kicks():
-    numbers = [torch.tensor(x, dtype=torch.float64) for x in ([H / 2, H / 2], [[-H]], [[0.0]])]
-    return KickStepper(H, 0.2, True, 0.0, 1.0, *numbers)
+    drifts, cosines, sines = (torch.tensor(x, dtype=torch.float64) for x in ([H / 2, H / 2], [[-H]], [[0.0]]))
+    return KickStepper(H, 0.2, True, 0.0, 1.0, drifts, cosines, sines)
 
 
 SPLITTING = ContactSplitting(lambda q: (1 - q.cos()).sum(-1), 1.0, 0.2)
