@@ -14,8 +14,8 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.stepping.engine import Engine
 from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.single_step import SingleStep
 from herglotz.stepping.state import (
     State,
     Status,
@@ -60,11 +60,11 @@ class Composition(OneStepMethod):
         total = sum(fraction for _, fraction in stages)
         if not abs(total - 1.0) < 1e-12:
             raise InputError(f"the fractions of a composition must sum to 1, got {total:.15g}")
-        engines: dict[int, Engine] = {}
+        single_steps: dict[int, SingleStep] = {}
         for method, _ in stages:
             if not isinstance(method, Substeps):
-                engines[id(method)] = Engine(method, None, MAX_ITERATIONS, False)
-        self.stages, self.throw, self._engines = tuple(stages), throw, engines
+                single_steps[id(method)] = SingleStep(method, None, MAX_ITERATIONS, False)
+        self.stages, self.throw, self._single_steps = tuple(stages), throw, single_steps
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
         """One step of h > 0, scalar or (...): all stages. The status is that of the first stage that failed.
@@ -96,7 +96,7 @@ class Composition(OneStepMethod):
     def _part(self, method: Method, state: State, h: Tensor) -> Step:
         if isinstance(method, Substeps):
             return method.substep(state, h)
-        return self._engines[id(method)](state, h, state.q)[0]
+        return self._single_steps[id(method)](state, h, state.q)[0]
 
 
 def yoshida(method: Method, order: int = 4, *, throw: bool = False) -> Composition:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.stepping.events import Event, Watch
-from herglotz.stepping.rollout import Drive, Plan, SingleStep, Track, roll_out
+from herglotz.stepping.rollout import Drive, OneStep, Plan, Track, roll_out
 from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
 
 
@@ -114,7 +114,7 @@ class OneStepMethod(ABC):
         """Whether steps want a guess."""
         return False
 
-    def _single_step(self) -> SingleStep:
+    def _single_step(self) -> OneStep:
         """The function that a rollout's steps are taken by."""
         return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  one signature for all
 

@@ -55,7 +55,7 @@ class Track(NamedTuple):
 
 
 # (state, h, guess, u, low) → the step and its `low`; a guess of None is the step's own.
-SingleStep = Callable[[Any, Tensor, Tensor | None, Tensor | None, Any], tuple[Step, Any]]
+OneStep = Callable[[Any, Tensor, Tensor | None, Tensor | None, Any], tuple[Step, Any]]
 Check = Callable[[Step, Any, Tensor, Tensor | None], None]  # (step, state, h, u), raises `StepError`
 
 
@@ -106,7 +106,7 @@ class Drive:
         Looks at every step and raises, or None.
     """
 
-    single_step: Callable[[], SingleStep]
+    single_step: Callable[[], OneStep]
     h: Tensor
     plan: Plan
     inputs: Tensor | None = None
@@ -124,7 +124,7 @@ class Drive:
         """The step, where all are equal: one tensor, so that what depends on h alone is kept."""
         return self.h[..., 0] if self.h.stride(-1) == 0 else None
 
-    def take(self, single: SingleStep, k: int, carry: Carry) -> tuple[Step, Any]:
+    def take(self, single: OneStep, k: int, carry: Carry) -> tuple[Step, Any]:
         """Step k as the events leave it."""
         state, low = carry.state, carry.low
         h = self.h[..., k] if self.equal is None else self.equal

@@ -8,10 +8,10 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
 from herglotz.models import capabilities
-from herglotz.stepping.engine import Engine, driven_by
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised, linearise
 from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.single_step import SingleStep, driven_by
 from herglotz.stepping.state import (
     Crossings,
     Rollout,
@@ -160,5 +160,5 @@ class Stepper(OneStepMethod):
             lines = explain_step(driven_by(self.L_d, u), state, h, max_iterations=self.max_iterations)
             raise StepError("; ".join([str(error), *lines[:1]])) from None
 
-    def _single_step(self) -> Engine:
-        return Engine(self.L_d, self.tol, self.max_iterations, self.explicit)
+    def _single_step(self) -> SingleStep:
+        return SingleStep(self.L_d, self.tol, self.max_iterations, self.explicit)

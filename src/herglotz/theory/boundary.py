@@ -17,7 +17,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
 from herglotz.mechanics.newton import find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
-from herglotz.stepping.rollout import Drive, Plan, SingleStep, roll_out
+from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Rollout, State, Status, Step, StepError, step_sizes
 from herglotz.stepping.stepper import Stepper
 from herglotz.theory.action import curve_action, curve_partials
@@ -146,7 +146,7 @@ def initial_value(
     end = State(q1.expand(P.D1.shape), momentum_plus(P), s0 + P.L)
     first = Step(end, P.c, torch.zeros_like(P.L, dtype=torch.uint8), torch.zeros_like(P.L), 0)
     later = Stepper(L_d)
-    single: SingleStep = lambda state, h, guess, *_: (first if state is start else later.step(state, h, guess), None)  # noqa: E731
+    single: OneStep = lambda state, h, guess, *_: (first if state is start else later.step(state, h, guess), None)  # noqa: E731
     track = roll_out(start, Drive(lambda: single, h_all, Plan(h_all.shape[-1])))
     q, p, s = track.states
     return Rollout(q, p, s, track.sigma, track.status, track.residual)

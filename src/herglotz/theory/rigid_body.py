@@ -21,7 +21,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
-from herglotz.stepping.rollout import Drive, Plan, SingleStep, roll_out
+from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes, throw_failure
 from herglotz.theory.rotations import cayley, hat
 
@@ -134,7 +134,7 @@ class RigidBodyStepper:
         """Step K times from (R, M, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
         state = _checked(BodyState(R, M, torch.zeros_like(M[..., 0]) if s is None else s))
         h_all = step_sizes(check_h(h, M), steps)
-        single: SingleStep = lambda state, h, *_: (self.step(state, h), None)  # noqa: E731
+        single: OneStep = lambda state, h, *_: (self.step(state, h), None)  # noqa: E731
         track = roll_out(state, Drive(lambda: single, h_all, Plan(h_all.shape[-1], every), extrapolate=False))
         R, M, s = track.states
         return BodyRollout(R, M, s, track.sigma, track.status, track.residual)

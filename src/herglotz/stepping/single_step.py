@@ -16,14 +16,14 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
-from herglotz.stepping.equation import End, Equation, ModelEquation, PartialsEquation, StepOfModel, model_equation
+from herglotz.stepping.equation import End, ModelEquation, PartialsEquation, StepEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
 from herglotz.stepping.newton import Increments, find_root, status_of
 from herglotz.stepping.state import State, Status, Step
 
 
-class Engine:
+class SingleStep:
     """Steps whose inputs are already checked; keeps what consecutive steps share (the force at the common point).
 
     In float32 steps are taken in increments Δ = q1 − q0 where L_d offers them, and rollouts sum them compensated:
@@ -105,7 +105,7 @@ class Engine:
 
     def _equation(
         self, L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, increments: bool, order: int
-    ) -> Equation:
+    ) -> StepEquation:
         """The step equation: by terms for a model, else by the partials of L_d."""
         if not self._tried:
             self._tried, self._terms = True, model_equation(self.L_d)
