@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.training.lifted import Path
-from herglotz.training.shooting import ShootingProblem
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import Path
 
-FOLDS = 5
+FOLDS = 5  # fifths of every trajectory, in time
 MARGIN = 1.05  # an error lower by less than this factor is no reason for a weaker prior or a richer level
+
+
+class Judged(Protocol):
+    """A fit that knows its errors over held-out blocks of time."""
+
+    def held_out_errors(self) -> Tensor:
+        """RMS of every fold, (FOLDS,), in units of q."""
+        ...
+
+
+F = TypeVar("F", bound=Judged)
 
 
 def held_out_errors(
@@ -66,3 +78,25 @@ def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
     """The smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
+
+
+def strongest_not_beaten(
+    departures: Sequence[float], fit: Callable[[float], F | None]
+) -> tuple[F, float, dict[float, Tensor]] | None:
+    """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
+
+    Returns
+    -------
+    tuple or None
+        (fit, its departure, held-out errors of all that could be fitted); None where none could.
+    """
+    fits: dict[float, F] = {}
+    held_out: dict[float, Tensor] = {}
+    for departure in sorted(departures, reverse=True):
+        found = fit(departure)
+        if found is not None:
+            fits[departure], held_out[departure] = found, found.held_out_errors()
+    if not fits:
+        return None
+    chosen = simplest_not_beaten(held_out)
+    return fits[chosen], chosen, held_out

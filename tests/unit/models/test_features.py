@@ -12,7 +12,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.features import LIBRARIES, expand, parse
 from herglotz.stepping import Stepper
 from herglotz.systems import scene
-from herglotz.training.residual import MANY, ResidualProblem
+from herglotz.training.problems.one_step import MANY, ResidualProblem
 
 ANGLES, LENGTHS = (True, True), (False, False)
 
