@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol, TypeVar
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -25,6 +26,15 @@ class Judged(Protocol):
 
 
 F = TypeVar("F", bound=Judged)
+
+
+@dataclass(frozen=True)
+class Chosen(Generic[F]):
+    """The fit whose strength of the prior held-out blocks chose, and the errors of all that were tried."""
+
+    fit: F
+    departure: float
+    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 def held_out_errors(
@@ -82,13 +92,10 @@ def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
 
 def strongest_not_beaten(
     departures: Sequence[float], fit: Callable[[float], F | None]
-) -> tuple[F, float, dict[float, Tensor]] | None:
+) -> Chosen[F] | None:
     """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
 
-    Returns
-    -------
-    tuple or None
-        (fit, its departure, held-out errors of all that could be fitted); None where none could.
+    None where none could be fitted.
     """
     fits: dict[float, F] = {}
     held_out: dict[float, Tensor] = {}
@@ -99,4 +106,4 @@ def strongest_not_beaten(
     if not fits:
         return None
     chosen = simplest_not_beaten(held_out)
-    return fits[chosen], chosen, held_out
+    return Chosen(fits[chosen], chosen, held_out)

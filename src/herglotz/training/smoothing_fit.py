@@ -17,7 +17,7 @@ from torch import Tensor
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
-from herglotz.training.cross_validation import left_out_errors, strongest_not_beaten
+from herglotz.training.cross_validation import Chosen, left_out_errors, strongest_not_beaten
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM, heavy_tailed
@@ -72,16 +72,7 @@ class SmoothingFit:
         return left_out_errors((by * r).flatten(), problem.data, hat) * problem.sigma
 
 
-@dataclass(frozen=True)
-class SmoothedStrength:
-    """The fit whose prior held-out blocks chose, and the errors of all that were tried."""
-
-    fit: SmoothingFit
-    departure: float
-    held_out: dict[float, Tensor]  # (FOLDS,) for every strength tried
-
-
-def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> SmoothedStrength | None:
+def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[SmoothingFit] | None:
     """Fit parameters and all states to positions, and find both noises, the steps' from as much as the data's on.
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
@@ -90,7 +81,7 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Smoothe
 
     Returns
     -------
-    SmoothedStrength or None
+    Chosen or None
         None where a step near the data has no solution.
     """
     config = task.config
@@ -136,7 +127,7 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Smoothe
         return found
 
     found = strongest_not_beaten(departures, fit)
-    return SmoothedStrength(last, weakest, {}) if found is None else SmoothedStrength(*found)
+    return found or Chosen(last, weakest, {})
 
 
 def _noises(fit: SmoothingFit) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.training.cross_validation import held_out_errors, strongest_not_beaten
+from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
 from herglotz.training.first_states import first_states
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
@@ -61,15 +61,6 @@ class TrajectoryFit:
         problem = self.problem
         _, A, _ = problem.normal_equations(self.result.x)
         return held_out_errors(problem, self.path, self.theta, A)
-
-
-@dataclass(frozen=True)
-class ChosenStrength:
-    """The fit whose prior held-out blocks chose, and the errors of all that were tried."""
-
-    fit: TrajectoryFit
-    departure: float
-    held_out: dict[float, Tensor]  # (FOLDS,) for every strength tried
 
 
 def segment_lengths(data: Trajectories) -> list[int]:
@@ -193,7 +184,7 @@ def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | N
     return None if first is None else stages.grow(first, sigma)
 
 
-def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> ChosenStrength | None:
+def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[TrajectoryFit] | None:
     """Fit parameters and states to positions.
 
     Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
@@ -203,7 +194,7 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
 
     Returns
     -------
-    ChosenStrength or None
+    Chosen or None
         From the longest segments that could be fitted; None if the model cannot follow even the shortest.
     """
     if model.potential.network is None:
@@ -232,7 +223,7 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
     weakest = max(task.config.departures)
     noise = (fit("noise", weakest) or last).noise
     found = strongest_not_beaten(task.config.departures, lambda departure: fit(f"prior {departure:g}", departure))
-    return ChosenStrength(last, task.config.departures[0], {}) if found is None else ChosenStrength(*found)
+    return found or Chosen(last, task.config.departures[0], {})
 
 
 def _without_outliers(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -87,23 +87,19 @@ class StatesProblem(LeastSquares):
         """States (..., 2n+1) from the unknowns (..., d), with s = 0 where s is none of them."""
         return torch.cat([states, states.new_zeros(*states.shape[:-1], 2 * self.n + 1 - self.d)], -1)
 
-
-class StateEquations(Protocol):
-    """A problem over parameters and states whose equations of the states alone can be had (`held`)."""
-
     def cost(self, x: Tensor) -> Tensor:
-        """See `solvers.levenberg_marquardt.SumOfSquares`."""
-        ...
+        """½|r|², a scalar; infinite where a step has no solution."""
+        raise NotImplementedError
 
-    def normal_equations(self, x: Tensor, *, held: bool) -> tuple[Tensor, Any, Tensor]:
-        """The same; `held`: of the states alone, the parameters as they are."""
-        ...
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
+        """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
+        raise NotImplementedError
 
 
 class StatesOnly:
-    """Such a problem with the parameters held: only the states are fitted."""
+    """A problem over parameters and states with the parameters held: only the states are fitted."""
 
-    def __init__(self, problem: StateEquations, theta: Tensor):
+    def __init__(self, problem: StatesProblem, theta: Tensor):
         self.problem, self.theta = problem, theta
 
     def full(self, states: Tensor) -> Tensor:

@@ -105,8 +105,10 @@ class OneStep(LeastSquares):
             r, J = self._linearised(x, part, carried)
             J = (J / deviation[part][..., None]).reshape(-1, len(x))
             r = (r / deviation[part]).reshape(-1)
-            cost, by = self.loss(r), self.root_weights(r)
-            J, r = by[:, None] * J, by * r
+            cost = self.loss(r)
+            if self.freedom is not None:
+                by = self.root_weights(r)
+                J, r = by[:, None] * J, by * r
             sums.add(lane, J.T @ J, J.T @ r, cost)
         A, b, cost = sums.total()
         of_prior = self.prior_equations(x[: self.P])
