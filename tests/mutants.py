@@ -18,7 +18,7 @@ from pathlib import Path
 from queue import Queue
 
 ROOT = Path(__file__).resolve().parents[1]
-M, S, K, V = "tests/unit/mechanics", "tests/unit/systems", "tests/unit/stepping", "tests/verification"
+M, S, K, V = "tests/unit/mechanics", "tests/unit/scenes", "tests/unit/stepping", "tests/verification"
 MUTANTS = [
     # mechanics
     ("mechanics/legendre.py", "return -D1 / P.c[..., None]", "return -D1", f"{M}/test_partials.py::test_legendre_transforms_of_the_exact_lagrangian"),
@@ -71,17 +71,17 @@ MUTANTS = [
     ("mechanics/hamilton_jacobi.py", "return join(q1, p1, s1) - join(*prolongation(S1, q1))", "return join(q1, p1, s1) - join(*prolongation(S1, q))", f"{V}/test_discrete_hamilton_jacobi.py"),
     ("mechanics/regularity.py", "torch.minimum(*beside) / size", "size / torch.minimum(*beside)", f"{K}/test_explain.py"),
     ("mechanics/rotations.py", "0.5 * _sinc(0.25 * x) ** 2", "0.5 * _sinc(x) ** 2", f"{M}/test_rotations.py"),
-    # systems
-    ("systems/exact.py", "- (D23 * Y_s).sum(-1)", "", f"{S}/test_exact.py"),
-    ("systems/exact.py", "inverse - p0[..., :, None]", "inverse + p0[..., :, None]", f"{S}/test_exact.py"),
-    ("systems/exact.py", ".real > 0).all(-1)", ".real.prod(-1) > 0)", f"{S}/test_exact.py::test_beyond_a_conjugate_point_is_nan_with_a_reason"),
-    ("systems/galerkin.py", "[..., ends] - moved[..., :-1, :-1]", "[..., ends] + moved[..., :-1, :-1]", f"{S}/test_rules.py"),
-    ("systems/galerkin.py", "0.5 - 0.1 * ROOT5", "0.5 - 0.11 * ROOT5", f"{S}/test_rules.py::test_order_on_the_damped_pendulum"),
-    ("systems/rules.py", "L_d(q1, q0, s0 + x, -h)", "L_d(q1, q0, s0, -h)", f"{S}/test_rules.py"),
-    ("systems/rules.py", "h * L(q1, v, s0 + x)", "h * L(q1, v, s0)", f"{S}/test_rules.py"),
-    ("systems/parachute.py", "B**2 - 4 * (B - a) * p", "B**2 - 4 * (B + a) * p", f"{S}/test_closed_forms.py"),
-    ("systems/linear_drag.py", "h * expm1w(-gamma * h) / (2 * m)", "h * expm1w(gamma * h) / (2 * m)", f"{S}/test_drag.py"),
-    ("systems/path.py", "lagrangian(*path(t[..., 0]), s)", "lagrangian(*path(t[..., 0]), 0 * s)", f"{S}/test_path.py"),
+    # scenes
+    ("scenes/exact.py", "- (D23 * Y_s).sum(-1)", "", f"{S}/test_exact.py"),
+    ("scenes/exact.py", "inverse - p0[..., :, None]", "inverse + p0[..., :, None]", f"{S}/test_exact.py"),
+    ("scenes/exact.py", ".real > 0).all(-1)", ".real.prod(-1) > 0)", f"{S}/test_exact.py::test_beyond_a_conjugate_point_is_nan_with_a_reason"),
+    ("scenes/galerkin.py", "[..., ends] - moved[..., :-1, :-1]", "[..., ends] + moved[..., :-1, :-1]", f"{S}/test_rules.py"),
+    ("scenes/galerkin.py", "0.5 - 0.1 * ROOT5", "0.5 - 0.11 * ROOT5", f"{S}/test_rules.py::test_order_on_the_damped_pendulum"),
+    ("scenes/rules.py", "L_d(q1, q0, s0 + x, -h)", "L_d(q1, q0, s0, -h)", f"{S}/test_rules.py"),
+    ("scenes/rules.py", "h * L(q1, v, s0 + x)", "h * L(q1, v, s0)", f"{S}/test_rules.py"),
+    ("scenes/parachute.py", "B**2 - 4 * (B - a) * p", "B**2 - 4 * (B + a) * p", f"{S}/test_closed_forms.py"),
+    ("scenes/linear_drag.py", "h * expm1w(-gamma * h) / (2 * m)", "h * expm1w(gamma * h) / (2 * m)", f"{S}/test_drag.py"),
+    ("scenes/path.py", "lagrangian(*path(t[..., 0]), s)", "lagrangian(*path(t[..., 0]), 0 * s)", f"{S}/test_path.py"),
     # models
     ("models/model.py", "(c - 1.0) * (s0 - h / 2 * t.V0)", "(c - 1.0) * s0", "tests/unit/models/test_ladder_orders.py::test_every_weight_gives_second_order"),
     ("models/model.py", "(t.g / 2).exp() * t.K", "t.K", "tests/unit/models/test_ladder_orders.py::test_every_weight_gives_second_order"),

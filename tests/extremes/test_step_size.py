@@ -12,8 +12,8 @@ from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts, st
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.export.c_wrapper import compiler
+from herglotz.scenes import scene
 from herglotz.stepping import Status, Stepper, explain_step
-from herglotz.systems import scene
 
 DTYPES = [torch.float32, torch.float64]
 

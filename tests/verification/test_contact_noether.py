@@ -15,8 +15,8 @@ from herglotz.mechanics import (
 )
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.network import Network
+from herglotz.scenes import left, midpoint_heun, scene
 from herglotz.stepping import EvolutionStepper, State, Stepper
-from herglotz.systems import left, midpoint_heun, scene
 
 H = 0.1  # the step
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 import herglotz.verify.legendre as rows
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.verify import verify
 from herglotz.verify.action import fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.legendre import left_formalism

@@ -13,9 +13,9 @@ from herglotz.mechanics import (
     right_equations,
 )
 from herglotz.mechanics.continuous import derivatives
+from herglotz.scenes import scene
+from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State
-from herglotz.systems import scene
-from herglotz.systems.printed_parachute import MAP_START, PrintedParachute
 from paper_errata.erratum import (
     PARACHUTE,
     Erratum,

@@ -21,8 +21,8 @@ from herglotz.mechanics import (
     relatedness_defect,
 )
 from herglotz.mechanics.continuous import jacobian
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from paper_errata.erratum import (
     OSCILLATOR,
     PARACHUTE,

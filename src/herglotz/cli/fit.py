@@ -67,8 +67,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--restarts", type=count, metavar="R",
-        help="draws of the weights that race for a part of the one-step fit's iterations (default: 4 for a correction "
-        "of one layer, else 1)",
+        help="random initialisations of the one-step fit; the best after 30 iterations is kept (default: 4 for a "
+        "correction of one layer, else 1)",
     )  # fmt: skip
     parser.add_argument(
         "--every", type=count, default=1, metavar="M",
@@ -145,6 +145,8 @@ def run(arguments: argparse.Namespace) -> int:
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:
     """Print what was reached, for people, and what to do next."""
+    from herglotz.training import Plan
+
     m, data = result.metrics, result.data
     unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
     kept, total = sum(result.train_lengths), data.samples
@@ -158,6 +160,9 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         ("damping rate", _show(m.get("rate"), f"per {'unit of time' if data.time_unit == '1' else data.time_unit}")),
         ("time", _show(m.get("seconds"), "s")),
     ]
+    print("Plan (what was decided, and why):")
+    print(Plan.from_dict(m["plan"]).table())
+    print("Result:")
     print_table([row for row in rows if not row[1].startswith("None")])
     if m.get("extrapolation_status") not in (None, "ok"):
         print(f"Note: {m['extrapolation_status']}")

@@ -24,7 +24,7 @@ def __getattr__(name: str) -> str:
     """`DESCRIPTION`, the text of --help, made when it is read: the list of scenes comes from their registry."""
     if name != "DESCRIPTION":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from herglotz.systems import scene, scene_names
+    from herglotz.scenes import scene, scene_names
 
     return ABOUT.format(scenes="".join(f"  {name:<20}{scene(name).description}\n" for name in scene_names()))
 
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = parse_parameters(arguments.param)
 
     from herglotz.data import save, simulate
-    from herglotz.systems import scene
+    from herglotz.scenes import scene
 
     system = scene(arguments.scene, **parameters)
     h = system.h if arguments.h is None else arguments.h

@@ -18,7 +18,7 @@ Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor
 
 
 class Scene(Protocol):
-    """What `simulate` needs of a scene; those of `herglotz.systems` have it."""
+    """What `simulate` needs of a scene; those of `herglotz.scenes` have it."""
 
     @property
     def name(self) -> str: ...  # noqa: D102

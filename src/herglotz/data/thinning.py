@@ -2,39 +2,37 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 
-if TYPE_CHECKING:
-    from herglotz.data.trajectories import Trajectories
 
-
-def thinned(data: Trajectories, every: int) -> Trajectories:
-    """Samples 0, m, 2m, … of every trajectory.
-
-    An input acts from its sample to the next, so that of a long step is the mean of those it covers, weighted by
-    their time: the impulse is kept.
+def kept_rows(lengths: Sequence[int], every: int) -> list[Tensor]:
+    """Rows 0, m, 2m, … of every trajectory in the concatenation, a tensor a trajectory.
 
     Raises
     ------
     InputError
-        If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
+        If `every` is not a whole number >= 1.
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be a whole number >= 1, got {every!r}")
-    spans = list(zip(data.offsets, data.lengths, strict=True))
-    kept = [torch.arange(first, first + length, every) for first, length in spans]
-    rows = torch.cat(kept).to(data.t.device)
-    u = None
-    if data.u is not None:
-        u = torch.cat([_means(data.t[a : a + n], data.u[a : a + n], every) for a, n in spans])
-    columns = {name: x[rows] for name in ("t", "q", "s", "p") if (x := getattr(data, name)) is not None}
-    return replace(data, **columns, u=u, lengths=tuple(len(x) for x in kept))
+    rows = torch.arange(sum(lengths)).split(list(lengths))
+    return [own[::every] for own in rows]
+
+
+def mean_inputs(
+    t: Tensor,  # (N,) time
+    u: Tensor,  # (N, m) input, which acts from its sample to the next
+    lengths: Sequence[int],
+    every: int,
+) -> Tensor:
+    """Return the time-weighted mean of u over each long step, (kept, m): the impulse is kept."""
+    spans = zip(t.split(list(lengths)), u.split(list(lengths)), strict=True)
+    return torch.cat([_means(own_t, own_u, every) for own_t, own_u in spans])
 
 
 def _means(t: Tensor, u: Tensor, every: int) -> Tensor:

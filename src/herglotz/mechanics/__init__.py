@@ -9,6 +9,7 @@ from herglotz.mechanics.continuous import (
     herglotz_acceleration,
 )
 from herglotz.mechanics.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
+from herglotz.mechanics.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.mechanics.gauge import Rescaled, joined_action
 from herglotz.mechanics.generating import (
     GeneratingFunction,
@@ -55,7 +56,6 @@ from herglotz.mechanics.jacobi import (
     sharp,
     sharp_bivector,
 )
-from herglotz.mechanics.jets import Function, Jet, jet, prolongation
 from herglotz.mechanics.left import LeftLagrangian, left_momenta
 from herglotz.mechanics.legendre import (
     herglotz_residual,
@@ -105,8 +105,8 @@ __all__ = [
     "Forced",
     "Forces",
     "Function",
+    "FunctionGerm",
     "GeneratingFunction",
-    "Jet",
     "LeftHamiltonian",
     "LeftLagrangian",
     "LegendrianDefect",
@@ -141,6 +141,7 @@ __all__ = [
     "flat",
     "flow_derivative",
     "generating_function",
+    "germ",
     "hamilton_jacobi_residual",
     "hat",
     "herglotz_acceleration",
@@ -151,7 +152,6 @@ __all__ = [
     "invariance_defect",
     "inverse_cayley",
     "jacobi_bracket",
-    "jet",
     "joined_action",
     "left_equations",
     "left_generating_function",

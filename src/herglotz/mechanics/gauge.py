@@ -35,7 +35,7 @@ class Rescaled:
     InputError
         If a is 0 or a number is not finite.
 
-    Source: trap 3 of `mathematics.md` with f(q, s) = a s + b.
+    Source: trap 3 of `docs/mathematics.md` with f(q, s) = a s + b.
     """
 
     L_d: DiscreteLagrangian

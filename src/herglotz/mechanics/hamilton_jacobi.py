@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Flow
+from herglotz.mechanics.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.mechanics.jacobi import join
-from herglotz.mechanics.jets import Function, Jet, jet, prolongation
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 from herglotz.mechanics.root import find_root
 
@@ -27,13 +27,13 @@ class Quadratic:
 
     def __call__(self, q: Tensor) -> Tensor:
         """S(q), shape (...)."""
-        return self.jet(q).S
+        return self.germ(q).S
 
-    def jet(self, q: Tensor) -> Jet:
+    def germ(self, q: Tensor) -> FunctionGerm:
         """Value and derivatives."""
         force = (self.alpha @ q[..., None])[..., 0]
         S = (0.5 * force * q + self.beta * q).sum(-1) + self.delta
-        return Jet(S, force + self.beta, self.alpha.expand(*q.shape, q.shape[-1]))
+        return FunctionGerm(S, force + self.beta, self.alpha.expand(*q.shape, q.shape[-1]))
 
 
 @dataclass(frozen=True)
@@ -49,11 +49,11 @@ class PointSource:
         """S¹(y), shape (...)."""
         return self.s + self.L_d(self.q, y, self.s, torch.as_tensor(self.h, dtype=y.dtype, device=y.device))
 
-    def jet(self, y: Tensor) -> Jet:
+    def germ(self, y: Tensor) -> FunctionGerm:
         """Value and derivatives."""
         q = self.q.expand(y.shape)
         P = partials(self.L_d, q, y, self.s.expand(y.shape[:-1]), self.h, order=2)
-        return Jet(self.s + P.L, P.D2, P.D22)
+        return FunctionGerm(self.s + P.L, P.D2, P.D22)
 
 
 def projected_flow(flow: Flow, S: Function, q: Tensor) -> Tensor:
@@ -73,11 +73,11 @@ def projected_step(
 
     Source: projected discrete flow of the paper, with S for its s.
     """
-    s0 = jet(S0, q0).S
+    s0 = germ(S0, q0).S
     eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device)
 
     def equations(q1: Tensor) -> tuple[Tensor, tuple[Tensor]]:
-        at = jet(S1, q1)
+        at = germ(S1, q1)
         P = partials(H_plus, q0, at.dS, s0, h, order=2)
         return q1 - P.D2, (eye - P.D22 @ at.d2S,)
 
@@ -87,8 +87,8 @@ def projected_step(
 def commutation_defect(flow: Flow, S0: Function, S1: Function, q: Tensor) -> Tensor:
     """Φ̃(γ^k(q)) − γ^{k+1}(Φ̃^γ(q)), shape (..., 2n+1), for any map Φ̃ of T*Q × R; its first n components are zero.
 
-    For the flow of an L_d it is zero on an open set of q exactly if S solves the discrete Hamilton–Jacobi equation
-    there.
+    For the flow of an L_d, S solves the right and the left discrete Hamilton–Jacobi equation on an open set of q
+    exactly where this defect is zero; the right equation alone does not suffice (erratum E10).
 
     Source: Theorem 3 of the paper; γ^{k+1} has dS^{k+1} (erratum E8).
     """
@@ -113,7 +113,7 @@ def riccati_step(P: Partials, S: Quadratic) -> Quadratic:
     Quadratic
         Not finite at a caustic, where A + cα is singular.
 
-    Source: section 3 of `mathematics.md`.
+    Source: section 3 of `docs/mathematics.md`.
     """
     c = P.c
     pivot = P.D11 + c[..., None, None] * S.alpha

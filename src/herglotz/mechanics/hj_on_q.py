@@ -12,8 +12,8 @@ from __future__ import annotations
 from torch import Tensor
 
 from herglotz.mechanics.continuous import Hamiltonian, gradient
+from herglotz.mechanics.function_germ import Function, prolongation
 from herglotz.mechanics.jacobi import Field, join
-from herglotz.mechanics.jets import Function, prolongation
 
 
 def energy_on_section(H: Hamiltonian, F: Function, q: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,7 +40,7 @@ def section_hamilton_jacobi_residual(H: Hamiltonian, gamma: Section, q: Tensor, 
 
     Where `section_asymmetry` is zero, this is zero exactly where X_H is tangent to the image of γ.
 
-    Source: section 6 of `mathematics.md`; for the damped oscillator γ = 2s/q is a solution.
+    Source: section 6 of `docs/mathematics.md`; for the damped oscillator γ = 2s/q is a solution.
     """
     p, _, g_s = section_derivatives(gamma, q, s)
     P = derivatives(lambda q, _, s: H(q, gamma(q, s), s), q, q, s)
@@ -67,7 +67,7 @@ def discrete_section_residuals(
 
     γ0 and γ1 solve the discrete equation if the second vanishes wherever the first does, on an open set of (q0, s0).
 
-    Source: section 6 of `mathematics.md`.
+    Source: section 6 of `docs/mathematics.md`.
     """
     P = partials(L_d, q0, q1, s0, h)
     return gamma0(q0, s0) - momentum_minus(P), gamma1(q1, s0 + P.L) - momentum_plus(P)

@@ -20,8 +20,8 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.contact import contact_form
 from herglotz.mechanics.continuous import jacobian
+from herglotz.mechanics.function_germ import Function
 from herglotz.mechanics.jacobi import Triple, join, sharp_bivector, split
-from herglotz.mechanics.jets import Function
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,10 @@ from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
-from herglotz.models.fourth import Bend, missing
 from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
+from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
@@ -233,7 +233,7 @@ class ContactLagrangian(nn.Module):
         assert not isinstance(kinetic, PositionKinetic)
         assert not isinstance(damping, AffineDamping)
         rate = phase.q0.new_zeros(()) if damping is None else damping.rate
-        return missing(Bend(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
+        return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
     def _forces(
         self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None

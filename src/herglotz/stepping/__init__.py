@@ -8,6 +8,7 @@ from herglotz.stepping.evolution import EvolutionStepper
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.hopf_lax import HopfLax, Propagated, hopf_lax
 from herglotz.stepping.legendrian import LegendrianStepper, legendrian_relation
+from herglotz.stepping.linearise import Linearised
 from herglotz.stepping.newton import Solution, Status, solve, solve_step
 from herglotz.stepping.rotation import BodyRollout, BodyState, BodyStep, RigidBodyStepper
 from herglotz.stepping.splitting import ContactSplitting, linear_damping
@@ -26,6 +27,7 @@ __all__ = [
     "EvolutionStepper",
     "HopfLax",
     "LegendrianStepper",
+    "Linearised",
     "Propagated",
     "RigidBodyStepper",
     "Rollout",

@@ -16,7 +16,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
 from herglotz.mechanics.action import curve_action, curve_partials
-from herglotz.mechanics.jets import Function, Jet, jet
+from herglotz.mechanics.function_germ import Function, FunctionGerm, germ
 from herglotz.mechanics.root import find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
 from herglotz.stepping.caustics import Opening, opening
@@ -121,7 +121,7 @@ def family_value(
     throw: bool,
 ) -> Curve:
     """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0)."""
-    return _critical(L_d, guess, [y], None, h, lambda q0: jet(S, q0), throw, beyond)
+    return _critical(L_d, guess, [y], None, h, lambda q0: germ(S, q0), throw, beyond)
 
 
 def initial_value(
@@ -167,13 +167,13 @@ def _critical(
     ends: list[Tensor],  # [q_N], or [q_0, q_N]
     s0: Tensor | None,  # None: S(q_0)
     h: Tensor,
-    start: Callable[[Tensor], Jet | None],
+    start: Callable[[Tensor], FunctionGerm | None],
     throw: bool,
     beyond: bool,
 ) -> Curve:
     n, fixed = ends[-1].shape[-1], len(ends) == 2
 
-    def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, Jet | None]:
+    def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, FunctionGerm | None]:
         interior = x.unflatten(-1, guess.shape[-2:]) if x.shape[-1] else guess
         q = torch.cat([*(e[..., None, :] for e in ends[:-1]), interior, ends[-1][..., None, :]], -2)
         S = start(q[..., 0, :])
@@ -226,7 +226,7 @@ def _critical(
     return out
 
 
-def _system(P: Partials, S: Jet | None) -> tuple[Tensor, Blocks]:
+def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
     """The equations R_k = 0 at the unknown points and their blocks for (δq_k, δs_k)."""
     batch = (slice(None),) * (P.L.ndim - 1)
     later, earlier = (*batch, slice(1, None)), (*batch, slice(None, -1))
@@ -259,7 +259,7 @@ def _block(qq: Tensor, qs: Tensor, sq: Tensor, ss: Tensor) -> Tensor:
     return torch.cat([torch.cat([qq, qs[..., None]], -1), bottom[..., None, :]], -2)
 
 
-def _parameters(q0: Tensor, S: Jet | None) -> Tensor:
+def _parameters(q0: Tensor, S: FunctionGerm | None) -> Tensor:
     """Derivative of (q_0, p_0, s_0) by the family's parameter: p_0 at fixed q_0 and s_0, or q_0 along dS."""
     eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device).expand(*q0.shape, q0.shape[-1])
     if S is None:

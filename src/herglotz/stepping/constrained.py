@@ -51,7 +51,7 @@ class ConstrainedStepper:
     throw
         Raise `StepError` at the first sample that fails.
 
-    Source: section 6 of `mathematics.md`.
+    Source: section 6 of `docs/mathematics.md`.
     """
 
     def __init__(

@@ -43,7 +43,7 @@ class EvolutionStepper:
     InputError
         If `field` is neither of the two.
 
-    Source: section 6 of `mathematics.md`.
+    Source: section 6 of `docs/mathematics.md`.
     """
 
     def __init__(

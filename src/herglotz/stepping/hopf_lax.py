@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.mechanics.jets import Function, Jet
+from herglotz.mechanics.function_germ import Function, FunctionGerm
 from herglotz.stepping.boundary import Curve, family_value
 from herglotz.stepping.newton import Status
 from herglotz.stepping.state import step_sizes
@@ -91,9 +91,9 @@ class Propagated:
 
     def __call__(self, y: Tensor) -> Tensor:
         """S^{k+N}(y), shape (...)."""
-        return self.jet(y).S
+        return self.germ(y).S
 
-    def jet(self, y: Tensor) -> Jet:
+    def germ(self, y: Tensor) -> FunctionGerm:
         """Value and derivatives."""
         out = hopf_lax(self.L_d, self.S, y, h=self.h, steps=self.steps)
-        return Jet(out.S, out.dS, out.d2S)
+        return FunctionGerm(out.S, out.dS, out.d2S)

@@ -43,7 +43,7 @@ def legendrian_relation(
 ) -> Triple:
     """The point of the relation over (q0, q1, s0), in Darboux coordinates of the contact product with τ = c.
 
-    Source: section 6 of `mathematics.md`, erratum E1 for the coordinates.
+    Source: section 6 of `docs/mathematics.md`, erratum E1 for the coordinates.
     """
     P = partials(L_d, q0, q1, s0, h)
     return contact_product_point((q0, momentum_minus(P), s0), (q1, momentum_plus(P), s0 + P.L), P.c)
@@ -66,7 +66,7 @@ class LegendrianStepper:
     throw
         Raise `StepError` at the first sample that fails.
 
-    Source: section 6 of `mathematics.md`; the paper treats regular L_d only.
+    Source: section 6 of `docs/mathematics.md`; the paper treats regular L_d only.
     """
 
     def __init__(

@@ -81,7 +81,7 @@ class RigidBodyStepper:
     InputError
         If J is not symmetric and positive.
 
-    Source: section 6 of `mathematics.md`.
+    Source: section 6 of `docs/mathematics.md`.
     """
 
     def __init__(self, inertia: Tensor, gamma: float = 0.0, *, throw: bool = False):

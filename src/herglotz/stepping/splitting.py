@@ -50,7 +50,7 @@ class ContactSplitting:
     InputError
         If m ≤ 0.
 
-    Source: section 5, trap 1 of `mathematics.md`; A. Bravetti, M. Seri, M. Vermeeren, F. Zadra, Celest. Mech. Dyn.
+    Source: section 5, trap 1 of `docs/mathematics.md`; A. Bravetti, M. Seri, M. Vermeeren, F. Zadra, Celest. Mech. Dyn.
     Astr. 132 (2020) 7.
     """
 

@@ -13,6 +13,7 @@ from herglotz.stepping.engine import Engine, driven_by
 from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.explicit import has_leapfrog
+from herglotz.stepping.linearise import Linearised, linearise
 from herglotz.stepping.rollout import Advance, Plan, Walk, roll_out
 from herglotz.stepping.state import (
     Crossings,
@@ -109,6 +110,28 @@ class Stepper:
         if self.throw:
             self._throw(step, state, h, u)
         return step
+
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step with its derivatives d(q, p, s)′ / d(q, p, s), d/dh and d/du, by the implicit-function theorem.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`.
+
+        Returns
+        -------
+        Linearised
+            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, and the step itself.
+
+        Raises
+        ------
+        InputError
+            As `step`.
+        """
+        with torch.no_grad():
+            step = self.step(state, h, u=u)
+        return linearise(self.L_d, state, check_h(h, state.q), u, step)
 
     def step_pair(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h0: Tensor | float, h1: Tensor | float | None = None

@@ -15,7 +15,7 @@ import torch
 
 from herglotz.export import CompiledStepper
 from herglotz.stepping import State
-from herglotz.tune.kicks_c import CompiledKicks
+from herglotz.tune.kick_composition_c import CompiledKicks
 
 EAGER_STEPS, EAGER_STARTS = 48, 2  # each enough to make the call around them small
 C_STARTS, C_STEPS = 16, 4096  # motions, and steps of them all in one timing, at least

@@ -15,7 +15,7 @@ from herglotz.stepping import State
 from herglotz.training import Run
 from herglotz.tune.config import TuneConfig
 from herglotz.tune.cost import Cost
-from herglotz.tune.kicks import KickStepper
+from herglotz.tune.kick_composition import KickStepper
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ from herglotz.export import CompiledStepper, DifferencedStepper, ExportedStepper
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
+from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import State, Step, Stepper
-from herglotz.systems import Scene, scene, scene_names
 from herglotz.training import Run, load_run
 
 # Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). Rounding: a step is

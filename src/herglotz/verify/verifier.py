@@ -68,7 +68,7 @@ def verify(
     InputError
         If the target or a setting is not usable.
 
-    Source: sections 1–3 of `mathematics.md`, errata E4–E7.
+    Source: sections 1–3 of `docs/mathematics.md`, errata E4–E7.
     """
     if steps < 2:
         raise InputError(f"steps must be >= 2, got {steps}; momentum matching joins two")

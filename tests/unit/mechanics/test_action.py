@@ -5,8 +5,8 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import curve_action, herglotz_action
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):

@@ -16,7 +16,7 @@ from herglotz.mechanics import (
     herglotz_acceleration,
     legendre_dual,
 )
-from herglotz.systems import reference_flow, scene
+from herglotz.scenes import reference_flow, scene
 
 
 def L(q, v, s):

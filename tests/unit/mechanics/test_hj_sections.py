@@ -20,8 +20,8 @@ from herglotz.mechanics import (
     transport_section,
 )
 from herglotz.mechanics.hj_on_qxr import section_derivatives
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 
 GAMMA = 3.0  # overdamped with Ω = 1
 

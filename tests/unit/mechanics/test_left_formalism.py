@@ -19,8 +19,8 @@ from herglotz.mechanics import (
     right_step,
 )
 from herglotz.mechanics.regularity import left_hessian
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):

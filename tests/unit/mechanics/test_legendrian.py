@@ -14,8 +14,8 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.continuous import jacobian
 from herglotz.mechanics.jacobi import join, split
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 
 H = torch.tensor(0.1, dtype=torch.float64)
 

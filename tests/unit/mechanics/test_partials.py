@@ -16,8 +16,8 @@ from herglotz.mechanics import (
     step_derivative,
 )
 from herglotz.mechanics.contact import flow_derivative
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 
 
 def polynomial(q0, q1, s0, h):

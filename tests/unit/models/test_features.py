@@ -10,8 +10,8 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.features import LIBRARIES, expand, parse
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training.problems.one_step import MANY, ResidualProblem
 
 ANGLES, LENGTHS = (True, True), (False, False)

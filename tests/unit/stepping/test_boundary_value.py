@@ -7,9 +7,9 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import herglotz_action
+from herglotz.scenes import scene
 from herglotz.stepping import Status, StepError, Stepper, boundary_value, initial_value
 from herglotz.stepping.block_tridiagonal import multiply, solve_blocks
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):

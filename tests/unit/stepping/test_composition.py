@@ -7,6 +7,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_defect, flow_derivative
+from herglotz.scenes import damped_pendulum, left, midpoint, midpoint_heun, reference_flow, right, scene
 from herglotz.stepping import (
     Composition,
     ContactSplitting,
@@ -19,7 +20,6 @@ from herglotz.stepping import (
     suzuki,
     yoshida,
 )
-from herglotz.systems import damped_pendulum, left, midpoint, midpoint_heun, reference_flow, right, scene
 
 GAMMA, HORIZON = 0.4, 2.0
 PENDULUM = damped_pendulum(gamma=GAMMA)

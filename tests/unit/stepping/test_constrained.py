@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import damped_pendulum, midpoint_heun, strang
 from herglotz.stepping import ConstrainedStepper, State, Status, StepError
-from herglotz.systems import damped_pendulum, midpoint_heun, strang
 
 GAMMA = 0.3
 

@@ -7,6 +7,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_vector_field, legendrian_defect, momentum_jacobian, partials
+from herglotz.scenes import damped_oscillator, midpoint_heun, reference_flow, strang
 from herglotz.stepping import (
     ConstrainedStepper,
     LegendrianStepper,
@@ -16,7 +17,6 @@ from herglotz.stepping import (
     Stepper,
     legendrian_relation,
 )
-from herglotz.systems import damped_oscillator, midpoint_heun, reference_flow, strang
 
 B, GAMMA = 2.0, 0.3
 

@@ -18,8 +18,8 @@ from herglotz.mechanics import (
     prolongation,
 )
 from herglotz.mechanics.jacobi import join
+from herglotz.scenes import reference_flow, scene
 from herglotz.stepping import EvolutionStepper, State, Status, StepError
-from herglotz.systems import reference_flow, scene
 
 PENDULUM = scene("damped_pendulum").hamiltonian
 GRADIENTS = [midpoint_gradient, increment_gradient, mean_value_gradient]

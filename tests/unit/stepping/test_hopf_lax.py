@@ -3,9 +3,9 @@
 import pytest
 import torch
 
-from herglotz.mechanics import PointSource, Quadratic, jet, partials, riccati_step
+from herglotz.mechanics import PointSource, Quadratic, germ, partials, riccati_step
+from herglotz.scenes import scene
 from herglotz.stepping import Propagated, Status, StepError, Stepper, hopf_lax
-from herglotz.systems import scene
 
 OSCILLATOR = scene("damped_oscillator")
 GOLDEN = (-0.26006580555808590321, 0.30739377267571633841, 0.1460659481608371959)
@@ -110,7 +110,7 @@ def test_one_curve_is_two_hopf_lax_steps():
     once = hopf_lax(nonlinear, bowl, y, h=0.2, steps=2)
     twice = hopf_lax(nonlinear, Propagated(nonlinear, bowl, 0.2), y, h=0.2)
     torch.testing.assert_close((once.S, once.dS, once.d2S), (twice.S, twice.dS, twice.d2S), rtol=1e-11, atol=1e-11)
-    at = jet(Propagated(nonlinear, bowl, 0.2, steps=2), y)
+    at = germ(Propagated(nonlinear, bowl, 0.2, steps=2), y)
     torch.testing.assert_close((at.S, at.dS), (once.S, once.dS))
 
 
@@ -128,7 +128,7 @@ def test_a_curve_is_a_characteristic():
     # fails if the extremal is not the motion from (x, dS(x), S(x))
     y = tensor([[0.2, -0.4]])
     out = hopf_lax(nonlinear, bowl, y, h=0.2, steps=5)
-    at = jet(bowl, out.x)
+    at = germ(bowl, out.x)
     walk = Stepper(nonlinear).rollout(out.x, at.dS, at.S, h=0.2, steps=5)
     torch.testing.assert_close((walk.final.q, walk.final.p, walk.final.s), (y, out.dS, out.S), rtol=1e-11, atol=1e-11)
 

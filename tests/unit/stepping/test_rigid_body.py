@@ -5,8 +5,8 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics.rotations import exp_so3, hat
+from herglotz.scenes import reference_flow
 from herglotz.stepping import BodyState, RigidBodyStepper, Status, StepError
-from herglotz.systems import reference_flow
 
 J, GAMMA = torch.tensor([1.0, 2.0, 2.6], dtype=torch.float64), 0.3
 F64 = torch.float64
