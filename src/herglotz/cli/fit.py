@@ -19,10 +19,12 @@ ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
+NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
-(*.png).
+(*.png). The last line is the verdict: "fits to the noise", "fits, worse than the noise by ...", or "does not fit: ..."
+with what to try; then the exit code is 3.
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q) or a
 Schmidt & Lipson .txt. Steps may differ and samples may be missing.
@@ -140,7 +142,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(result.metrics)
     else:
         report(result, out, drawn)
-    return 0
+    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
 
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:
@@ -168,6 +170,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         print(f"Note: {m['extrapolation_status']}")
     if drawn:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
+    print(f"Verdict: {m['verdict']}")
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 

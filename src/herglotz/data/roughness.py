@@ -10,10 +10,11 @@ if TYPE_CHECKING:
     from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # in a row, and of the polynomial through them
+DEGREES = (3, 5, 7)  # of `precision`: noise leaves the same at each, coarsely sampled motion leaves less at the higher
 MOST = 4000  # windows that are looked at
 
 
-def roughness(data: Trajectories) -> float:
+def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     """RMS residual of polynomials in time through nine samples in a row, in units of q; inf where there are fewer.
 
     Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Steps may differ. Angles
@@ -30,6 +31,14 @@ def roughness(data: Trajectories) -> float:
     rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
     t, q = data.t[rows].double().cpu(), data.q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
-    Q = torch.linalg.qr(torch.stack([x**k for k in range(DEGREE + 1)], -1)).Q
+    Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
     r = q - Q @ (Q.mT @ q)
-    return float((r.square().mean() * SAMPLES / (SAMPLES - DEGREE - 1)).sqrt())
+    return float((r.square().mean() * SAMPLES / (SAMPLES - degree - 1)).sqrt())
+
+
+def precision(data: Trajectories) -> float:
+    """Standard deviation of the noise of q as the data show it without a model; an upper bound where they are coarse.
+
+    inf where no trajectory has nine samples.
+    """
+    return min(roughness(data, degree) for degree in DEGREES)

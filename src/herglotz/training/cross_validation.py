@@ -90,9 +90,7 @@ def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
 
 
-def strongest_not_beaten(
-    departures: Sequence[float], fit: Callable[[float], F | None]
-) -> Chosen[F] | None:
+def strongest_not_beaten(departures: Sequence[float], fit: Callable[[float], F | None]) -> Chosen[F] | None:
     """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
 
     None where none could be fitted.

@@ -24,6 +24,7 @@ from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.run import Run, box_of
 from herglotz.training.task import Task
+from herglotz.training.verdict import judged
 
 
 def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
@@ -34,7 +35,9 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
     if fitted.used is not None:
         dropped[~dropped] = ~fitted.used
     states, status = _states_everywhere(fitted, data, train.lengths, task.base.model_step)
-    metrics = _errors(fitted, task, seen, dropped, states) | {
+    metrics = _errors(fitted, task, seen, dropped, states)
+    metrics |= judged(task, seen, fitted, metrics)
+    metrics |= {
         "extrapolation_status": status,
         "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
         "seed": config.seed,
@@ -111,7 +114,7 @@ def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: Sta
     used[training] = ~dropped
     if robust:
         beyond &= ~spikes(data)
-    unseen = data if train is data else _test_part(data, train.lengths)
+    unseen = seen.unseen or data
     triples = unseen.triples(base.max_step)
     problem = ResidualProblem(fitted.model, unseen, max_step=base.max_step)
     x = problem.start()
@@ -128,7 +131,7 @@ def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: Sta
         "train_rms": _rms(error[used]),
         "outliers": int(dropped.sum()),
         "outliers_unseen": int((~training).sum() - beyond.sum()),
-        "extrapolation_rms": None if train is data else _rms(error[beyond]),
+        "extrapolation_rms": None if seen.unseen is None else _rms(error[beyond]),
         "spread": _rms(data.q - data.q.mean(0)),
         "objective": fitted.objective,
         "sigma": fitted.sigma,
@@ -136,14 +139,6 @@ def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: Sta
         "parameters": sum(p.numel() for p in fitted.model.parameters()),
         **fitted.notes,
     }
-
-
-def _test_part(data: Trajectories, trained: tuple[int, ...]) -> Trajectories:
-    rows = [torch.arange(f + k, f + n) for f, n, k in zip(data.offsets, data.lengths, trained, strict=True)]
-    index = torch.cat(rows).to(data.t.device)
-    lengths = tuple(n - k for n, k in zip(data.lengths, trained, strict=True))
-    known = {name: x[index] for name in ("t", "q", "s", "p", "u") if (x := getattr(data, name)) is not None}
-    return replace(data, **known, lengths=lengths)
 
 
 def _rms(x: Tensor) -> float | None:

@@ -51,7 +51,8 @@ class Look:
 
     data: Trajectories  # all, angles unwrapped
     train: Trajectories  # the first part of every trajectory
-    kept: Trajectories  # of that all but single spikes
+    unseen: Trajectories | None  # the rest; None: nothing is held out
+    kept: Trajectories  # of the first part all but single spikes
     spikes: Tensor  # (N_train,) bool
     outliers: bool  # more than single spikes are suspected
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
@@ -74,7 +75,7 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     if not settings.use_inputs:
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
-    train = data if settings.train_fraction == 1 else data.split_time(settings.train_fraction)[0]
+    train, unseen = (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
     kept, drag = without(train, dropped), drag_starts_the_fit(settings)
@@ -93,7 +94,8 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
-        data, train, kept, dropped, outliers, roughness(kept), settings, base, structure, motion, probe
+        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, noise=roughness(kept),
+        settings=settings, base=base, structure=structure, baseline_motion=motion, probe=probe,
     )  # fmt: skip
 
 

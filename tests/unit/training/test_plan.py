@@ -45,7 +45,7 @@ def test_the_drawing_in_the_docs_is_the_code():
         (0.0, {}, 3, "residual"),
         (0.01, {}, 4, "trajectory"),
         (0.01, {"objective": "smoothing"}, 1, "smoothing"),
-        (0.0, {"mass_width": 3}, 6, "residual"),
+        (0.0, {"mass_width": 3}, 5, "trajectory"),
         (0.0, {"supervision": "qs"}, 0, "residual"),
     ],
 )
@@ -68,7 +68,9 @@ def test_every_decision_has_a_reason(noise):
     assert max(map(len, table.splitlines())) <= 120
 
 
-@pytest.mark.parametrize(("noise", "settings"), [(0.01, {}), (0.0, {}), (0.0, {"mass_width": 3})])
+@pytest.mark.parametrize(
+    ("noise", "settings"), [(0.01, {}), (0.0, {}), (0.0, {"mass_width": 2, "correction_width": 3})]
+)
 def test_a_plan_that_is_given_back_repeats_the_fit(noise, settings):
     # fails if a decision is not in the plan, is lost in JSON, or is made again by other means
     config, data = replace(QUICK, **settings), pendulum(noise)
