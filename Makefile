@@ -5,7 +5,7 @@ WORKERS ?= 2
 # One thread a test worker: two workers on two cores do not fight over them.
 ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo lint check test test-slow mutants census clean
+.PHONY: demo lint check test test-anywhere test-slow mutants census clean
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -27,6 +27,10 @@ check: lint
 
 test: lint
 	$(ENV) $(PY) -m pytest -q -n $(WORKERS)
+
+# Other instructions, threads, versions and roundings: eight times as long as `make test`.
+test-anywhere: .venv/installed
+	$(PY) tests/anywhere.py
 
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow

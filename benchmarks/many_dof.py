@@ -29,7 +29,8 @@ from herglotz.plots.style import new_figure, save_figure, styled
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
-from herglotz.stepping import Event, State, Stepper, boundary_value
+from herglotz.stepping import Event, State, Stepper
+from herglotz.theory import boundary_value
 from herglotz.training import FitConfig, fit
 
 RESULTS = Path(__file__).resolve().parent / "results"

@@ -3,10 +3,14 @@
 import pytest
 import torch
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.scenes import scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,
     PointSource,
+    Propagated,
     RightHamiltonian,
     commutation_defect,
     generating_function,
@@ -14,14 +18,11 @@ from herglotz.mechanics import (
     hamilton_jacobi_residual,
     left_generating_function,
     left_hamilton_jacobi_residual,
-    partials,
     projected_flow,
     projected_step,
     right_equations,
     right_step,
 )
-from herglotz.scenes import scene
-from herglotz.stepping import Propagated, State, Stepper
 
 
 def nonlinear(q0, q1, s0, h):

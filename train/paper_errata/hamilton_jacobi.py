@@ -5,7 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.scenes import scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,
     Quadratic,
@@ -16,15 +19,12 @@ from herglotz.mechanics import (
     germ,
     hamilton_jacobi_residual,
     left_hamilton_jacobi_residual,
-    partials,
     projected_flow,
     projected_step,
     prolongation,
     riccati_step,
 )
-from herglotz.mechanics.continuous import derivatives, jacobian
-from herglotz.scenes import scene
-from herglotz.stepping import State, Stepper
+from herglotz.theory.continuous import derivatives, jacobian
 from paper_errata.erratum import (
     OSCILLATOR,
     Erratum,

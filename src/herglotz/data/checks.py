@@ -1,4 +1,4 @@
-"""What a set of trajectories must satisfy before anything is learned from it; every failure is an `InputError`."""
+"""Checks of a set of trajectories before learning; every failure is an `InputError`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 
 ARRAYS = ("t", "q", "s", "p", "u")
-MIN_SAMPLES = 3  # a discrete Herglotz residual joins q_{k-1}, q_k, q_{k+1}
+MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
 DTYPES = (torch.float32, torch.float64)
 
 

@@ -1,4 +1,4 @@
-"""One door for files: `load` and `save` choose the format."""
+"""`load` and `save` choose the format of a file."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def load(
     angles: str | Sequence[str] | None = None,  # coordinates that are angles; left out: what the file says; () for none
     unwrap: bool = True,  # make angles continuous
 ) -> Trajectories:
-    """Read trajectories from any format that is known here.
+    """Read trajectories from any of `FORMATS`.
 
     Returns
     -------

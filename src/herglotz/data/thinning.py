@@ -1,4 +1,4 @@
-"""Every m-th sample only: less work where a motion is sampled far faster than it changes."""
+"""Samples left out of recorded motion: the inputs of the steps that become longer keep their impulse."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from torch import Tensor
 from herglotz.errors import InputError
 
 
-def kept_rows(lengths: Sequence[int], every: int) -> list[Tensor]:
-    """Rows 0, m, 2m, … of every trajectory in the concatenation, a tensor a trajectory.
+def every_mth(lengths: Sequence[int], every: int) -> Tensor:
+    """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
 
     Raises
     ------
@@ -20,25 +20,20 @@ def kept_rows(lengths: Sequence[int], every: int) -> list[Tensor]:
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be a whole number >= 1, got {every!r}")
-    rows = torch.arange(sum(lengths)).split(list(lengths))
-    return [own[::every] for own in rows]
+    return torch.cat([torch.arange(length) % every == 0 for length in lengths])
 
 
-def mean_inputs(
+def inputs_of_kept(
     t: Tensor,  # (N,) time
-    u: Tensor,  # (N, m) input, which acts from its sample to the next
-    lengths: Sequence[int],
-    every: int,
+    u: Tensor,  # (N, m) inputs; each acts from its sample to the next
+    lengths: Sequence[int],  # samples of each trajectory
+    kept: Tensor,  # (N,) bool; the first sample of every trajectory is kept
 ) -> Tensor:
-    """Return the time-weighted mean of u over each long step, (kept, m): the impulse is kept."""
-    spans = zip(t.split(list(lengths)), u.split(list(lengths)), strict=True)
-    return torch.cat([_means(own_t, own_u, every) for own_t, own_u in spans])
-
-
-def _means(t: Tensor, u: Tensor, every: int) -> Tensor:
-    """Time-weighted means of u over the steps between kept samples, (kept, m); the last one acts on no step."""
+    """Return the time-weighted mean of u over the step that starts at each kept sample, (kept, m)."""
     h = torch.cat([t.diff(), t.new_zeros(1)])
-    block = torch.arange(len(t), device=t.device) // every
-    impulse = u.new_zeros(int(block[-1]) + 1, u.shape[1]).index_add(0, block, u * h[:, None])
-    time = h.new_zeros(len(impulse)).index_add(0, block, h)
-    return torch.where(time[:, None] > 0, impulse / time.clamp_min(1e-300)[:, None], u[::every])
+    h[torch.tensor(lengths).cumsum(0) - 1] = 0  # no step starts at the last sample of a trajectory
+    step = kept.cumsum(0) - 1
+    time = h.new_zeros(int(step[-1]) + 1).index_add(0, step, h)
+    impulse = u.new_zeros(len(time), u.shape[1]).index_add(0, step, u * h[:, None])
+    mean = impulse / time.clamp_min(torch.finfo(h.dtype).tiny)[:, None]
+    return torch.where(time[:, None] > 0, mean, u[kept])

@@ -1,4 +1,4 @@
-"""`Trajectories`: a ragged set of sampled motions, irregular steps and gaps welcome."""
+"""`Trajectories`: a ragged set of sampled motions; steps may be irregular and samples missing."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
 from herglotz.data.splits import time_split, trajectory_split
-from herglotz.data.thinning import kept_rows, mean_inputs
+from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
 
-GAP = 1.5  # a longer step, in typical steps, is a gap
+GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +44,7 @@ class Trajectories:
     p: Tensor | None = None  # (N, n) momentum, where known
     u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
     time_unit: str = "s"
-    source: str = ""  # where it came from, for messages
+    source: str = ""  # file or scene of origin, for messages
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
@@ -163,12 +163,19 @@ class Trajectories:
         InputError
             If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
         """
-        kept = kept_rows(self.lengths, every)
-        rows = torch.cat(kept).to(self.t.device)
-        columns = self._map(lambda x: x[rows])
+        return self.keep(every_mth(self.lengths, every).to(self.t.device))
+
+    def keep(self, kept: Tensor) -> Trajectories:
+        """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.
+
+        A longer step takes the mean of the inputs in it, weighted by their time. The first sample of every trajectory
+        must be kept.
+        """
+        columns = self._map(lambda x: x[kept])
         if self.u is not None:
-            columns["u"] = mean_inputs(self.t, self.u, self.lengths, every)
-        return replace(self, **columns, lengths=tuple(len(own) for own in kept))
+            columns["u"] = inputs_of_kept(self.t, self.u, self.lengths, kept)
+        lengths = tuple(int(own.sum()) for own in kept.split(list(self.lengths)))
+        return replace(self, **columns, lengths=lengths)
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
@@ -201,7 +208,7 @@ class Trajectories:
     def unwrapped(self) -> Trajectories:
         """Return the set with every angle continuous: jumps longer than π lose their multiple of 2π.
 
-        Right as long as no angle truly turns by more than π between two samples.
+        The result is wrong where an angle truly turns by more than π between two samples.
         """
         turning = torch.tensor(self.angles, device=self.q.device)
         if not turning.any():

@@ -16,8 +16,7 @@ from herglotz.export.lean import FlatField, LeanEquation, LeanField, is_lean
 from herglotz.export.metadata import TOLERANCE
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
-from herglotz.stepping.equation import model_equation
-from herglotz.stepping.explicit import Leapfrog, has_leapfrog
+from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field
 
 WEIGHTS = (6.0, -15.0, 20.0, -15.0, 6.0, -1.0)  # of the last misses: the polynomial through them, continued
@@ -216,7 +215,7 @@ def best_plan(
 
     Only speed depends on it: what an attempt leaves is judged at every step.
     """
-    if has_leapfrog(model):
+    if model.capabilities.explicit:
         return Plan(True, 2)  # not used: the step is explicit
     if model.config.order == 4:
         return Plan(False, 0)  # an evaluation is a thousand operations: one copy of it in the file, Newton's
@@ -233,7 +232,7 @@ def best_plan(
             for k in range(steps):
                 q, p, s = run.q[:, k], run.p[:, k], run.s[:, k, None]
                 here: tuple[Tensor, ...] = ()
-                if model_equation(model) is not None:
+                if model.capabilities.by_terms:
                     here = LeanField(model.potential)(q)
                 delta, _, _, _, *iterates, size = attempt(q, p, s, column, misses, *here, *u)
                 known = run.q[:, k + 1] - q

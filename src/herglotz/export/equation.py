@@ -244,7 +244,7 @@ class Equations:
     @cached_property
     def field(self) -> Graph | None:
         """`FieldAt`, where steps hand the potential on."""
-        if model_equation(self.model) is None:
+        if not self.model.capabilities.by_terms:
             return None
         return traced(FieldAt(self.model), example(self.model, 0.1)[:1])
 
@@ -286,7 +286,7 @@ class Equations:
         return traced(module, (q, p, s, h, 0.1 * p, *self._here(q), *u))
 
     def _here(self, q: Tensor) -> tuple[Tensor, ...]:
-        return () if model_equation(self.model) is None else _field_like(q)
+        return _field_like(q) if self.model.capabilities.by_terms else ()
 
 
 def _field_like(q: Tensor) -> tuple[Tensor, Tensor]:

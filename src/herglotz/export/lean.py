@@ -22,7 +22,6 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.network import Network
 from herglotz.models.sweep import activation
 from herglotz.models.terms import Kinetic, Potential
-from herglotz.stepping.equation import model_equation
 from herglotz.stepping.field import Field, FieldOf
 
 FEW = 8  # rows of a matrix that a compiler had better multiply out
@@ -252,11 +251,8 @@ class LeanEquation:
 
 def is_lean(model: ContactLagrangian) -> bool:
     """Whether `LeanEquation` knows the model: constant mass, c of h alone."""
-    if model_equation(model) is None or model.s_enters_motion or model.coupling is not None:
-        return False
-    if model.coupling is not None or model.config.order == 4 or model.potential.features is not None:
-        return False
-    return type(model.kinetic) is Kinetic and not model.linear_in_q1
+    made_of = model.capabilities
+    return made_of.by_terms and made_of.constant_c and not (made_of.explicit or made_of.position_features)
 
 
 class FlatField:

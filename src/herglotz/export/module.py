@@ -16,7 +16,7 @@ from herglotz.export.equation import Equations, eliminate, inverse, length
 from herglotz.export.newton import ITERATIONS, Newton, Values, status_of
 from herglotz.export.one_step import OneStep, Report, SafeStep, safe_step
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.explicit import Leapfrog, has_leapfrog
+from herglotz.stepping.explicit import Leapfrog
 
 
 class StepModule(nn.Module):
@@ -47,7 +47,7 @@ class StepModule(nn.Module):
             raise InputError(f"newton_iterations must be at least 2, got {iterations}; {ITERATIONS} suits most models")
         equations = Equations.of(model)
         self.model, self.field = equations.model, equations.field
-        if not has_leapfrog(self.model):
+        if not self.model.capabilities.explicit:
             top = max(self.model.config.speed)
             self.newton, self.first_order = Newton(equations.slopes, iterations, top), equations.first_order
         self.report = Report(Box.of(box, equations.model, h_range))
@@ -68,7 +68,7 @@ class StepModule(nn.Module):
             q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a
             box, outside (B,) uint8. NaN in the samples whose status is not `Status.CONVERGED`.
         """
-        if has_leapfrog(self.model):
+        if self.model.capabilities.explicit:
             move = Leapfrog(self.model, inverse)(q, p, s, h, u=u[0] if u else None)
             return self.report(h, (q, p, s), (move.q1, move.p1, s + move.L), move.c.clone(), 0.0 * s, None)
         here = () if self.field is None else self.field(q)

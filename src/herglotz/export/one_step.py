@@ -24,7 +24,6 @@ from herglotz.export.newton import (
 from herglotz.export.trace import Graph, traced
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import LinearDamping
-from herglotz.stepping.explicit import has_leapfrog
 
 
 class Report(nn.Module):
@@ -92,7 +91,7 @@ class OneStep(nn.Module):
         model = equations.model
         dtype = next(model.parameters()).dtype
         self.compensated = dtype == torch.float32
-        self.iterates = not has_leapfrog(model)
+        self.iterates = not model.capabilities.explicit
         self.field = equations.field
         self.kept = 2 if self.field is not None else 0
         if self.iterates:

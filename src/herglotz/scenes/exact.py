@@ -15,11 +15,11 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
-from herglotz.mechanics.continuous import jacobian
 from herglotz.scenes.motion import Motion, lagrangian_motion, state_change
 from herglotz.scenes.reference import integrate
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
+from herglotz.theory.continuous import jacobian
 
 PIECES = 2  # of the step; conjugate points are looked for at the end of each
 MISS = 1e-11  # of q1, relative to the positions, that Newton may leave: a Taylor step in q1 takes the rest

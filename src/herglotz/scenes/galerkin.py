@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import Partials, autograd_partials
-from herglotz.mechanics.continuous import Lagrangian
 from herglotz.scenes.implicit import MAX_NEWTON, fixed_point
 from herglotz.scenes.special import as_step
+from herglotz.theory.continuous import Lagrangian
 
 ROOT5 = 5.0**0.5
 # Gauss–Lobatto nodes on [0, 1]: with k of them the quadrature, and here the integrator, has order 2k − 2.

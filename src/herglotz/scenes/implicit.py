@@ -11,7 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.continuous import jacobian
+from herglotz.theory.continuous import jacobian
 
 MAX_NEWTON = 30
 # With the Jacobian held fixed each Newton step inside the graph makes derivatives exact one order further.

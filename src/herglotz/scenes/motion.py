@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.continuous import derivatives, herglotz_acceleration, jacobian
 from herglotz.scenes.scene import State, StateFunction
+from herglotz.theory.continuous import derivatives, herglotz_acceleration, jacobian
 
 Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
 

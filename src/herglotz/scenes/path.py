@@ -7,8 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.continuous import Lagrangian
 from herglotz.scenes.reference import reference_flow
+from herglotz.theory.continuous import Lagrangian
 
 Path = Callable[[Tensor], tuple[Tensor, Tensor]]  # t ↦ (q(t), q̇(t)), (...) → (..., n) twice
 

@@ -19,7 +19,7 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
     """A rigid body that no torque acts on but a uniform damping, J Ω̇ = JΩ × Ω − γJΩ.
 
     The angles are a chart of the rotations that ends at a pitch of ±π/2. The default ranges spin the body about its
-    first axis, where pitch and yaw only nutate; `herglotz.stepping.RigidBodyStepper` needs no chart.
+    first axis, where pitch and yaw only nutate; `herglotz.theory.RigidBodyStepper` needs no chart.
 
     Parameters
     ----------

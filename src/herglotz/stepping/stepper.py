@@ -9,10 +9,10 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
+from herglotz.models import capabilities
 from herglotz.stepping.engine import Engine, driven_by
 from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.explain import explain_step
-from herglotz.stepping.explicit import has_leapfrog
 from herglotz.stepping.linearise import Linearised, linearise
 from herglotz.stepping.rollout import Advance, Plan, Walk, roll_out
 from herglotz.stepping.state import (
@@ -201,7 +201,8 @@ class Stepper:
             raise InputError("events and checkpoint exclude one another; leave one out")
         watch = Watch(events, start) if events else None
         plan = Plan(h_all.shape[-1], every, chunk, checkpoint)
-        iterates = not (self.explicit and has_leapfrog(self.L_d))
+        of_model = capabilities(self.L_d)
+        iterates = not (self.explicit and of_model is not None and of_model.explicit)
         return roll_out(start, h_all, lambda: self._advance(h_all, inputs, watch), plan, watch, iterates)
 
     def _checked_inputs(self, inputs: Tensor, q: Tensor) -> Tensor:

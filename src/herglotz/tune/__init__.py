@@ -1,4 +1,4 @@
-"""Speed against accuracy: the setting that meets an error or a budget, and the front it was chosen from."""
+"""Speed against accuracy: `tune` finds the cheapest setting for an error, or the most accurate one for a budget."""
 
 from herglotz.tune.config import TuneConfig
 from herglotz.tune.distil import distil

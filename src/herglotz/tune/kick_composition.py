@@ -1,14 +1,14 @@
-"""A large step as a few kicks and drifts, each with its own learned potential: no equation is solved.
+"""A large explicit step of a few kicks and drifts, each kick with its own learned potential.
 
 One degree of freedom, constant c = e^{−γh}. A step is half of the damping, then
 
     q ← q + d_0 p,  and for i = 1 … K:  p ← p − V_i′(q),  q ← q + d_i p,
 
-and the other half. Every stage is the flow of a separable discrete Lagrangian, p = ΔQ/d and V_i at the end of it, so
-that the step is a contact map whatever its numbers are: Φ̃*η = c η, c = e^{−γh}, s by one term a stage. The V_i are
-trigonometric polynomials of an angle, or polynomials of a length. With free d_i and V_i the K stages need not
-approximate the motion in between: they are fitted to the map over h alone, as compositions of Hénon-like maps can
-approximate any symplectic map.
+and the other half. Every stage is the flow of a separable discrete Lagrangian with p = Δq/d and V_i at
+its end. The step is therefore a contact map for all values of its numbers: Φ̃*η = c η with c = e^{−γh}, and each stage
+adds one term to s. The V_i are trigonometric polynomials of an angle, or polynomials of a length. The d_i and V_i are
+fitted to the map over h alone; the stages need not follow the motion inside the step. Compositions of Hénon-like maps
+can approximate any symplectic map.
 
 Source: D. Turaev, Nonlinearity 16 (2003) 123 (Hénon-like maps); S. Blanes, F. Casas and A. Murua, Acta Numerica 33
 (2024) 1 (compositions with modified potentials).
@@ -28,9 +28,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping import Rollout, State, Status, Step
 from herglotz.training import levenberg_marquardt
 
-LEVELS = ("conservative", "linear")  # those with a constant c and no force
+LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
 EXACT = 1e-8  # σ of the residuals relative to the motion's size, as in `distil`
-WEAK = 10.0  # σ of the prior that keeps every number near its start, relative to that start's size
+WEAK = 10.0  # σ of the prior on each number's distance from its start, relative to the size of the start
 
 
 @dataclass(frozen=True)
@@ -46,7 +46,7 @@ class KickStepper:
     drifts
         (K + 1,) d_0 … d_K, in time over mass.
     cosines, sines
-        (K, N) V_i = Σ_n a_in cos nq + b_in sin nq of an angle; of a length Σ_n a_in x^n, n ≥ 1, and no sines.
+        (K, N) coefficients: V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, for a length.
     """
 
     h: float
@@ -57,28 +57,28 @@ class KickStepper:
     drifts: Tensor
     cosines: Tensor
     sines: Tensor
-    offset: float = 0.0  # added to s at the end: the constants of the V_i, which no motion sees
-    error: float = 0.0  # RMS of q after one step, in units of q: C need not be more exact than that
+    offset: float = 0.0  # added to s after a step: the sum of the constants of the V_i, which do not move q or p
+    error: float = 0.0  # RMS error of q after one step, in units of q; the sines of the C form are made as accurate
 
     dof = 1
 
     @property
     def kicks(self) -> int:
-        """K."""
+        """Return K, the number of kicks."""
         return len(self.cosines)
 
     @property
     def parameters(self) -> int:
-        """How many numbers were fitted."""
+        """Return how many numbers were fitted."""
         return self.drifts.numel() + self.cosines.numel() + self.sines.numel()
 
     def to(self, dtype: torch.dtype) -> KickStepper:
-        """The same numbers in another dtype."""
+        """Return the stepper in another dtype."""
         numbers = {name: getattr(self, name).to(dtype) for name in ("drifts", "cosines", "sines")}
         return replace(self, **numbers)
 
     def kick(self, i: int, q: Tensor) -> tuple[Tensor, Tensor]:
-        """V_i(q) and V_i′(q), of the shape of q."""
+        """Return V_i(q) and V_i′(q), of the shape of q."""
         a, b = self.cosines[i], self.sines[i]
         n = torch.arange(1, len(a) + 1, dtype=q.dtype, device=q.device)
         if not self.angle:
@@ -88,7 +88,7 @@ class KickStepper:
         return (a * cos + b * sin).sum(-1), (n * (b * cos - a * sin)).sum(-1)
 
     def map(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """One step of (...), (...), (...)."""
+        """Return (q, p, s) after one step; q, p and s have shape (...)."""
         root = torch.exp(torch.tensor(-0.5 * self.rate * self.h, dtype=q.dtype, device=q.device))
         p, s = root * p, root * s
         q, s = q + self.drifts[0] * p, s + 0.5 * self.drifts[0] * p * p
@@ -99,7 +99,7 @@ class KickStepper:
         return q, root * p, root * s + self.offset
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
-        """One step; NaN and `Status.DIVERGED` where the result is not finite.
+        """Take one step; NaN and `Status.DIVERGED` where the result is not finite.
 
         Raises
         ------
@@ -119,7 +119,7 @@ class KickStepper:
         return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
 
     def rollout(self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int) -> Rollout:
-        """K equal steps from (q, p, s); s defaults to 0."""
+        """Take `steps` equal steps from (q, p, s); s defaults to 0."""
         states, taken = [State(q, p, torch.zeros_like(q[..., 0]) if s is None else s)], []
         for _ in range(steps):
             taken.append(self.step(states[-1], h))
@@ -127,12 +127,12 @@ class KickStepper:
         return Rollout.of(states, taken)
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain numbers, for JSON."""
+        """Return plain numbers for JSON."""
         return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(self).items()}
 
 
 def can_kick(model: ContactLagrangian) -> bool:
-    """Whether the model's step can be one of kicks: one coordinate and a constant c, without forces."""
+    """Return whether kicks can replace the model's step: one coordinate, a constant c and no forces."""
     return model.config.dof == 1 and model.config.level in LEVELS
 
 
@@ -146,14 +146,14 @@ def fit_kicks(
     degree: int = 4,
     iterations: int = 150,
 ) -> KickStepper:
-    """Fit kicks and drifts to a flow map over h, by Levenberg–Marquardt on (q1, p1) and no derivative of the model.
+    """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
 
     Parameters
     ----------
     model
-        Gives γ, whether q is an angle, and where to start: leapfrog with the slope of its potential.
+        Source of γ, of whether q is an angle, and of the start: leapfrog with the stiffness of its potential.
     before, after
-        (T, 1), (T, 1), (T) each, a time h apart.
+        Pairs of states a time h apart, (T, 1), (T, 1), (T) each.
 
     Raises
     ------
@@ -200,13 +200,13 @@ def fit_kicks(
 
 
 def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int, degree: int) -> KickStepper:
-    """K steps of leapfrog with the model's own stiffness: drifts h/K over the mass, kicks h/K times the force."""
+    """Return K steps of leapfrog with the model's stiffness: drifts h/K over the mass, kicks h/K times the force."""
     config = model.config
     low, high = float(before.q.min()), float(before.q.max())
     middle, half = (0.0, 1.0) if config.angles[0] else ((low + high) / 2, (high - low) / 2)
     drifts = torch.full((kicks + 1,), h / kicks, dtype=torch.float64)
     drifts[0] = drifts[-1] = h / kicks / 2
-    # A length needs its linear term as well: the middle of the data is not where the force is zero.
+    # A length needs a linear term too: the force is not zero at the middle of the data.
     a = torch.zeros(kicks, degree if config.angles[0] else degree + 1, dtype=torch.float64)
     b = torch.zeros(kicks, degree if config.angles[0] else 0, dtype=torch.float64)
     k = float(config.stiffness[0])

@@ -1,9 +1,9 @@
-"""The C form of a `KickStepper`: one short header without dependencies, straight-line code, nothing that iterates.
+"""The C form of a `KickStepper`: one short header of straight-line code without dependencies.
 
-sin and cos are polynomials on (−π/2, π/2) after taking away the nearest multiple of π, as exact as the fit of the step
-asks (a thirtieth of its error); inside a step an angle is counted in half turns, which saves a product a kick. The
-potentials are polynomials in cos q, and sin q times such, summed by Estrin's scheme, which a processor can overlap. A
-library function would take longer than the rest of the step.
+sin and cos are polynomials on (−π/2, π/2) after the nearest multiple of π is subtracted; their error is a thirtieth of
+the step's own. Library functions would take longer than the rest of the step. Inside a step an angle is counted in half
+turns, which saves one product a kick. The potentials are polynomials in cos q, and sin q times polynomials in cos q,
+summed by Estrin's scheme, whose operations a processor can overlap.
 """
 
 from __future__ import annotations
@@ -26,8 +26,7 @@ from herglotz.export.c_wrapper import FLAGS, compiler
 from herglotz.stepping import Rollout, State, Status
 from herglotz.tune.kick_composition import KickStepper
 
-FINEST = {"float64": 1e-13, "float32": 3e-8}  # error of sin and cos
-COARSEST = 1e-4
+FINEST, COARSEST = {"float64": 1e-13, "float32": 3e-8}, 1e-4  # bounds of the error that sin and cos may have
 TYPES = {"float64": "double", "float32": "float"}
 
 HEADER = """/* One step of h = {h}: {kicks} kicks and drifts. Written by herglotz; C99, no dependency but <tgmath.h>.

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics import contact_vector_field
 from herglotz.scenes import damped_pendulum, reference_flow, reference_solve, scene
+from herglotz.theory import contact_vector_field
 
 GAMMA = 0.2
 

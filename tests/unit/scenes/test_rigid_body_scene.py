@@ -5,7 +5,7 @@ import math
 import torch
 
 from herglotz.scenes import scene
-from herglotz.stepping import RigidBodyStepper
+from herglotz.theory import RigidBodyStepper
 
 J = (2.1, 1.7, 0.9)
 SYSTEM = scene("rigid_body", J1=J[0], J2=J[1], J3=J[2], gamma=0.3)

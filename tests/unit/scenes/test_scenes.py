@@ -8,14 +8,13 @@ import torch
 from herglotz.mechanics import (
     autograd_partials,
     contact_defect,
-    contact_vector_field,
     flow_derivative,
     legendre_minus,
     legendre_plus,
     partials,
-    right_hamiltonian,
 )
 from herglotz.scenes import ORDERS, reference_flow, scene, scene_names
+from herglotz.theory import contact_vector_field, right_hamiltonian
 
 # at each scene's own examples, off the default parameters, where m = 1 and Ω = 1 would hide powers
 SCENES = [scene(name, **parameters) for name in scene_names() for parameters in scene(name).examples]
