@@ -1,10 +1,11 @@
 """Objectives, optimisers and the fit."""
 
+from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.fit import fit
 from herglotz.training.identifiability import Trade, traded
 from herglotz.training.look import Look, look
-from herglotz.training.plan import Plan, choose
+from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.shooting import ShootingProblem

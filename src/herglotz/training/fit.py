@@ -8,11 +8,12 @@ import time
 from pathlib import Path
 
 from herglotz.data import Trajectories
+from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
-from herglotz.training.plan import Plan, choose
+from herglotz.training.plan import Plan
 from herglotz.training.run import Run
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task

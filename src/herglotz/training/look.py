@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,14 +16,12 @@ from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pul
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
+from herglotz.training.plan import Plan
 from herglotz.training.smoothing_fit import SMOOTHED
 from herglotz.training.stages import Stages
 from herglotz.training.structure import kept_structure, start_of_features, structure_is_free
 from herglotz.training.task import NOISY, Task, drag_starts_the_fit
 from herglotz.training.trajectory_fit import check_size
-
-if TYPE_CHECKING:
-    from herglotz.training.plan import Plan
 
 PROBE = 40  # iterations of the flexible one-step fit that measures the noise, and of those that other fits start from
 EXPLAINED = 100.0  # times the σ of exact data: a baseline that errs less explains them

@@ -12,7 +12,8 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
-from herglotz.training.plan import DECISIONS, RULES, choose_objective, drawing
+from herglotz.training.choose import RULES, choose_objective, drawing
+from herglotz.training.plan import DECISIONS
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
