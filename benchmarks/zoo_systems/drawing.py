@@ -12,7 +12,6 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.random import Generator
-
 from zoo_systems.judging import score
 from zoo_systems.known import fit_known
 from zoo_systems.mechanisms import Array, Mechanism, Values

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-
 from zoo_systems.mechanisms import Array
 from zoo_systems.systems import ZooSystem
 

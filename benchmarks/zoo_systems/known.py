@@ -7,7 +7,6 @@ implicit dry friction, Jacobian by differences, all columns stepped as one batch
 from __future__ import annotations
 
 import numpy as np
-
 from zoo_systems.mechanisms import Array, Mechanism
 from zoo_systems.prediction import MechanismModel, roll, start_states, trained
 from zoo_systems.systems import ZooSystem

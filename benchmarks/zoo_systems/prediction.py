@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-
 from zoo_systems.mechanisms import Array, Mechanism
 from zoo_systems.systems import TRAIN, Recording, ZooSystem
 

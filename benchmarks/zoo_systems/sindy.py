@@ -9,7 +9,6 @@ Source: S. L. Brunton, J. L. Proctor and J. N. Kutz, PNAS 113 (2016) 3932.
 from __future__ import annotations
 
 import numpy as np
-
 from zoo_systems.mechanisms import Array
 from zoo_systems.prediction import SMOOTH, rk4, roll, start_states, trained
 from zoo_systems.systems import ZooSystem

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-
 from zoo_systems.mechanisms import Array, Mechanism
 
 EXACT = 1e-4  # of the size of a motion: what "at the noise" means where there is no noise

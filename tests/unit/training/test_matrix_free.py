@@ -116,7 +116,7 @@ def test_fit_takes_products_beyond_a_size(monkeypatch):
         made.append(len(problem.start()))
         return MatrixFree(problem)
 
-    module = sys.modules["herglotz.training.fit"]
+    module = sys.modules["herglotz.training.one_step_fit"]
     monkeypatch.setattr(module, "MatrixFree", watched)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=20, h=0.5, seed=0)
     settings = FitConfig(objective="residual", correction_width=4, iterations=2, train_fraction=1.0)
