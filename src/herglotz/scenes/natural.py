@@ -1,4 +1,4 @@
-"""Two ways to write a scene shortly: a constant mass with one damping rate, and a scene without a closed form."""
+"""Short forms of a scene: a constant mass with one damping rate, and a scene without a closed form."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from herglotz.scenes.scene import Scene, StateFunction
 
 @dataclass(frozen=True)
 class Natural:
-    """L = m|v|²/2 − V(q) − γs and what follows from it: H = |p|²/2m + V(q) + γs, p = mv."""
+    """L = m|v|²/2 − V(q) − γs, with H = |p|²/2m + V(q) + γs and p = mv."""
 
     potential: Callable[[Tensor], Tensor]
     gamma: float

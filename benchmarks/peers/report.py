@@ -1,4 +1,4 @@
-"""The table and the figure of `peers.py`, from what its JSON holds."""
+"""The table and the figure of the peers, from what their JSON holds."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ import statistics
 from pathlib import Path
 from typing import Any
 
-from herglotz.data.files import write_atomically
+from benchmarks.harness import picture, spread
+from benchmarks.harness import table as lines_of
+from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, new_figure, styled
 
 from . import PEERS
 from .problems import PROBLEMS
@@ -32,22 +34,13 @@ def values(cells: list[Cell], name: str) -> list[float]:
     return [x for cell in cells if (x := cell.get(name)) is not None]
 
 
-def spread(cells: list[Cell], name: str) -> str:
-    """Median and range over the seeds, for the table."""
-    found = values(cells, name)
-    if not found:
-        return "failed"
-    middle = statistics.median(found)
-    return f"{middle:.1e}" if len(found) == 1 else f"{middle:.1e} ({min(found):.1e} – {max(found):.1e})"
-
-
 def table(result: dict[str, Any]) -> str:
     """Markdown: one table a data set."""
     s, m = result["settings"], result["machine"]
     lines = [
         "# herglotz beside its peers",
         "",
-        "`python benchmarks/peers.py`. Every network peer: two hidden layers of "
+        "`python benchmarks/peers`. Every network peer: two hidden layers of "
         f"{s['width']} units, float64, Adam (rate {s['learning_rate']:g}, cosine, batches of {s['batch']}) for "
         f"{s['adam_part']:.0%} of {s['budget_s']:g} s of processor time, then L-BFGS; the weights of the least "
         "validation error are kept. "
@@ -62,59 +55,65 @@ def table(result: dict[str, Any]) -> str:
         "end; failed: not finite or 50 rad off. Energy: RMS error of the energy along rollouts over its start "
         "(measured pendulum: error of the amplitude at the end). Median of the seeds (least – largest).",
         "",
+        *lines_of(("peer", "what it is"), ((p.title, p.source) for p in PEERS.values())),
+        "",
     ]
-    lines += ["| peer | what it is |", "|---|---|", *(f"| {p.title} | {p.source} |" for p in PEERS.values()), ""]
     for data in PROBLEMS:
-        rows = rows_of(result["cells"], data)
-        if not rows:
-            continue
-        lines += [f"## {data}", "", result["titles"][data] + ".", ""]
-        lines += ["| peer | given | RMS | median error | failed | energy | training s | parameters | seeds |"]
-        lines += ["|---|---|---|---|---|---|---|---|---|"]
-        for (peer, given), cells in rows.items():
-            failed, total = (sum(int(c.get(k) or 0) for c in cells) for k in ("failures", "rollouts"))
-            stopped = [c["error"] for c in cells if c.get("error")]
-            note = f"{failed} of {total}" + (f"; {len(stopped)} fits: {stopped[0]}" if stopped else "")
-            seconds, parameters = (values(cells, k) for k in ("seconds", "parameters"))
-            lines.append(
-                f"| {PEERS[peer].title} | {GIVEN[given]} | {spread(cells, 'rms')} | {spread(cells, 'median')} | {note} "
-                f"| {spread(cells, 'decay') if values(cells, 'decay') else '–'} "
-                f"| {statistics.median(seconds):.0f} | {round(statistics.median(parameters)) if parameters else '–'} "
-                f"| {len(cells)} |"
-            )
-        ahead = {r: c for r, c in rows.items() if any(x.get("after") for x in c)}
-        if ahead:
-            lines += ["", "RMS of the elbow and the tip angle (rad), median of the seeds:", ""]
-            times = next(x["after"] for c in ahead.values() for x in c if x.get("after"))
-            lines += ["| peer | " + " | ".join(f"after {t}" for t in times) + " |", "|---" * (1 + len(times)) + "|"]
-            for (peer, _), cells in ahead.items():
-                columns = []
-                for t in times:
-                    pairs = [x["after"][t] for x in cells if x.get("after") and x["after"][t]]
-                    middle = [statistics.median(p[k] for p in pairs) for k in (0, 1)] if pairs else []
-                    columns.append(", ".join(f"{x:.3f}" for x in middle) or "failed")
-                lines.append(f"| {PEERS[peer].title} | " + " | ".join(columns) + " |")
-        lines.append("")
-    if result.get("reproduced"):
-        lines += [
-            "## Figures of the sources",
-            "",
-            "| figure | source | here median (least – largest) | seeds | agrees if | agrees |",
-            "|---|---|---|---|---|---|",
-        ]
-        for one in result["reproduced"].values():
-            here = one["here"]
-            shown = f"{statistics.median(here):.2e} ({min(here):.1e} – {max(here):.1e})"
-            agrees = "yes" if one["agrees"] else "no"
-            lines.append(f"| {one['figure']} | {one['source']} | {shown} | {len(here)} | {one['rule']} | {agrees} |")
-        lines += ["", result["reproduced_note"], ""]
-    return "\n".join(lines)
+        if rows := rows_of(result["cells"], data):
+            lines += [f"## {data}", "", result["titles"][data] + ".", "", *_errors(rows), *_ahead(rows), ""]
+    return "\n".join([*lines, *_sources(result)])
+
+
+def _errors(rows: Rows) -> list[str]:
+    """A row a peer and what it was given."""
+    found = []
+    for (peer, given), cells in rows.items():
+        failed, total = (sum(int(c.get(k) or 0) for c in cells) for k in ("failures", "rollouts"))
+        stopped = [c["error"] for c in cells if c.get("error")]
+        note = f"{failed} of {total}" + (f"; {len(stopped)} fits: {stopped[0]}" if stopped else "")
+        seconds, parameters, decay = (values(cells, k) for k in ("seconds", "parameters", "decay"))
+        found.append([
+            PEERS[peer].title, GIVEN[given], spread(values(cells, "rms")), spread(values(cells, "median")), note,
+            spread(decay) if decay else "–", f"{statistics.median(seconds):.0f}",
+            round(statistics.median(parameters)) if parameters else "–", len(cells),
+        ])  # fmt: skip
+    head = ("peer", "given", "RMS", "median error", "failed", "energy", "training s", "parameters", "seeds")
+    return lines_of(head, found)
+
+
+def _ahead(rows: Rows) -> list[str]:
+    """Errors of both angles after some times, where the data set asks for them."""
+    ahead = {peer: c for (peer, _), c in rows.items() if any(x.get("after") for x in c)}
+    if not ahead:
+        return []
+    times = next(x["after"] for c in ahead.values() for x in c if x.get("after"))
+    found = []
+    for peer, cells in ahead.items():
+        columns = []
+        for t in times:
+            pairs = [x["after"][t] for x in cells if x.get("after") and x["after"][t]]
+            middle = [statistics.median(p[k] for p in pairs) for k in (0, 1)] if pairs else []
+            columns.append(", ".join(f"{x:.3f}" for x in middle) or "failed")
+        found.append([PEERS[peer].title, *columns])
+    words = "RMS of the elbow and the tip angle (rad), median of the seeds:"
+    return ["", words, "", *lines_of(["peer", *(f"after {t}" for t in times)], found)]
+
+
+def _sources(result: dict[str, Any]) -> list[str]:
+    """Figures of the sources and ours."""
+    if not result.get("reproduced"):
+        return []
+    found = []
+    for one in result["reproduced"].values():
+        here = one["here"]
+        shown = f"{statistics.median(here):.2e} ({min(here):.1e} – {max(here):.1e})"
+        found.append([one["figure"], one["source"], shown, len(here), one["rule"], "yes" if one["agrees"] else "no"])
+    head = ("figure", "source", "here median (least – largest)", "seeds", "agrees if", "agrees")
+    return ["## Figures of the sources", "", *lines_of(head, found), "", result["reproduced_note"]]
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
     """RMS of every seed, a panel a data set: filled where positions only were given."""
-    from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, new_figure, save_figure, styled
-
     shown = [data for data in PROBLEMS if rows_of(result["cells"], data)]
     peers = [p for p in PEERS if any(key.split("/")[1] == p for key in result["cells"])]
     place = {p: len(peers) - 1 - k for k, p in enumerate(peers)}
@@ -156,10 +155,4 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for k, (text, color) in enumerate([("● herglotz, positions only", MODEL), *key]):
             left = (0.1, 2.2, 5.2, 7.2)[k] / width
             figure.text(left, 1 - 0.42 / height, text, color=color, fontsize=9)
-        save_figure(figure, path)
-
-
-def write(result: dict[str, Any], folder: Path) -> None:
-    """peers.md and peers.png."""
-    write_atomically(folder / "peers.md", table(result).encode())
-    draw(result, folder / "peers.png")
+        picture(figure, path)

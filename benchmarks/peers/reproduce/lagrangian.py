@@ -24,8 +24,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ..continuous import DeepLagrangian, FreeLagrangian
 from ..known_equation import Equation
-from ..lagrangian import DeepLagrangian, FreeLagrangian
 from ..networks import Network, Scales
 from ..rollouts import rk4
 from .discrete import kepler_orbit, kepler_rates, softplus_net

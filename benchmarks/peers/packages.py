@@ -1,4 +1,4 @@
-"""Published packages as they are: phlearn (pseudo-Hamiltonian neural networks) and pysindy (sparse regression).
+"""herglotz as a peer, and published packages as they are: phlearn (pseudo-Hamiltonian networks) and pysindy.
 
 S. Eidnes, A. Stasik, C. Sterud, E. Bøhn, S. Riemer-Sørensen, "Pseudo-Hamiltonian neural networks with state-dependent
 external forces", Physica D 446:133673 (2023): ẋ = (S − R) ∂H/∂x with R ≥ 0 diagonal on the momenta.
@@ -14,6 +14,7 @@ import io
 import math
 import time
 import warnings
+from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
@@ -21,12 +22,45 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .fields import scales_of, substeps
-from .networks import LEARNING_RATE, WIDTH, count, split
+from herglotz.data import Trajectories
+from herglotz.stepping import Stepper
+from herglotz.training import FitConfig, fit
+from herglotz.training.run import Run
+
+from .networks import LEARNING_RATE, WIDTH, count, scales_of, split, substeps
 from .rollouts import Flow
 from .samples import Samples, differences
 
 THRESHOLDS = (0.003, 0.01, 0.03, 0.1, 0.3)  # of SINDy's sparse regression; a validation part chooses
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A fitted stepper as a predictor."""
+
+    run: Run
+    h: float
+
+    @property
+    def parameters(self) -> int:
+        """Number of trained values of the model."""
+        return self.run.metrics["parameters"]
+
+    def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
+        """See `rollouts.Predictor`."""
+        stepper = Stepper(self.run.model)
+        with torch.no_grad():
+            out = stepper.rollout(*stepper.init(q0, q1, None, self.h), h=self.h, steps=steps)
+        return torch.cat([q0[:, None], out.q], 1)
+
+
+def train_ours(samples: Samples, seed: int, budget: float) -> Learned:  # noqa: ARG001
+    """`herglotz.training.fit` on all samples; the budget is not used: it stops by itself."""
+    lengths = [len(q) for q in samples.q]
+    t = torch.cat([samples.h * torch.arange(k, dtype=torch.float64) for k in lengths])
+    data = Trajectories.of(t, torch.cat(samples.q), lengths, angles=samples.angles, source="peers")
+    config = FitConfig(train_fraction=1.0, seed=seed)
+    return Learned(fit(data, config, progress=False), samples.h)
 
 
 def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
@@ -37,16 +71,15 @@ def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
     """
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        from phlearn.phnns import HamiltonianNN, PseudoHamiltonianNN, R_estimator
-        from phlearn.phnns import train as phlearn_train
+        from phlearn import phnns  # pyright: ignore[reportMissingImports]
 
     began, n, h = time.process_time(), samples.dof, samples.h
     with torch.random.fork_rng():
         torch.manual_seed(seed)  # the package draws from the global generator
-        friction = R_estimator([False] * n + [True] * n, torch.float64)
+        friction = phnns.R_estimator([False] * n + [True] * n, torch.float64)
         friction.pick_rs = friction.pick_rs.double()
-        H = HamiltonianNN(2 * n, WIDTH).double()
-        model = PseudoHamiltonianNN(2 * n, hamiltonian_est=H, dissipation_est=friction, ttype=torch.float64)
+        H = phnns.HamiltonianNN(2 * n, WIDTH).double()
+        model = phnns.PseudoHamiltonianNN(2 * n, hamiltonian_est=H, dissipation_est=friction, ttype=torch.float64)
         weights = [x for x in (*H.parameters(), *friction.parameters()) if x.requires_grad]
         motions = samples.exact or [m for q in samples.q if (m := differences(q, h, samples.noisy)) is not None]
         first = torch.cat([torch.cat([m.q, m.p], -1)[:-1] for m in motions])
@@ -65,7 +98,7 @@ def train_phlearn(samples: Samples, seed: int, budget: float) -> Flow:
                 group["lr"] = LEARNING_RATE * (0.5 + 0.5 * math.cos(math.pi * used)) + 1e-6
             with warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
                 warnings.simplefilter("ignore")
-                _, value = phlearn_train(
+                _, value = phnns.train(
                     model, "srk4", packed(rows), optimiser, packed(held), epochs=1, batch_size=64, verbose=False
                 )
             if value is not None and value < best:
@@ -104,7 +137,7 @@ def train_sindy(samples: Samples, seed: int, budget: float) -> Flow:  # noqa: AR
     """Sparse regression (STLSQ) on rates over `library`; the threshold with the least validation error."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        import pysindy
+        import pysindy  # pyright: ignore[reportMissingImports]
 
         motion, n = samples.motion(), samples.dof
         terms, rates = library(motion.q, motion.v, samples.angles).numpy(), motion.a.numpy()

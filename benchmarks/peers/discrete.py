@@ -1,4 +1,4 @@
-"""Discrete Lagrangian networks: conservative, and with discrete forces, both from positions only.
+"""Peers that step from positions only: discrete Lagrangian networks, without and with forces, and a plain step map.
 
 Conservative: Y. Lishkova, P. Scherer, S. Ridderbusch, M. Jamnik, P. Liò, S. Ober-Blöbaum, C. Offen, "Discrete
 Lagrangian neural networks with automatic symmetry discovery", IFAC 2023 (arXiv:2211.10830). L_d(q0, q1) is one network,
@@ -98,17 +98,48 @@ def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, for
         mixed = model.mixed(q0[base], q1[base])
         return regularity(mixed) if forced else (mixed - eye).square().mean()
 
-    train(
-        lambda i: loss(rows[i]) + REGULAR * penalty(),
-        len(rows),
-        lambda: loss(held) + REGULAR * penalty(),
-        model.weights,
-        generator,
-        budget,
-    )
+    fit, judge = (lambda i: loss(rows[i]) + REGULAR * penalty()), (lambda: loss(held) + REGULAR * penalty())
+    train(fit, len(rows), judge, model.weights, generator, budget)
     return ThreePoint(model.residual, count(model.weights))
 
 
 def train_forced_discrete_lagrangian(samples: Samples, seed: int, budget: float) -> ThreePoint:
     """With discrete forces."""
     return train_discrete_lagrangian(samples, seed, budget, forced=True)
+
+
+class StepMap:
+    """q2 = 2q1 − q0 + h² σ_a net(q1, (q1 − q0)/h): a network that predicts the second difference."""
+
+    def __init__(self, samples: Samples, generator: torch.Generator):
+        self.h, self.scales = samples.h, scales_of_triples(samples)
+        self.net = Network(self.scales.q_inputs + samples.dof, samples.dof, generator)
+        self.parameters = count(list(self.net.parameters()))
+
+    def second_difference(self, q0: Tensor, q1: Tensor) -> Tensor:
+        """Predicted (q2 − 2q1 + q0) / (h² σ_a), (B, n)."""
+        return self.net(self.scales.of_state(q1, (q1 - q0) / self.h))
+
+    def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
+        """See `rollouts.Predictor`."""
+        out = [q0, q1]
+        with torch.no_grad():
+            for _ in range(steps):
+                bend = self.h**2 * self.scales.a * self.second_difference(out[-2], out[-1])
+                out.append(2 * out[-1] - out[-2] + bend)
+        return torch.stack(out, 1)
+
+
+def train_mlp(samples: Samples, seed: int, budget: float) -> StepMap:
+    """One-step least squares of the second difference."""
+    generator = torch.Generator().manual_seed(seed)
+    model = StepMap(samples, generator)
+    q0, q1, q2 = samples.triples()
+    target = (q2 - 2 * q1 + q0) / (samples.h**2 * model.scales.a)
+    rows, held = split(len(q0), generator)
+
+    def loss(i: Tensor) -> Tensor:
+        return (model.second_difference(q0[i], q1[i]) - target[i]).square().mean()
+
+    train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), list(model.net.parameters()), generator, budget)
+    return model

@@ -1,4 +1,4 @@
-"""herglotz beside its peers, on the same data and machine: `python benchmarks/peers.py [--data ...] [--peers ...]`.
+"""herglotz beside its peers, on the same data and machine: `python benchmarks/peers [--data ...] [--peers ...]`.
 
 A cell is one fit: a data set, a peer, what it is given, a seed. Every finished cell is kept in peers.json at once; the
 command goes on where it was interrupted, and `--again` measures some peers anew. At the end (or with `--redraw` alone)
@@ -9,9 +9,9 @@ Data: pendulum_02, pendulum_05, pendulum_10 (simulated damped pendulum at three 
 
 Examples
 --------
-    python benchmarks/peers.py --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out runs/peers
-    python benchmarks/peers.py --reproduce            # figures of the sources, measured with our implementations
-    python benchmarks/peers.py --redraw               # table and figure from the JSON that is there
+    python benchmarks/peers --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out runs/peers
+    python benchmarks/peers --reproduce            # figures of the sources, measured with our implementations
+    python benchmarks/peers --redraw               # table and figure from the JSON that is there
 
 Needs, each for its peer alone: torchdiffeq, pysindy, phlearn (`pip install --no-deps phlearn imageio`, then ipython and
 autograd). A peer whose package is missing is left out, and the command says so.
@@ -19,31 +19,23 @@ autograd). A peer whose package is missing is left out, and the command says so.
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import signal
-import subprocess
 import sys
 import time
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import torch
-from peer_models import PEERS, networks
-from peer_models.known_equation import train_known_equation
-from peer_models.ours import measured
-from peer_models.problems import PROBLEMS, Problem
-from peer_models.report import write
-from peer_models.reproduce import reproduce
 from tqdm import tqdm
 
-from herglotz.data.files import write_atomically
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+from benchmarks import harness
+from benchmarks.peers import PEERS, networks
+from benchmarks.peers.known_equation import train_known_equation
+from benchmarks.peers.problems import PROBLEMS, Problem
+from benchmarks.peers.report import draw, table
+from benchmarks.peers.reproduce import reproduce
 from herglotz.errors import InputError
 
-ROOT = Path(__file__).resolve().parents[1]
 BUDGET = 10.0  # seconds of processor time of a network peer's fit
 LIMIT = 900  # seconds of processor time after which a cell is given up
 
@@ -62,10 +54,10 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
     signal.signal(signal.SIGVTALRM, _out_of_time)
     signal.setitimer(signal.ITIMER_VIRTUAL, LIMIT)
     began = time.process_time()
-    out: dict[str, Any] = {"error": None, "commit": _commit()}
+    out: dict[str, Any] = {"error": None, "commit": harness.commit()}
     try:
-        if name == "ours" and problem.whole is not None:
-            found, out["parameters"] = measured(problem.whole(), seed)
+        if name == "ours" and problem.own is not None:
+            found, out["parameters"] = problem.own(seed)
             return out | found | {"seconds": time.process_time() - began}
         samples = problem.samples(seed, exact)
         began = time.process_time()  # simulating the data is not training
@@ -85,11 +77,6 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
     return out | {"error": error, "rms": None}
 
 
-def _commit() -> str:
-    told = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT)
-    return told.stdout.strip()
-
-
 def settings(budget: float) -> dict[str, Any]:
     """What every network peer shares."""
     return {
@@ -105,23 +92,13 @@ def settings(budget: float) -> dict[str, Any]:
 
 def opened(path: Path, budget: float | None) -> dict[str, Any]:
     """The result so far, or an empty one."""
-    if path.is_file():
-        result = json.loads(path.read_text(encoding="utf-8"))
-        if result["settings"] != settings(budget or result["settings"]["budget_s"]):
-            raise InputError(
-                f"{path}: holds results of other settings, {result['settings']}; take that --budget, or another --out"
-            )
-        return result
-    packages = ("torch", "numpy", "scipy", "torchdiffeq", "pysindy", "phlearn")
-    versions = {"python": platform.python_version()}
-    for package in packages:
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = "not installed"
-    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
-    return {"machine": machine, "versions": versions, "settings": settings(budget or BUDGET), "titles": {},
-            "cells": {}}  # fmt: skip
+    new = harness.conditions("numpy", "scipy", "torchdiffeq", "pysindy", "phlearn")
+    result = harness.load(path, new | {"settings": settings(budget or BUDGET), "titles": {}, "cells": {}})
+    if result["settings"] != settings(budget or result["settings"]["budget_s"]):
+        raise InputError(
+            f"{path}: holds results of other settings, {result['settings']}; take that --budget, or another --out"
+        )
+    return result
 
 
 def plan(data: list[str], peers: list[str], seeds: int) -> list[tuple[str, str, str, int]]:
@@ -140,60 +117,48 @@ def plan(data: list[str], peers: list[str], seeds: int) -> list[tuple[str, str, 
     return cells
 
 
-def chosen(names: str | None, known: Any, what: str) -> list[str]:
-    """Names given with commas, checked; all where none are given."""
-    found = names.split(",") if names else list(known)
-    for name in found:
-        if name not in known:
-            raise InputError(f"unknown {what} '{name}'; choose from {', '.join(known)}")
-    return found
-
-
-def store(result: dict[str, Any], path: Path) -> None:
-    write_atomically(path, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
-
-
 def main(argv: list[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = harness.parser(__doc__)
     parser.add_argument("--data", help=f"with commas (default: all of {', '.join(PROBLEMS)})")
     parser.add_argument("--peers", help=f"with commas (default: all of {', '.join(PEERS)})")
     parser.add_argument("--seeds", type=int, default=5, help="seeds 0, 1, … of data and weights (default 5)")
     parser.add_argument("--budget", type=float, help=f"seconds of processor time a network fit (default {BUDGET:g})")
-    parser.add_argument(
-        "--again", action="store_true", help="measure the chosen cells (or the figures of the sources) anew"
-    )
+    parser.add_argument("--again", action="store_true", help="measure the chosen cells (or the figures) anew")
     parser.add_argument("--reproduce", action="store_true", help="only the figures of the sources")
     parser.add_argument("--redraw", action="store_true", help="only the table and the figure")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results", help="folder of the results")
     arguments = parser.parse_args(argv)
-    torch.set_num_threads(1)  # small matrices: more threads only wait
+    data = harness.chosen(parser, arguments.data, PROBLEMS, "data set")
+    peers = harness.chosen(parser, arguments.peers, PEERS, "peer")
+    for name in [p for p in peers if not PEERS[p].installed]:
+        print(f"{name}: left out, {PEERS[name].package} is not installed", file=sys.stderr)
+        peers.remove(name)
+    path = harness.json_file(arguments, "peers")
     try:
-        data, peers = chosen(arguments.data, PROBLEMS, "data set"), chosen(arguments.peers, PEERS, "peer")
-        missing = [p for p in peers if not PEERS[p].installed]
-        for name in missing:
-            print(f"{name}: left out, {PEERS[name].package} is not installed", file=sys.stderr)
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        path = arguments.out / "peers.json"
         result = opened(path, arguments.budget)
         if arguments.reproduce:
             if arguments.again:
                 result.pop("reproduced", None)
-            reproduce(result, arguments.seeds, lambda: store(result, path))
+            reproduce(result, arguments.seeds, lambda: harness.store(path, result))
         elif not arguments.redraw:
-            cells = plan(data, [p for p in peers if p not in missing], arguments.seeds)
-            keys = {"/".join(map(str, c)): c for c in cells}
-            todo = {k: c for k, c in keys.items() if arguments.again or k not in result["cells"]}
-            with tqdm(todo.items(), initial=len(keys) - len(todo), total=len(keys), disable=None) as bar:
-                for key, (name, peer, given, seed) in bar:
-                    bar.set_postfix_str(key)
-                    problem = PROBLEMS[name]()
-                    result["titles"][name] = problem.title
-                    result["cells"][key] = cell(problem, peer, given, seed, result["settings"]["budget_s"])
-                    store(result, path)
-        write(result, arguments.out)
+            measure(result, plan(data, peers, arguments.seeds), arguments.again, path)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None
-    print(arguments.out / "peers.md")
+    harness.store(path, result, table(result))
+    draw(result, path.with_suffix(".png"))
+    print(path.with_suffix(".md"))
+
+
+def measure(result: dict[str, Any], cells: list[tuple[str, str, str, int]], again: bool, path: Path) -> None:
+    """Fit and judge the cells that the result does not hold, or all; each is stored at once."""
+    keys = {"/".join(map(str, c)): c for c in cells}
+    todo = {k: c for k, c in keys.items() if again or k not in result["cells"]}
+    with tqdm(todo.items(), initial=len(keys) - len(todo), total=len(keys), disable=None) as bar:
+        for key, (name, peer, given, seed) in bar:
+            bar.set_postfix_str(key)
+            problem = PROBLEMS[name]()
+            result["titles"][name] = problem.title
+            result["cells"][key] = cell(problem, peer, given, seed, result["settings"]["budget_s"])
+            harness.store(path, result)
 
 
 if __name__ == "__main__":

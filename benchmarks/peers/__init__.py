@@ -6,14 +6,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
 
-from .discrete import train_discrete_lagrangian, train_forced_discrete_lagrangian
-from .hnn import train_dissipative_hnn, train_hnn
+from .continuous import train_delan, train_dissipative_hnn, train_hnn, train_lnn, train_neural_ode
+from .discrete import train_discrete_lagrangian, train_forced_discrete_lagrangian, train_mlp
 from .known_equation import train_known_equation
-from .lagrangian import train_delan, train_lnn
-from .ours import train_ours
-from .package_peers import train_phlearn, train_sindy
+from .packages import train_ours, train_phlearn, train_sindy
 from .rollouts import Predictor
-from .steps import train_mlp, train_neural_ode
 
 Train = Callable[..., Predictor]
 

@@ -20,8 +20,8 @@ import math
 import torch
 from torch import Tensor, nn
 
+from ..continuous import acceleration
 from ..discrete import ANCHORS, REGULAR, DiscreteLagrangian, jacobian, regularity
-from ..lagrangian import acceleration
 from ..networks import Network, Scales
 from ..rollouts import ThreePoint, rk4
 from .figures import Figure, read_off

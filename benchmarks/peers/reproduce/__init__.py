@@ -24,7 +24,7 @@ TASKS: dict[str, Callable[..., dict[str, float]]] = {
 MOST = {"Kepler": 3, "Kepler, momenta as velocities": 3, "double pendulum": 3, "arm": 3}
 FIGURES: dict[str, dict[str, Figure]] = {**hamiltonian.FIGURES, **discrete.FIGURES, **lagrangian.FIGURES}
 NOTE = (
-    "What is run, and where it departs from the source: `benchmarks/peer_models/reproduce/`. Agreement, fixed "
+    "What is run, and where it departs from the source: `benchmarks/peers/reproduce/`. Agreement, fixed "
     "before the runs at these settings: the range of our seeds meets the spread of the source; where the source "
     "gives one number, our median lies within half a decade of what was read off a logarithmic plot, or is at most "
     "twice a printed error. Three seeds where one takes more than three minutes. torchdiffeq, pysindy and phlearn "

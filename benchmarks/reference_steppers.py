@@ -90,8 +90,8 @@ def hand_written(model: ContactLagrangian) -> Hand:
 def jax_rollout(model: ContactLagrangian, iterations: int) -> Callable[..., Any] | None:
     """`rollout(q, p, s, h, steps)` → q (steps, B, n): a jitted scan of Newton steps on grad and jacfwd, or None."""
     try:
-        import jax
-        import jax.numpy as jnp
+        import jax  # pyright: ignore[reportMissingImports]
+        import jax.numpy as jnp  # pyright: ignore[reportMissingImports]
     except ImportError:
         return None
     jax.config.update("jax_enable_x64", True)

@@ -2,35 +2,23 @@
 
 import json
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-pytest.importorskip("scipy")  # the benchmark's, not the package's
-FOLDER = Path(__file__).resolve().parents[3] / "benchmarks"
-MODULES = ("", "_native", "_scenes", "_analytic", "_cases", "_rivals", "_headline", "_learned", "_neural", "_report")
-
-
-@pytest.fixture(scope="module")
-def benchmark():
-    import importlib
-
-    sys.path.insert(0, str(FOLDER))
-    yield {name: importlib.import_module(f"work_precision{name}") for name in MODULES}
-    sys.path.remove(str(FOLDER))
-    for name in MODULES:
-        sys.modules.pop(f"work_precision{name}", None)
+pytest.importorskip("scipy", reason="scipy is an extra of the benchmarks")
+from benchmarks import harness, work_precision
+from benchmarks import work_precision_rivals as rivals
+from benchmarks import work_precision_ways as ways
 
 
 @pytest.mark.slow
-def test_rules_show_their_orders(benchmark, tmp_path):
+def test_rules_show_their_orders(tmp_path):
     # fails if errors are taken at other times than the truth, or a method's name stands beside another's error
     out = tmp_path / "points.json"
     options = ["--quick", "--only", "analytic", "--scenes", "damped_oscillator", "--out", str(out)]
-    benchmark[""].main(options)
-    points = json.loads(out.read_text())["scenes"]["damped_oscillator"]
+    work_precision.main(options)
+    points = harness.load(out, {})["scenes"]["damped_oscillator"]
     assert out.with_suffix(".png").stat().st_size > 10_000
     assert "damped_oscillator" in out.with_suffix(".md").read_text()
     rules = [p for p in points if p.get("order")]
@@ -47,24 +35,23 @@ def test_rules_show_their_orders(benchmark, tmp_path):
     assert near["median"] == pytest.approx(far["median"], rel=1e-6)
     # what is done is not done again
     before = out.read_text()
-    benchmark[""].main([*options, "--resume"])
+    work_precision.main([*options, "--resume"])
     assert json.loads(out.read_text())["scenes"] == json.loads(before)["scenes"]
 
 
 @pytest.mark.parametrize("name", ["damped_oscillator", "damped_pendulum", "double_pendulum", "parachute", "kepler",
                                   "chain", "driven_pendulum", "rigid_body"])  # fmt: skip
-def test_the_equations_in_c_are_those_of_the_scene(benchmark, name):
+def test_the_equations_in_c_are_those_of_the_scene(name):
     # fails if a sign, a parameter or the torque of a segment differs between C and the scene, or an order is lost
-    scenes, rivals = benchmark["_scenes"], benchmark["_rivals"]
-    setup = scenes.SETUPS[name]
-    start = scenes.starts_of(setup.scene, 3, 5)
-    truth = scenes.exact_motion(setup, start)
+    setup = ways.SETUPS[name]
+    start = ways.starts_of(setup.scene, 3, 5)
+    truth = ways.exact_motion(setup, start)
     v = setup.scene.velocity(*start)
     y = torch.cat([start.q, rivals.body_velocity(start.q, v) if name == "rigid_body" else v], -1)
     u = setup.inputs()
-    segments = scenes.CHECKS if u is None else len(u)
-    library = benchmark["_native"].Native(name, "float64", dof=setup.scene.dof)
-    every = segments // scenes.CHECKS
+    segments = ways.CHECKS if u is None else len(u)
+    library = rivals.Native(name, "float64", dof=setup.scene.dof)
+    every = segments // ways.CHECKS
 
     def error(method, x):
         q, _ = library.motions(y, setup.T, segments, method, x, u)
@@ -72,14 +59,14 @@ def test_the_equations_in_c_are_those_of_the_scene(benchmark, name):
 
     assert error("RK4", 4000 // every) < 1e-7
     assert error("DOP853", 1e-9) < 1e-6
-    methods = [("implicit midpoint", 2), *([("leapfrog", 2)] if name in benchmark["_native"].SEPARABLE else [])]
+    methods = [("implicit midpoint", 2), *([("leapfrog", 2)] if name in rivals.SEPARABLE else [])]
     for method, order in methods:
         assert abs(math.log2(error(method, 512 // every) / error(method, 1024 // every)) - order) < 0.2
 
 
-def test_dop853_in_c_is_dop853(benchmark):
+def test_dop853_in_c_is_dop853():
     # fails if a coefficient is lost on the way into C: the error must follow the tolerance, at order 8's price
-    library = benchmark["_native"].Native("damped_pendulum", "float64", fast=False)
+    library = rivals.Native("damped_pendulum", "float64", fast=False)
     y = torch.tensor([[1.5, 0.3]], dtype=torch.float64)
     exact, _ = library.motions(y, 8.0, 4, "RK4", 4000)
     errors, counts = [], []
@@ -94,15 +81,14 @@ def test_dop853_in_c_is_dop853(benchmark):
 
 
 @pytest.mark.parametrize("layers", [1, 2])
-def test_a_network_in_c_is_the_network(benchmark, layers):
+def test_a_network_in_c_is_the_network(layers):
     # fails if a weight is read transposed, a bias is dropped, or the quotient for tanh is not tanh
     make = torch.Generator().manual_seed(0)
     width, n = 6, 2
     sizes = [(3 * n, width), (width,), *([(width, width), (width,)] if layers == 2 else []), (n, width)]
     w = [torch.randn(s, generator=make, dtype=torch.float64) for s in sizes]
-    native = benchmark["_native"]
-    weights = native.Weights(torch.cat([x.flatten() for x in w]), n, width, layers, True)
-    library = native.Native("double_pendulum", "float64", weights, n)
+    weights = rivals.Weights(torch.cat([x.flatten() for x in w]), n, width, layers, True)
+    library = rivals.Native("double_pendulum", "float64", weights, n)
     y = torch.randn(5, 2 * n, generator=make, dtype=torch.float64)
 
     def rhs(y):
@@ -121,9 +107,8 @@ def test_a_network_in_c_is_the_network(benchmark, layers):
     assert float((q[:, 0] - wanted[:, :n]).abs().max()) < 1e-6
 
 
-def test_fronts_and_ratios(benchmark):
+def test_fronts_and_ratios():
     # fails if a dominated point is kept, or a rival that misses the error is compared with
-    report = benchmark["_report"]
 
     def point(kind, us, error):
         return {"kind": kind, "setting": f"{us}", "us_per_time": us, "spread": 0.0, "median": error, "q95": error}
@@ -131,12 +116,12 @@ def test_fronts_and_ratios(benchmark):
     points = [point("learned", 2.0, 1e-4), point("learned", 3.0, 1e-3), point("neural ODE, RK4", 1.0, 1e-2),
               point("neural ODE, DOP853", 30.0, 5e-5), point("DOP853, true equations", 8.0, 1e-4),
               point("RK4, true equations", 1.0, None)]  # fmt: skip
-    assert [p["us_per_time"] for p in report.front(points)] == [1.0, 2.0, 30.0]
-    (row,) = report.headline(points)
+    assert [p["us_per_time"] for p in work_precision.front(points)] == [1.0, 2.0, 30.0]
+    (row,) = work_precision.headline(points)
     assert (row["neural ODE"], row["DOP853"], row["RK4"]) == (15.0, 4.0, None)
 
 
-def test_a_setting_is_chosen_on_other_starts_than_it_is_judged_on(benchmark):
+def test_a_setting_is_chosen_on_other_starts_than_it_is_judged_on():
     # fails if the judging half chooses, a rival of another seed is taken, or the classical ones are lost
     def point(kind, us, choice, error, **more):
         return {"kind": kind, "setting": f"{us}", "us_per_time": us, "choice_median": choice, "median": error, **more}
@@ -145,22 +130,21 @@ def test_a_setting_is_chosen_on_other_starts_than_it_is_judged_on(benchmark):
               point("learned kicks", 4.0, 5e-4, 1e-4, seed=1), point("neural ODE, RK4", 20.0, 0.0, 1e-3, seed=0),
               point("neural ODE, RK4", 10.0, 0.0, 1e-5, seed=1),
               point("DOP853, true equations", 8.0, 0.0, 1e-6)]  # fmt: skip
-    rows = benchmark["_headline"].chosen(points, "median", 1e-3, 2)["seeds"]
+    rows = work_precision.chosen(points, "median", 1e-3, 2)["seeds"]
     assert [(r["us_per_time"], r["error"]) for r in rows] == [(2.0, 3e-3), (4.0, 1e-4)]
     assert [(r["neural ODE"], r["DOP853"], r["RK4"]) for r in rows] == [(10.0, 4.0, None), (2.5, 2.0, None)]
     q = torch.tensor([[[0.1]], [[0.2]], [[3.0]], [[3.0]]])
-    found = benchmark["_scenes"].judged(q, torch.zeros_like(q))
+    found = ways.judged(q, torch.zeros_like(q))
     assert found["choice_q95"] == pytest.approx(0.2)
     assert found["median"] == pytest.approx(3.0)
 
 
-def test_the_learned_equation_is_that_of_the_model(benchmark):
+def test_the_learned_equation_is_that_of_the_model():
     # fails if a learned number stands at another place of the C equation, or the entry's velocity is not M⁻¹p
     from herglotz.mechanics import legendre_plus
     from herglotz.models import ContactLagrangian, ModelConfig
     from herglotz.stepping import State, Stepper
 
-    head, native = benchmark["_headline"], benchmark["_native"]
     features, ones, none = ("pendulums", "cos(q1)", "cos(q2)"), (1.0, 1.0), (0.0, 0.0)
     config = ModelConfig(
         angles=(True, True), scale=ones, speed=ones, stiffness=none, tilt=none, features=features, potential_width=0
@@ -170,7 +154,7 @@ def test_the_learned_equation_is_that_of_the_model(benchmark):
         for name, parameter in model.named_parameters():
             if name.endswith("coefficient") or name == "damping.rate":
                 parameter.copy_(torch.arange(1.0, 1.0 + parameter.numel()).reshape(parameter.shape) / 5)
-    found = head.constants_of(model)
+    found = rivals.constants_of(model)
     q, v = torch.tensor([[0.3, -0.4]]).double(), torch.tensor([[0.7, 0.2]]).double()
     start = State(q, torch.zeros_like(q), torch.zeros(1).double())
     h = 1e-5  # p = ∂K/∂v from the model itself, by the step of a motion with this velocity
@@ -178,46 +162,10 @@ def test_the_learned_equation_is_that_of_the_model(benchmark):
         p = legendre_plus(model, q - h * v, q, torch.zeros(1).double(), h)[1]
         out = Stepper(model).rollout(q, p, h=1e-3, steps=100)
     start = State(q, p, torch.zeros(1).double())
-    torch.testing.assert_close(head._velocity(found, start), v, rtol=1e-3, atol=1e-3)
-    library = native.Native("double_pendulum", "float64", dof=2, constants=found)
+    torch.testing.assert_close(rivals._velocity(found, start), v, rtol=1e-3, atol=1e-3)
+    library = rivals.Native("double_pendulum", "float64", dof=2, constants=found)
     wanted, _ = library.motions(torch.cat([q, v], -1), 0.1, 1, "RK4", 100)
     torch.testing.assert_close(out.q[:, -1], wanted[:, 0], rtol=0, atol=1e-4)
-    plain = native.Native("double_pendulum", "float64", dof=2)
+    plain = rivals.Native("double_pendulum", "float64", dof=2)
     other, _ = plain.motions(torch.cat([q, v], -1), 0.1, 1, "RK4", 100)
     assert float((other - wanted).abs().max()) > 1e-3
-
-
-def test_a_fixed_number_of_iterations_is_the_step_or_says_that_it_is_not(benchmark):
-    # fails if the unrolled loop that torch.compile takes is another method, or hides that it did not arrive
-    from herglotz.export import StepModule
-    from herglotz.models import ContactLagrangian, ModelConfig
-    from herglotz.stepping import Status
-
-    model = ContactLagrangian(ModelConfig(correction_width=6)).double()
-    make = torch.Generator().manual_seed(0)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.5 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
-        q, p = torch.randn(2, 7, 1, generator=make, dtype=torch.float64)
-        x = (q, p, torch.zeros(7, dtype=torch.float64), torch.full((7,), 0.4, dtype=torch.float64))
-        plain, module = StepModule(model), StepModule(model)
-        newton, wanted = module.newton, plain(*x)
-        for turns, arrives in ((12, True), (1, False)):
-            module.newton = benchmark["_learned"].FixedNewton(newton, turns)
-            found = module(*x)
-            assert bool((found[5] == Status.CONVERGED).all()) == arrives
-            if arrives:
-                torch.testing.assert_close(found[:3], wanted[:3], rtol=1e-13, atol=1e-13)
-    assert bool(found[0].isnan().any())
-
-
-def test_what_was_not_measured_is_said(benchmark):
-    # fails if a knob without a point passes for measured
-    points = [{"kind": "learned, level conservative", "setting": ""}, {"kind": "learned, ONNX", "artefact": "ONNX"},
-              {"kind": "neural ODE, RK4", "width": 8, "depth": 1}]  # fmt: skip
-    lines = benchmark["_report"].coverage({"driven_pendulum": points})
-    cells = {line.split("|")[1].strip(): line.split("|")[2].strip() for line in lines if line.startswith("| ")}
-    assert (cells["level"], cells["ONNX"]) == ("yes", "yes")
-    assert cells["torch.compile"].startswith("no")
-    assert cells["correction on/off"].startswith("no")  # a width of another's network is none
-    assert cells["larger h, learned"] == "no: an input is held over h only"

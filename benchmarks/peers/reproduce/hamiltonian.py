@@ -18,7 +18,7 @@ from collections.abc import Callable, Sequence
 import torch
 from torch import Tensor, nn
 
-from ..hnn import Hamiltonian
+from ..continuous import Hamiltonian
 from ..networks import Scales
 from ..rollouts import rk4
 from .figures import Figure, spread
