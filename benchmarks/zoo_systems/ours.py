@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.zoo_systems.mechanisms import Array
+from benchmarks.zoo_systems.prediction import trained
+from benchmarks.zoo_systems.systems import Recording, ZooSystem
 from herglotz.data import Trajectories, save
 from herglotz.training import load_run
-from zoo_systems.mechanisms import Array
-from zoo_systems.prediction import trained
-from zoo_systems.systems import Recording, ZooSystem
 
 WALL = 30  # times the processor time that a fit may wait on a busy machine
 
