@@ -24,9 +24,7 @@ def test_scene_is_the_function():
 
 def test_unknown_scene():
     # fails if the message does not list the names to choose from
-    with pytest.raises(
-        InputError, match="unknown scene 'pendulum'; choose one of cart_pole, chain, damped_o"
-    ):
+    with pytest.raises(InputError, match="unknown scene 'pendulum'; choose one of cart_pole, chain, damped_o"):
         scene("pendulum")
 
 
