@@ -85,12 +85,17 @@ def test_links_lead_somewhere(path):
 
 
 def resolve(name):
-    """The object that a dotted name means; raises where there is none."""
-    module, parts = importlib.import_module("herglotz"), name.split(".")[1:]
-    for i, part in enumerate(parts):
-        if not hasattr(module, part):
-            importlib.import_module(".".join(["herglotz", *parts[: i + 1]]))
-        module = getattr(module, part)
+    """The object that a dotted name means; raises where there is none. A module may share its name with a function."""
+    parts = re.sub(r"^hz\b", "herglotz", name).split(".")
+    for i in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:i]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[i:]:
+            value = getattr(value, part)
+        return
+    raise ModuleNotFoundError(name)
 
 
 @by_page
