@@ -19,11 +19,11 @@ from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 WARMUP = 20  # samples from which the state is estimated
-BELIEVED = 0.1  # noise of a step relative to the data's in the warm-up, as in `smooth`: the model is believed
+BELIEVED = 0.1  # noise of a step over that of the data in the warm-up, as in `smooth`: the states follow the model
 
 
 class Trained(Protocol):
-    """What `predict` needs of a run."""
+    """The attributes of a run that `predict` uses."""
 
     @property
     def model(self) -> ContactLagrangian: ...  # noqa: D102
