@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.roughness import precision
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
@@ -27,6 +28,10 @@ FIRST_SEGMENT = 20  # recorded steps; later stages double it
 MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 FLOOR = 1e-6  # of the largest |q|: errors below it are no reason to stop growing segments
+WIDER = (30.0, 900.0)  # times weaker priors: the next ranges start where the default one ends, the last at 5 baselines
+HALVED = 2.0  # factor by which a weaker prior has to lower the error of the shortest segments
+SMALL = 1e-2  # of the largest |q|: shortest segments that miss less lack no force as large as the baseline's
+NOT_THE_NOISE = 1.5  # times the data's precision; as in the verdict
 STAGE = 40  # iterations of a stage at most: a start near the optimum needs fewer, and a poor one is left by the next
 
 
@@ -105,10 +110,14 @@ class SegmentStages:
         Fit the states alone.
     s
         (N,) s at every sample in the model's unit, where it is known.
+    label
+        What sets the names of these stages apart from those of others in the same fit.
     """
 
-    def __init__(self, task: Task, model: ContactLagrangian, *, frozen: bool = False, s: Tensor | None = None):
-        self.task, self.model, self.frozen, self.s = task, model, frozen, s
+    def __init__(
+        self, task: Task, model: ContactLagrangian, *, frozen: bool = False, s: Tensor | None = None, label: str = ""
+    ):
+        self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
 
     def fit(
@@ -135,7 +144,7 @@ class SegmentStages:
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
         total = min(self.task.config.iterations, STAGE)
         result = self.task.stages.run(
-            name, x, total,
+            name + self.label, x, total,
             lambda x, callback: levenberg_marquardt(
                 target, x, max_iterations=total, rtol=1e-4, patience=3, callback=callback
             ),
@@ -145,16 +154,19 @@ class SegmentStages:
         path = problem.solve(problem.pack(theta, result.x[-states.numel() :].reshape(states.shape)))
         return None if path is None or not math.isfinite(result.cost) else TrajectoryFit(theta, problem, path, result)
 
-    def robust_or_not(self, sigma: float) -> TrajectoryFit | None:
+    def shortest(self, sigma: float) -> TrajectoryFit | None:
+        """The shortest segments, from the samples."""
+        return self.fit(self.lengths[0], sigma, FREEDOM if self.task.config.robust == "on" else None, None)
+
+    def robust_or_not(self, first: TrajectoryFit) -> TrajectoryFit:
         """The shortest segments, with Student's t or without the outliers where the data have any.
 
         With `robust` "auto" they are fitted with Student's t as well. Where that shows outliers, and they are few, they
         are left out and least squares go on with the rest; where the rest has outliers still, or they are many,
         Student's t is the loss of all further stages (`problems.robust`).
         """
-        robust, length = self.task.config.robust, self.lengths[0]
-        first = self.fit(length, sigma, FREEDOM if robust == "on" else None, None)
-        if first is None or robust != "auto":
+        length = self.lengths[0]
+        if self.task.config.robust != "auto":
             return first
         trial = self.fit(length, max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
         if trial is None or not heavy_tailed(trial.misfit):
@@ -199,11 +211,11 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
     """
     if model.potential.network is None:
         task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
-    stages = SegmentStages(task, model)
-    first = stages.robust_or_not(sigma)
+    stages, first = _wide_enough(task, model, sigma)
     if first is None:
         return None
-    last = stages.grow(first, sigma)
+    departures = stages.task.config.departures
+    last = stages.grow(stages.robust_or_not(first), sigma)
     previous, noise = last, last.noise
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
@@ -220,10 +232,31 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
         return found
 
     # The weakest prior twice: the first round finds the noise, which then stays the same for all.
-    weakest = max(task.config.departures)
-    noise = (fit("noise", weakest) or last).noise
-    found = strongest_not_beaten(task.config.departures, lambda departure: fit(f"prior {departure:g}", departure))
-    return found or Chosen(last, task.config.departures[0], {})
+    noise = (fit("noise", max(departures)) or last).noise
+    found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
+    return found or Chosen(last, departures[0], {})
+
+
+def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:
+    """The stages whose range of priors lets the shortest segments follow the data, and the fit of these segments.
+
+    The range of the settings, if these segments are at the data's precision or miss less than 1 % of the motion. If
+    not, ranges weaker by 30 and 900 are tried, and taken where they halve the error: the baseline then lacks a force as
+    large as its own. Errors are those of the bulk, for outliers are no reason for another prior.
+    """
+    stages = SegmentStages(task, model)
+    first = stages.shortest(sigma)
+    enough = max(NOT_THE_NOISE * precision(task.data), SMALL * task.size)
+    for by in WIDER if len(task.config.departures) > 1 else ():
+        if first is not None and scale_of(first.misfit) <= enough:
+            break
+        weaker = tuple(departure * by for departure in task.config.departures)
+        wide = replace(task, config=replace(task.config, departures=weaker))
+        other = SegmentStages(wide, model, label=f", prior weaker by {by:g}")
+        found = other.shortest(sigma)
+        if found is not None and (first is None or scale_of(found.misfit) < scale_of(first.misfit) / HALVED):
+            stages, first = other, found
+    return stages, first
 
 
 def _without_outliers(
