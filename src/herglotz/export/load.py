@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import io
 import zipfile
 from collections.abc import Callable, Mapping
@@ -16,8 +17,8 @@ from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.box import Box
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
-from herglotz.export.metadata import METADATA, from_json
-from herglotz.export.pt2 import quiet
+from herglotz.export.metadata import AOTI, KEY, METADATA, from_json
+from herglotz.export.programs import quiet
 from herglotz.stepping import Rollout, State, Step, step_sizes
 
 Program = Callable[..., tuple[Tensor, ...]]
@@ -237,6 +238,40 @@ def load_pt2(path: PathLike) -> ExportedStepper:
     return ExportedStepper(modules, metadata, str(path), "pt2")
 
 
+def load_onnx(path: PathLike) -> ExportedStepper:
+    """Read a file that `export_onnx` wrote; it runs on as many threads as torch does.
+
+    Raises
+    ------
+    InputError
+        If onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another version.
+    """
+    content = read_bytes(path)
+    try:
+        import onnxruntime as ort
+    except ImportError:
+        raise InputError(f"{path}: needs onnxruntime; install it with: pip install onnxruntime") from None
+    options = ort.SessionOptions()
+    options.intra_op_num_threads = torch.get_num_threads()
+    options.inter_op_num_threads = 1
+    options.enable_cpu_mem_arena = False  # a tenth faster for tensors of a few numbers, and no slower for others
+    options.log_severity_level = 4  # an exception says it; its log line would be a second
+    try:
+        session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
+        entries = session.get_modelmeta().custom_metadata_map
+        metadata = from_json(entries.get(KEY), path)
+        programs = {"rollout": _session_program(session)}
+        for name in (x for x in entries if x.startswith(f"{KEY}_")):  # further models, in base 64
+            second = ort.InferenceSession(base64.b64decode(entries[name]), options, providers=["CPUExecutionProvider"])
+            programs[name.removeprefix(f"{KEY}_")] = _session_program(second)
+    except InputError:
+        raise
+    except Exception as error:  # onnxruntime has a dozen exception classes and no common one
+        line = (str(error).strip().splitlines() or [""])[0]
+        raise InputError(f"{path}: is not a readable .onnx file ({line[:120]}); export the model again") from None
+    return ExportedStepper(programs, metadata, str(path), "onnx")
+
+
 def load_exported(path: PathLike) -> Any:
     """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
 
@@ -252,8 +287,6 @@ def load_exported(path: PathLike) -> Any:
     """
     suffix = Path(path).suffix.lower()
     if suffix == ".onnx":
-        from herglotz.export.onnx_file import load_onnx
-
         return load_onnx(path)
     if suffix == ".h":
         from herglotz.export.c_stepper import load_c
@@ -270,11 +303,20 @@ def _is_compiled(content: bytes) -> bool:
 def _load_aoti(path: PathLike) -> ExportedStepper:
     from torch._inductor.package.package import load_package
 
-    from herglotz.export.aoti import INIT, KEY, ROLLOUT
+    programs = {name: load_package(str(path), key) for name, key in AOTI.items()}
+    loader: Any = programs["rollout"].loader
+    return ExportedStepper(programs, from_json(loader.get_metadata().get(KEY), path), str(path), "aoti")
 
-    package, init = (load_package(str(path), name) for name in (ROLLOUT, INIT))
-    metadata = from_json(package.loader.get_metadata().get(KEY), path)  # pyright: ignore[reportAttributeAccessIssue]
-    return ExportedStepper({"rollout": package, "init": init}, metadata, str(path), "aoti")
+
+def _session_program(session: Any) -> Program:
+    """An onnxruntime session as a function of tensors."""
+    names = [x.name for x in session.get_inputs()]
+
+    def run(*arguments: Tensor) -> tuple[Tensor, ...]:
+        feeds = {name: x.detach().numpy() for name, x in zip(names, arguments, strict=True)}
+        return tuple(torch.from_numpy(x) for x in session.run(None, feeds))
+
+    return run
 
 
 def _plain(x: Tensor) -> Tensor:

@@ -1,15 +1,138 @@
-"""What each operation of a traced graph is in ONNX, where it is not one operation of the same meaning."""
+"""What each operation of a traced program is in ONNX; loops first, then one function or name an operation."""
 
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import torch
+from torch import fx
 
-from herglotz.export.onnx_ops import NUMPY, Writer, _axis, _common, _of, _within, aten, kind_of
+from herglotz.errors import InputError
+from herglotz.export.lower.onnx_writer import NUMPY, Writer, described, kind_of
+
+aten = torch.ops.aten
+SIMPLE = {
+    aten.abs.default: "Abs", aten.neg.default: "Neg", aten.sin.default: "Sin", aten.cos.default: "Cos",
+    aten.exp.default: "Exp", aten.tanh.default: "Tanh", aten.sqrt.default: "Sqrt", aten.sigmoid.default: "Sigmoid",
+    aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not", aten.isnan.default: "IsNaN",
+    aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
+    aten.maximum.default: "Max", aten.minimum.default: "Min",
+    aten.__and__.Tensor: "And", aten.__or__.Tensor: "Or", aten.eq.Scalar: "Equal", aten.eq.Tensor: "Equal",
+    aten.le.Tensor: "LessOrEqual", aten.le.Scalar: "LessOrEqual", aten.lt.Tensor: "Less", aten.lt.Scalar: "Less",
+    aten.ge.Tensor: "GreaterOrEqual", aten.ge.Scalar: "GreaterOrEqual", aten.gt.Tensor: "Greater",
+    aten.gt.Scalar: "Greater", aten.where.self: "Where", aten.where.ScalarSelf: "Where",
+    aten.where.ScalarOther: "Where", aten.where.Scalar: "Where", aten.pow.Tensor_Scalar: "Pow",
+    aten.pow.Tensor_Tensor: "Pow",
+}  # fmt: skip
+SAME = (aten.clone.default, aten.detach.default, aten.alias.default)
+# Written where one of their outputs is taken; zeros nowhere, see `_is_zero`.
+LATER = (
+    aten.unbind.int, aten.broadcast_tensors.default, aten.split_with_sizes.default, aten.linalg_inv_ex.default,
+    aten.zeros.default,
+)  # fmt: skip
+
+
+def write(w: Writer, program: fx.GraphModule, values: Sequence[Any]) -> list[str]:
+    """The nodes of a program at the values of its placeholders (names or known tensors); the names of its outputs."""
+    nodes = list(program.graph.nodes)
+    w.values |= dict(zip((x for x in nodes if x.op == "placeholder"), values, strict=True))
+    outputs: list[str] = []
+    for node in nodes:
+        if node.op == "get_attr":
+            w.values[node] = getattr(program, node.target)
+        elif node.op == "call_function" and node.users and node.target not in LATER and not _within(node):
+            w.values[node] = _translate(w, node)
+        elif node.op == "output":
+            found: Any = node.args[0]
+            outputs = [w.name(x) for x in (found if isinstance(found, (tuple, list)) else [found])]
+    return outputs
+
+
+def _translate(w: Writer, node: Any) -> Any:
+    target: Any = node.target
+    if target in SAME:
+        return w.values[node.args[0]]
+    if target in SIMPLE:
+        if target == aten.add.Tensor and _is_zero(node.args[1]):
+            return w.values[node.args[0]]
+        dtype = _common(node)
+        names = [w.name(x, dtype) for x in node.args]
+        if (scale := node.kwargs.get("alpha", 1)) != 1:
+            names[1] = w.emit("Mul", names[1], w.name(scale, dtype))
+        return w.emit(SIMPLE[target], *names)
+    if target not in TABLE:
+        raise InputError(f"ONNX export does not know the operation {target}; export to --format pt2 or c")
+    return TABLE[target](w, node)
+
+
+def _while(w: Writer, node: Any) -> list[str]:
+    """A loop that turns while its condition holds: ONNX's Loop, with the condition evaluated before and in it."""
+    from onnx import TensorProto, helper
+
+    condition, body, carry, fixed = node.args
+    condition, body = w.values[condition], w.values[body]
+    start, fixed = [w.name(x) for x in carry], [w.values[x] for x in fixed]
+    (on,) = write(w, condition, [*start, *fixed])
+    inner, value, empty = w.inner(), helper.make_tensor_value_info, helper.make_empty_tensor_value_info
+    inside = [w.fresh() for _ in start]
+    turned = inner.own(write(inner, body, [*inside, *fixed]), inside)
+    (more,) = write(inner, condition, [*turned, *fixed])
+    graph = helper.make_graph(
+        inner.nodes, "turn",
+        [value(w.fresh(), TensorProto.INT64, []), value(w.fresh(), TensorProto.BOOL, []), *map(empty, inside)],
+        [value(more, TensorProto.BOOL, []), *map(empty, turned)],
+    )  # fmt: skip
+    return w.several("Loop", ["", on, *start], len(start), body=graph)
+
+
+def _scan(w: Writer, node: Any) -> list[str]:
+    """A loop over the rows of its inputs: ONNX's Scan."""
+    from onnx import helper
+
+    body, carry, rows, fixed = node.args
+    body = w.values[body]
+    start, table, fixed = [w.name(x) for x in carry], [w.name(x) for x in rows], [w.values[x] for x in fixed]
+    inner, value = w.inner(), helper.make_tensor_value_info
+    inside = [w.fresh() for _ in (*start, *table)]
+    out = inner.own(write(inner, body, [*inside, *fixed]), inside)
+    given, (results,) = (body.graph.find_nodes(op=x) for x in ("placeholder", "output"))
+    infos = [
+        [value(x, kind_of(described(y).dtype), _free(described(y).shape)) for x, y in zip(names, nodes, strict=False)]
+        for names, nodes in ((inside, given), (out, results.args[0]))
+    ]
+    graph = helper.make_graph(inner.nodes, "step", *infos)
+    return w.several("Scan", [*start, *table], len(out), body=graph, num_scan_inputs=len(table))
+
+
+def _free(shape: Sequence[Any]) -> list[int | None]:
+    """The sizes that are fixed."""
+    return [x if isinstance(x, int) else None for x in shape]
+
+
+def _is_zero(x: Any) -> bool:
+    """Whether this is the zero that `RolloutModule` adds for inductor's sake."""
+    return isinstance(x, fx.Node) and x.target == aten.zeros.default
+
+
+def _common(node: Any) -> torch.dtype | None:
+    """The dtype of plain numbers beside tensors: that of the last tensor (the first of `where` is its mask)."""
+    tensors = [x for x in node.args if isinstance(x, fx.Node)]
+    dtype = described(tensors[-1]).dtype
+    if dtype != torch.bool:
+        return dtype
+    return described(node).dtype if described(node).dtype != torch.bool else None
+
+
+def _axis(axis: int, x: Any) -> int:
+    return axis % len(described(x).shape)
+
+
+def _within(node: Any) -> bool:
+    """Whether this is |x| on its way into sums, which ONNX has as one operation."""
+    return node.target == aten.abs.default and all(x.target == aten.sum.dim_IntList for x in node.users)
 
 
 def _slice(w: Writer, node: Any) -> str:
@@ -27,29 +150,29 @@ def _item(w: Writer, node: Any) -> str:
     """One output of an operation that has several."""
     source: Any = node.args[0]
     index: Any = node.args[1]
+    if source in w.values:  # of a loop
+        return w.values[source][index]
     if source.target == aten.unbind.int:
         x, axis = source.args[0], (source.args[1] if len(source.args) > 1 else 0)
         return w.emit("Gather", w.name(x), w.constant(index, np.int64), axis=_axis(axis, x))
     if source.target == aten.split_with_sizes.default:
-        if source not in w._parts:
-            x, sizes, axis = source.args
-            names = (w.name(x), w.integers(*sizes))
-            w._parts[source] = w.several("Split", names, len(sizes), axis=_axis(axis, x))
-        return w._parts[source][index]
+        x, sizes, axis = source.args
+        w.values[source] = w.several("Split", (w.name(x), w.integers(*sizes)), len(sizes), axis=_axis(axis, x))
+        return w.values[source][index]
     if source.target == aten.linalg_inv_ex.default:
         assert index == 0
         return _inverse(w, source.args[0])
     assert source.target == aten.broadcast_tensors.default
     x, others = source.args[0][index], source.args[0]
-    if _of(x).shape == _of(node).shape:
+    if described(x).shape == described(node).shape:
         return w.name(x)
-    whole = next(y for y in others if _of(y).shape == _of(node).shape)
+    whole = next(y for y in others if described(y).shape == described(node).shape)
     return w.emit("Expand", w.name(x), w.emit("Shape", w.name(whole)))
 
 
 def _inverse(w: Writer, x: Any) -> str:
     """The inverse of a mass matrix by Gauss and Jordan: ONNX has none, and such a matrix needs no row exchanges."""
-    n, real = _of(x).shape[-1], NUMPY[_of(x).dtype]
+    n, real = described(x).shape[-1], NUMPY[described(x).dtype]
     eye, last = np.eye(n), w.integers(-1)
     J = w.name(x)
     for k in range(n):
@@ -64,20 +187,21 @@ def _inverse(w: Writer, x: Any) -> str:
 
 def _transposed(w: Writer, node: Any) -> str:
     x, first, second = node.args
-    perm = list(range(len(_of(x).shape)))
+    perm = list(range(len(described(x).shape)))
     perm[first], perm[second] = perm[second], perm[first]
     return w.emit("Transpose", w.name(x), perm=perm)
 
 
 def _flattened(w: Writer, node: Any) -> str:
-    """The axes from one on to the last in one."""
-    x, axis = node.args
-    return w.emit("Reshape", w.name(x), w.integers(*[0] * _axis(axis, x), -1))
+    """The axes from the first to the last named one in one."""
+    x, first, last = (*node.args, -1)[:3]
+    tail = described(x).shape[_axis(last, x) + 1 :]
+    return w.emit("Reshape", w.name(x), w.integers(*[0] * _axis(first, x), -1, *tail))
 
 
 def _moved(w: Writer, node: Any) -> str:
     x, source, target = node.args
-    dims = len(_of(x).shape)
+    dims = len(described(x).shape)
     order = torch.empty(list(range(1, dims + 1)), device="meta").movedim(source, target).shape
     return w.emit("Transpose", w.name(x), perm=[size - 1 for size in order])
 
@@ -87,7 +211,7 @@ def _unflatten(w: Writer, node: Any) -> str:
     axis = _axis(axis, x)
     assert axis == 0
     tail = w.emit("Shape", w.name(x), start=1)
-    return w.emit("Reshape", w.name(x), w.emit("Concat", w.integers(*shape), tail, axis=0))
+    return w.emit("Reshape", w.name(x), w.emit("Concat", w.sizes(shape), tail, axis=0))
 
 
 def _product(w: Writer, a: str, b: str, rank: int) -> str:
@@ -96,22 +220,26 @@ def _product(w: Writer, a: str, b: str, rank: int) -> str:
 
 
 def _matmul(w: Writer, node: Any) -> str:
+    """A B; a vector B as a column, for which onnxruntime is ten times faster."""
     a, b = node.args
-    rank = 2 if len(_of(a).shape) == len(_of(b).shape) == 2 else 0
-    return _product(w, w.name(a), w.name(b), rank)
+    ranks = len(described(a).shape), len(described(b).shape)
+    if ranks == (2, 1):
+        last = w.integers(1)
+        return w.emit("Squeeze", w.emit("Gemm", w.name(a), w.emit("Unsqueeze", w.name(b), last)), last)
+    return _product(w, w.name(a), w.name(b), 2 if ranks == (2, 2) else 0)
 
 
 def _linear(w: Writer, node: Any) -> str:
     x, weight, *bias = node.args
-    known = w._values.get(weight)
+    known = w.known(weight)
     turned = (
         w.emit("Transpose", w.name(weight), perm=[1, 0]) if known is None
-        else w.constant(known.t().contiguous().numpy(), NUMPY[known.dtype])
+        else w.constant(known.detach().t().contiguous().numpy(), NUMPY[known.dtype])
     )  # fmt: skip
     added = w.name(bias[0]) if bias and bias[0] is not None else None
-    if len(_of(x).shape) == 2 and added is not None:
+    if len(described(x).shape) == 2 and added is not None:
         return w.emit("Gemm", w.name(x), turned, added)
-    product = _product(w, w.name(x), turned, len(_of(x).shape))
+    product = _product(w, w.name(x), turned, len(described(x).shape))
     return product if added is None else w.emit("Add", product, added)
 
 
@@ -122,11 +250,11 @@ def _addcmul(w: Writer, node: Any) -> str:
     if value == -1:
         return w.emit("Sub", w.name(a), w.emit("Mul", w.name(b), w.name(c)))
     if value != 1:
-        known = w._values.get(c)
+        known = w.known(c)
         if known is None:
-            c_name = w.emit("Mul", w.name(c), w.name(value, _of(node).dtype))
+            c_name = w.emit("Mul", w.name(c), w.name(value, described(node).dtype))
         else:
-            c_name = w.constant((known * value).numpy(), NUMPY[known.dtype])
+            c_name = w.constant((known.detach() * value).numpy(), NUMPY[known.dtype])
         return w.emit("Add", w.name(a), w.emit("Mul", w.name(b), c_name))
     return w.emit("Add", w.name(a), w.emit("Mul", w.name(b), w.name(c)))
 
@@ -134,7 +262,7 @@ def _addcmul(w: Writer, node: Any) -> str:
 def _stack(w: Writer, node: Any) -> str:
     parts: Any = node.args[0]
     axis: Any = node.args[1] if len(node.args) > 1 else 0
-    axis = axis % (len(_of(parts[0]).shape) + 1)
+    axis = axis % (len(described(parts[0]).shape) + 1)
     return w.emit("Concat", *(w.emit("Unsqueeze", w.name(x), w.integers(axis)) for x in parts), axis=axis)
 
 
@@ -181,7 +309,7 @@ def _index(w: Writer, node: Any) -> str:
 
 def _expm1(w: Writer, node: Any) -> str:
     """e^x − 1 = 2t/(1 − t), t = tanh(x/2), where x is small: ONNX has no expm1."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
+    x, dtype = w.name(node.args[0]), described(node).dtype
     one, two = w.name(1.0, dtype), w.name(2.0, dtype)
     t = w.emit("Tanh", w.emit("Div", x, two))
     small = w.emit("Div", w.emit("Mul", two, t), w.emit("Sub", one, t))
@@ -200,14 +328,14 @@ def _log1p(w: Writer, x: str, dtype: torch.dtype) -> str:
 
 def _atanh(w: Writer, node: Any) -> str:
     """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has it in float32 only."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
+    x, dtype = w.name(node.args[0]), described(node).dtype
     ratio = w.emit("Div", w.emit("Mul", w.name(2.0, dtype), x), w.emit("Sub", w.name(1.0, dtype), x))
     return w.emit("Mul", w.name(0.5, dtype), _log1p(w, ratio, dtype))
 
 
 def _log_sigmoid(w: Writer, node: Any) -> str:
     """Log σ(x) = min(x, 0) − log(1 + e^{−|x|})."""
-    x, dtype = w.name(node.args[0]), _of(node).dtype
+    x, dtype = w.name(node.args[0]), described(node).dtype
     decay = w.emit("Exp", w.emit("Neg", w.emit("Abs", x)))
     return w.emit("Sub", w.emit("Min", x, w.name(0.0, dtype)), _log1p(w, decay, dtype))
 
@@ -215,16 +343,18 @@ def _log_sigmoid(w: Writer, node: Any) -> str:
 def _nan_to_num(w: Writer, node: Any) -> str:
     x, nan, large = node.args
     assert nan == large
-    return w.emit("Where", w.finite(x), w.name(x), w.name(nan, _of(node).dtype))
+    return w.emit("Where", w.finite(x), w.name(x), w.name(nan, described(node).dtype))
 
 
 def _diagonal(w: Writer, node: Any) -> str:
     x: Any = node.args[0]
-    eye = w.constant(np.eye(_of(x).shape[-1]), NUMPY[_of(x).dtype])
+    eye = w.constant(np.eye(described(x).shape[-1]), NUMPY[described(x).dtype])
     return w.emit("Mul", w.emit("Unsqueeze", w.name(x), w.integers(-1)), eye)
 
 
-TABLE: dict[Any, Callable[[Writer, Any], str]] = {
+TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
+    torch.ops.higher_order.while_loop: _while,
+    torch.ops.higher_order.scan: _scan,
     aten.slice.Tensor: _slice,
     aten.select.int: _select,
     operator.getitem: _item,
@@ -246,8 +376,8 @@ TABLE: dict[Any, Callable[[Writer, Any], str]] = {
         "Expand", w.name(n.args[0]), w.sizes([1 if x == -1 else x for x in n.args[1]])
     ),
     aten.sym_size.int: lambda w, n: w.emit("Shape", w.name(n.args[0]), start=n.args[1], end=n.args[1] + 1),
-    operator.mul: lambda w, n: w.emit("Mul", w.name(n.args[0]), w.integers(n.args[1])),
-    aten.rsub.Scalar: lambda w, n: w.emit("Sub", w.name(n.args[1], _of(n).dtype), w.name(n.args[0])),
+    operator.mul: lambda w, n: w.emit("Mul", *(w.integers(x) if isinstance(x, int) else w.name(x) for x in n.args)),
+    aten.rsub.Scalar: lambda w, n: w.emit("Sub", w.name(n.args[1], described(n).dtype), w.name(n.args[0])),
     aten.ne.Scalar: lambda w, n: w.emit("Not", w.emit("Equal", w.name(n.args[0]), w.name(n.args[1], _common(n)))),
     aten.ne.Tensor: lambda w, n: w.emit("Not", w.emit("Equal", w.name(n.args[0]), w.name(n.args[1]))),
     aten.amax.default: _reduced("ReduceMax"),
@@ -262,7 +392,7 @@ TABLE: dict[Any, Callable[[Writer, Any], str]] = {
     aten.zeros_like.default: lambda w, n: w.like(n, 0),
     aten.ones_like.default: lambda w, n: w.like(n, 1),
     aten.full_like.default: lambda w, n: w.like(n, n.args[1]),
-    aten.new_zeros.default: lambda w, n: w.emit("Expand", w.name(0.0, _of(n).dtype), w.sizes(n.args[1])),
+    aten.new_zeros.default: lambda w, n: w.emit("Expand", w.name(0.0, described(n).dtype), w.sizes(n.args[1])),
     aten.isfinite.default: lambda w, n: w.finite(n.args[0]),
     aten.nan_to_num.default: _nan_to_num,
     aten.expm1.default: _expm1,

@@ -1,0 +1,1 @@
+"""One traced program of a step, written in the words of each format."""
