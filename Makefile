@@ -1,11 +1,11 @@
-# `make demo` and `make test` do all the set-up themselves; they need Python >= 3.11 and make.
+# Every target does its own set-up; all that has to be there is Python >= 3.11 and make.
 PYTHON ?= python3
 PY := .venv/bin/python
 WORKERS ?= 2
 # One thread a test worker: two workers on two cores do not fight over them.
 ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo test test-slow mutants lint clean
+.PHONY: demo lint check test test-anywhere test-slow mutants census clean
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -20,8 +20,17 @@ lint: .venv/installed
 	$(PY) -m ruff check .
 	$(PY) -m pyright
 
+# Before a commit: the folders of unit tests that are quick.
+QUICK := tests/unit/*.py tests/unit/data
+check: lint
+	$(ENV) $(PY) -m pytest -q -n $(WORKERS) $(QUICK)
+
 test: lint
 	$(ENV) $(PY) -m pytest -q -n $(WORKERS)
+
+# Other instructions, threads, versions and roundings: eight times as long as `make test`.
+test-anywhere: .venv/installed
+	$(PY) tests/anywhere.py
 
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow
@@ -29,6 +38,10 @@ test-slow: .venv/installed
 # Break the geometry line by line; every mutant must be noticed (several minutes).
 mutants: .venv/installed
 	$(ENV) $(PY) tests/mutants.py
+
+# Lines a room, long functions, complexity, import circles.
+census: .venv/installed
+	$(PY) tools/census.py
 
 clean:
 	rm -rf .venv runs build dist .pytest_cache .ruff_cache

@@ -28,8 +28,8 @@ from herglotz.errors import InputError
 from herglotz.export import export_c
 from herglotz.export.c_wrapper import FLAGS, compiler
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import Scene, scene
 from herglotz.stepping import Rollout, State, Stepper
-from herglotz.systems import Scene, scene
 
 ROOT = Path(__file__).resolve().parents[1]
 Row = dict[str, Any]

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from herglotz.data import Trajectories, simulate
 from herglotz.data.files import write_atomically
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import select
 from herglotz.training.selection import CANDIDATES
 

@@ -26,10 +26,11 @@ from herglotz.data import simulate
 from herglotz.data.files import write_atomically
 from herglotz.models import ContactLagrangian
 from herglotz.plots.style import new_figure, save_figure, styled
-from herglotz.stepping import Event, State, Stepper, boundary_value
-from herglotz.systems import scene
-from herglotz.systems.reference import reference_flow
-from herglotz.systems.scene import Scene
+from herglotz.scenes import scene
+from herglotz.scenes.reference import reference_flow
+from herglotz.scenes.scene import Scene
+from herglotz.stepping import Event, State, Stepper
+from herglotz.theory import boundary_value
 from herglotz.training import FitConfig, fit
 
 RESULTS = Path(__file__).resolve().parent / "results"

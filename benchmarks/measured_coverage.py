@@ -33,7 +33,7 @@ from herglotz.plots.style import (
     save_figure,
     styled,
 )  # fmt: skip
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import Bands, FitConfig, Run, ensemble_bands, fit, laplace
 
 LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95, 0.99)

@@ -19,8 +19,8 @@ import torch
 
 from herglotz.data import Trajectories, load, simulate
 from herglotz.models import ContactLagrangian
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, fit
 
 PENDULUM = "schmidt_lipson_2009/real_pend_h_1.txt"

@@ -35,8 +35,8 @@ from work_precision_scenes import CHECKS, SETUPS, TOLD, Setup, judged
 
 from herglotz.stepping import State
 from herglotz.tune.distil import pairs_of
-from herglotz.tune.kicks import can_kick, fit_kicks
-from herglotz.tune.kicks_c import CompiledKicks
+from herglotz.tune.kick_composition import can_kick, fit_kicks
+from herglotz.tune.kick_composition_c import CompiledKicks
 
 ROOT = Path(__file__).resolve().parents[1]
 WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}

@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from herglotz.scenes import scene
 from herglotz.stepping import State
-from herglotz.systems import scene
 
 CHECKS = 4  # times at which errors are taken
 # What a user knows of two links.

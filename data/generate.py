@@ -8,7 +8,7 @@ from pathlib import Path
 
 from herglotz.data import Trajectories, simulate, write_csv
 from herglotz.errors import InputError
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 HERE = Path(__file__).parent
 DEMO_COMMENTS = (

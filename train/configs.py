@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from herglotz.data import Trajectories, load, simulate
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import FitConfig
 
 ROOT = Path(__file__).resolve().parents[1]

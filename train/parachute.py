@@ -22,12 +22,12 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import GeneratingFunction, generating_function, hamilton_jacobi_residual
 from herglotz.plots import save_figure
 from herglotz.plots.parachute import Fall, PrintedOrbit, plot_fall, plot_printed_map
+from herglotz.scenes import scene
+from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
-from herglotz.systems.printed_parachute import MAP_START, PrintedParachute
+from herglotz.theory import GeneratingFunction, generating_function, hamilton_jacobi_residual
 
 SHOWN = 6  # points of the printed map in the figures; the next is ten times larger, the one after it 1e22
 G, LAM, H = 10.0, 0.01, 0.2

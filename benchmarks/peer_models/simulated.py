@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import simulate
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 from .judging import Metrics, Problem, errors
 from .known_equation import Equation

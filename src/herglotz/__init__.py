@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from herglotz.export import compile, export_pt2, load_pt2
     from herglotz.mechanics import partials
     from herglotz.models import ContactLagrangian, ModelConfig
+    from herglotz.scenes import scene, scene_names
     from herglotz.stepping import State, Status, Stepper
-    from herglotz.systems import scene, scene_names
     from herglotz.training import FitConfig, Run, fit, load_run, save_run
 
 # Loaded at first use, so that `herglotz --help` does not wait for torch. (`verify` is a room of the same
@@ -39,8 +39,8 @@ _HOME = {
     "State": "stepping",
     "Status": "stepping",
     "Stepper": "stepping",
-    "scene": "systems",
-    "scene_names": "systems",
+    "scene": "scenes",
+    "scene_names": "scenes",
     "FitConfig": "training",
     "Run": "training",
     "fit": "training",

@@ -7,9 +7,10 @@ import torch
 from extreme_cases import build, starts, state
 
 from herglotz.errors import InputError
-from herglotz.mechanics import Rescaled, autograd_partials, joined_action, partials
+from herglotz.mechanics import autograd_partials, partials
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
-from herglotz.systems import scene
+from herglotz.theory import Rescaled, joined_action
 
 FIELDS = ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33")
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 from extreme_cases import assert_nothing_silent, build, starts, state
 
+from herglotz.scenes import scene
 from herglotz.stepping import Status, Stepper
-from herglotz.systems import scene
 
 EPS = torch.finfo(torch.float64).eps
 

@@ -120,11 +120,11 @@ def test_outliers_that_stay_are_reported():
 
 def test_a_million_samples():
     # fails if loading, windows or the baseline are slower than linear, or loop over samples in Python
-    begin = time.perf_counter()
+    begin = time.process_time()
     data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
     assert len(data.triples()) == 999_998
     base = estimate_baseline(data)
-    assert time.perf_counter() - begin < 20
+    assert time.process_time() - begin < 20
     assert base.rate == pytest.approx(RATE, rel=1e-6)
     assert base.stiffness[0] == pytest.approx(STIFFNESS, rel=1e-6)
 
@@ -132,12 +132,12 @@ def test_a_million_samples():
 def test_a_million_samples_are_fitted_thinned_or_not_at_all():
     # fails if `fit` starts what ends in a killed process (a matrix of 10^11 numbers), or its advice does not help
     data = Trajectories.of(*motion(torch.arange(1_000_000) * 1e-3))
-    begin = time.perf_counter()
+    begin = time.process_time()
     with pytest.raises(InputError, match=r"667000 samples to fit, at most 100000 .*--every 7,"):
         herglotz.fit(data)
     many = replace(data, t=torch.arange(100, dtype=torch.float64).repeat(10_000), lengths=(100,) * 10_000)
     with pytest.raises(InputError, match=r"--every 5,"):  # many short trajectories are as many states
         herglotz.fit(many, FitConfig(train_fraction=0.5))
-    assert time.perf_counter() - begin < 20
+    assert time.process_time() - begin < 20
     run = herglotz.fit(data.thinned(2000), FitConfig(iterations=5))
     assert run.metrics["train_rms"] < 1e-3 * run.metrics["spread"]

@@ -9,8 +9,9 @@ from extreme_cases import assert_nothing_silent, build, state
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.mechanics import legendre_minus
-from herglotz.stepping import ContactSplitting, State, Status, Stepper, explain_step
-from herglotz.systems import scene
+from herglotz.scenes import scene
+from herglotz.stepping import State, Status, Stepper, explain_step
+from herglotz.theory import ContactSplitting
 from herglotz.tune import flag_unresolved
 
 TINY = 1e-300  # stands for no damping in scenes whose s-derivative must exist

@@ -14,8 +14,9 @@ from herglotz.models.action import ActionFlow
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.network import Network
-from herglotz.stepping import ContactSplitting, Stepper
+from herglotz.stepping import Stepper
 from herglotz.stepping.field import FieldOf
+from herglotz.theory import ContactSplitting
 
 # What each scene names, and the parameters that this brings.
 BASE = {"kinetic", "potential"}

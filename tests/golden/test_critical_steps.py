@@ -1,4 +1,4 @@
-"""Largest stable steps of the rules (section 4 of mathematics.md); where c and H± are lost is in test_explain.py."""
+"""Largest stable steps of the rules (section 4 of docs/mathematics.md); test_explain.py has the loss of c and H±."""
 
 import math
 
@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import partials, step_derivative
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 
 def multipliers(system, rule, h):

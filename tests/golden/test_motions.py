@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import legendre_minus, legendre_plus
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 H = 0.5
 # scene, parameters, q, p, s and after H: q, p, s

@@ -1,11 +1,11 @@
-"""Eight discrete steps against 17-digit values, and the Riccati recursion (section 4 of mathematics.md)."""
+"""Eight discrete steps against 17-digit values, and the Riccati recursion (section 4 of docs/mathematics.md)."""
 
 import pytest
 import torch
 
 from herglotz.mechanics import autograd_partials, partials
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 
 RTOL = 1e-12
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from herglotz.data import simulate
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, fit, laplace
 
 

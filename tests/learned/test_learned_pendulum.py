@@ -9,8 +9,8 @@ import torch
 
 from herglotz.data import load, simulate
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.verify import verify
 

@@ -11,8 +11,8 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata
 from herglotz.export.c_wrapper import compiler
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.tune import TuneConfig, tune
 from herglotz.tune.cost import Cost

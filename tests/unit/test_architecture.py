@@ -8,7 +8,7 @@ import pytest
 
 SOURCE = Path(__file__).resolve().parents[2] / "src" / "herglotz"
 # A ← B: B may import A. Rooms between two bars may not import one another; `errors` and `settings` serve all.
-ORDER = "mechanics | systems models | stepping | data | training | export | tune | verify | plots | cli"
+ORDER = "mechanics | models | stepping | theory | scenes | data | training | export | tune | verify | plots | cli"
 LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.split()}
 RUNTIME = {"torch", "numpy", "matplotlib", "tqdm", "herglotz"} | set(sys.stdlib_module_names)
 # Extras that only some users install: for the ONNX files, and inside functions, so that nothing else needs them.
@@ -52,7 +52,8 @@ def test_only_the_door_differentiates_lagrangians():
     allowed = {
         "mechanics/partials.py",  # the door
         "mechanics/contact.py",  # the derivative of a flow
-        "mechanics/continuous.py",  # a continuous Hamiltonian
+        "stepping/linearise.py",  # the derivative of a step
+        "theory/continuous.py",  # a continuous Hamiltonian
         "training/residual.py",  # with respect to parameters
         "training/matrix_free.py",  # the same
         "training/supervision.py",  # the same
@@ -68,3 +69,19 @@ def test_modules_stay_small_and_load_safely(path):
     assert len(text.splitlines()) <= 350
     assert text.count("torch.load(") == text.count("weights_only=True"), "torch.load without weights_only=True"
     assert "allow_pickle=True" not in text
+
+
+EXPORT = pytest.param("export", marks=pytest.mark.xfail(reason="loader and onnx_file, onnx_table and onnx_ops"))
+
+
+@pytest.mark.parametrize("room", [*sorted(set(LEVEL) - {"export"}), EXPORT])
+def test_no_two_files_import_each_other(room):
+    # fails if files form a circle, also one that only type checkers see: neither can be read without the other
+    names = {f"herglotz.{room}.{path.stem}": path for path in (SOURCE / room).glob("*.py") if path.stem != "__init__"}
+    needs = {name: {m for m in imports(path) if m in names} for name, path in names.items()}
+    while free := [name for name, wanted in needs.items() if not wanted]:
+        for name in free:
+            del needs[name]
+        for wanted in needs.values():
+            wanted.difference_update(free)
+    assert not needs, f"circles among {sorted(needs)}"

@@ -1,6 +1,11 @@
 """The package's front door."""
 
+import tomllib
+from pathlib import Path
+
 import herglotz as hz
+
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_every_public_name_resolves_again_and_again():
@@ -11,3 +16,17 @@ def test_every_public_name_resolves_again_and_again():
         for name in hz.__all__:
             value = getattr(hz, name)
             assert callable(value), name
+
+
+def test_the_version_stands_in_one_place():
+    # fails if the version is written into pyproject.toml or CITATION.cff too, where it could differ
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "version" not in project["project"]
+    assert project["tool"]["hatch"]["version"]["path"] == "src/herglotz/__init__.py"
+    assert hz.__version__ not in (ROOT / "CITATION.cff").read_text(encoding="utf-8").split("cff-version: 1.2.0")[1]
+    assert f"## {hz.__version__}" in (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+
+
+def test_the_package_says_that_it_is_typed():
+    # fails if type checkers would ignore our annotations (PEP 561)
+    assert (ROOT / "src" / "herglotz" / "py.typed").exists()

@@ -5,7 +5,12 @@ import math
 import pytest
 import torch
 
-from herglotz.mechanics import (
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.network import Network
+from herglotz.scenes import left, midpoint_heun, scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
+    EvolutionStepper,
     dissipation_defect,
     infinitesimal_generator,
     invariance_defect,
@@ -13,10 +18,6 @@ from herglotz.mechanics import (
     momentum_map,
     noether_defect,
 )
-from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.models.network import Network
-from herglotz.stepping import EvolutionStepper, State, Stepper
-from herglotz.systems import left, midpoint_heun, scene
 
 H = 0.1  # the step
 

@@ -3,25 +3,26 @@
 import pytest
 import torch
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.scenes import scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
     LeftHamiltonian,
     LeftLagrangian,
     PointSource,
+    Propagated,
     RightHamiltonian,
     commutation_defect,
     generating_function,
+    germ,
     hamilton_jacobi_residual,
-    jet,
     left_generating_function,
     left_hamilton_jacobi_residual,
-    partials,
     projected_flow,
     projected_step,
     right_equations,
     right_step,
 )
-from herglotz.stepping import Propagated, State, Stepper
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):
@@ -71,14 +72,14 @@ class Fan:
 
     def right(self, S0, S1, q0, q1):
         """The right residual at any pair, over its terms."""
-        at0, at1 = jet(S0, q0), jet(S1, q1)
+        at0, at1 = germ(S0, q0), germ(S1, q1)
         H = RightHamiltonian(self.L_d, self.q1)(q0, at1.dS, at0.S, self.h)
         size = max(float(x.abs().max()) for x in (at0.S, at1.S, (at1.dS * q1).sum(-1), H))
         return hamilton_jacobi_residual(at1.S, at0.S, at1.dS, q1, H) / size
 
     def left(self, S0, S1, q0, q1):
         """The left residual at any pair, over its terms."""
-        at0, at1 = jet(S0, q0), jet(S1, q1)
+        at0, at1 = germ(S0, q0), germ(S1, q1)
         H = LeftHamiltonian(self.L_d, self.q0)(at0.dS, q1, at1.S, self.h)
         size = max(float(x.abs().max()) for x in (at0.S, at1.S, (at0.dS * q0).sum(-1), H))
         return left_hamilton_jacobi_residual(at1.S, at0.S, at0.dS, q0, H) / size
@@ -108,7 +109,7 @@ def test_theorem_3_the_diagram_commutes_on_an_open_set(name):
     by_H = projected_step(RightHamiltonian(f.L_d, f.q1), f.S0, f.S1, f.q0, f.h, f.q1)
     assert largest(by_H - f.q1) < 1e-11 * largest(f.q1)
     # the second condition of the paper's proof: dS^k = D1H⁺/(1 − D3H⁺) on the section
-    at0, at1 = jet(f.S0, f.q0), jet(f.S1, f.q1)
+    at0, at1 = germ(f.S0, f.q0), germ(f.S1, f.q1)
     H = partials(RightHamiltonian(f.L_d, f.q1), f.q0, at1.dS, at0.S, f.h)
     _, p0, _ = right_equations(H, at1.dS, at0.S)
     assert largest(p0 - at0.dS) < 1e-10 * size
@@ -123,10 +124,10 @@ def test_theorem_3_a_wrong_S_breaks_both(name):
 
     class Bent:
         def __call__(self, q):
-            return self.jet(q).S
+            return self.germ(q).S
 
-        def jet(self, q):
-            at = jet(f.S1, q)
+        def germ(self, q):
+            at = germ(f.S1, q)
             offset, eye = q - f.q1.mean(0), torch.eye(q.shape[-1], dtype=q.dtype)
             return type(at)(at.S + 5e-4 * (offset**2).sum(-1), at.dS + 1e-3 * offset, at.d2S + 1e-3 * eye)
 

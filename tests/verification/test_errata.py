@@ -9,9 +9,10 @@ import mpmath
 import pytest
 import torch
 
-from herglotz.mechanics import contact_defect, contact_vector_field, flow_derivative
-from herglotz.systems import PrintedParachute, scene
-from herglotz.systems.printed_parachute import MAP_START
+from herglotz.mechanics import contact_defect, flow_derivative
+from herglotz.scenes import PrintedParachute, scene
+from herglotz.scenes.printed_parachute import MAP_START
+from herglotz.theory import contact_vector_field
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT / "train"))  # as for a script that is run there

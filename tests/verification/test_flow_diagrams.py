@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from herglotz.mechanics import legendre_minus, legendre_plus
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
-from herglotz.systems import scene
 
 
 def nonlinear(q0, q1, s0, h):

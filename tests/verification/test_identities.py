@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene, scene_names
 from herglotz.stepping import State
-from herglotz.systems import scene, scene_names
 from herglotz.verify import verify
 from herglotz.verify.subject import subject
 

@@ -6,13 +6,13 @@ import pytest
 import torch
 
 import herglotz.verify.legendre as rows
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.verify import verify
 from herglotz.verify.action import fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.legendre import left_formalism
+from herglotz.verify.sampled_rollout import sampled_rollout
 from herglotz.verify.subject import subject
-from herglotz.verify.walk import walk
 
 H = 0.1
 OSCILLATOR = scene("damped_oscillator").L_d
@@ -71,7 +71,7 @@ def sign_only(P, p0, s1):
 def test_the_left_equations_row_rejects_the_printed_formula(monkeypatch, wrong, least):
     # fails if the row compares p1 with itself (E5)
     known = subject((nonlinear, states(2)), H, 16, 0)
-    w = walk(known, 3)
+    w = sampled_rollout(known, 3)
     assert left_formalism(known, w, 1e-10).passed
     monkeypatch.setattr(rows, "left_equations", wrong)
     check = left_formalism(known, w, 1e-10)

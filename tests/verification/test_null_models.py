@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
+from herglotz.scenes import scene
 from herglotz.stepping import State, Step, Stepper
-from herglotz.systems import scene
 from herglotz.verify import verify
 from herglotz.verify.action import fan, hamilton_jacobi
 from herglotz.verify.subject import subject

@@ -6,16 +6,12 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from herglotz.mechanics import (
-    contact_vector_field,
-    generating_function,
-    partials,
-    right_equations,
-)
-from herglotz.mechanics.continuous import derivatives
+from herglotz.mechanics import partials
+from herglotz.scenes import scene
+from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State
-from herglotz.systems import scene
-from herglotz.systems.printed_parachute import MAP_START, PrintedParachute
+from herglotz.theory import contact_vector_field, generating_function, right_equations
+from herglotz.theory.continuous import derivatives
 from paper_errata.erratum import (
     PARACHUTE,
     Erratum,

@@ -6,23 +6,20 @@ from collections.abc import Callable
 
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import Partials, mixed_hessian, momentum_minus, partials
+from herglotz.scenes import scene
+from herglotz.stepping import Stepper
+from herglotz.theory import (
     LeftHamiltonian,
-    Partials,
     contact_product_point,
     contact_vector_field,
     evolution_vector_field,
     left_equations,
-    mixed_hessian,
-    momentum_minus,
-    partials,
     product_potential,
     prolongation,
     relatedness_defect,
 )
-from herglotz.mechanics.continuous import jacobian
-from herglotz.stepping import Stepper
-from herglotz.systems import scene
+from herglotz.theory.continuous import jacobian
 from paper_errata.erratum import (
     OSCILLATOR,
     PARACHUTE,

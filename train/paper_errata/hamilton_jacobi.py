@@ -1,25 +1,30 @@
-"""E6 to E8: the discrete Hamilton–Jacobi equations and the slips around them."""
+"""E6 to E8 and E10: the discrete Hamilton–Jacobi equations, their theorem, and the misprints around them."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import partials
+from herglotz.scenes import scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
+    LeftHamiltonian,
     LeftLagrangian,
     Quadratic,
+    RightHamiltonian,
+    commutation_defect,
     contact_vector_field,
     generating_function,
+    germ,
     hamilton_jacobi_residual,
-    jet,
     left_hamilton_jacobi_residual,
-    partials,
+    projected_flow,
+    projected_step,
     prolongation,
     riccati_step,
 )
-from herglotz.mechanics.continuous import derivatives, jacobian
-from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
+from herglotz.theory.continuous import derivatives, jacobian
 from paper_errata.erratum import (
     OSCILLATOR,
     Erratum,
@@ -71,15 +76,15 @@ def e7() -> Erratum:
     q0 = tensor(0.8)
 
     def residual(q1: Tensor) -> Tensor:
-        a, b = jet(S0, q0), jet(S1, q1)
+        a, b = germ(S0, q0), germ(S1, q1)
         return hamilton_jacobi_residual(b.S, a.S, b.dS, q1, H_plus(q0, b.dS, a.S, h))
 
-    q1 = s.flow(q0, jet(S0, q0).dS, jet(S0, q0).S, h)[0]
+    q1 = s.flow(q0, germ(S0, q0).dS, germ(S0, q0).S, h)[0]
     on, off = size(residual(q1)), [size(residual(q1 + d)) for d in (0.1, 0.2)]
     pair = q1 + 0.1
     slope = jacobian(lambda y: residual(y)[..., None], pair)[1][..., 0, :]
-    at = jet(S1, pair)
-    D2H = partials(H_plus, q0, at.dS, jet(S0, q0).S, h).D2
+    at = germ(S1, pair)
+    D2H = partials(H_plus, q0, at.dS, germ(S0, q0).S, h).D2
     predicted = -(at.d2S @ (pair - D2H)[..., None])[..., 0]
     return Erratum(
         "E7",
@@ -104,9 +109,9 @@ def e8() -> Erratum:
     assert s.H_minus is not None
     P = partials(s.L_d, tensor(0.0), tensor(0.0), tensor(0.0)[0], h, order=2)
     S0 = Quadratic(tensor(1.0)[:, None], tensor(0.5), tensor(0.25)[0])
-    at = jet(S0, x0.q)
+    at = germ(S0, x0.q)
     q1, p1, _ = s.flow(x0.q, at.dS, at.S, h)
-    section = [size(jet(S, q1).dS - p1) for S in (S0, riccati_step(P, S0))]
+    section = [size(germ(S, q1).dS - p1) for S in (S0, riccati_step(P, S0))]
     left = partials(LeftLagrangian(s.L_d), x0.q, x1.q, x1.s, h)
     D3 = [
         size(partials(H, a, b, c, h).D3 + left.D3)
@@ -121,10 +126,12 @@ def e8() -> Erratum:
     proof = [size((p * D_).sum(-1) - D.L - s_dot) for D_ in (D.D1, D.D2)]
     return Erratum(
         "E8",
-        "`gamma-a`, `L-H2`, Step 3 before `pre-HJ`, `Proof-2-`, `Proof-1-`, diagram before `commit`",
+        "`gamma-a`, `L-H2`, Step 3 before `pre-HJ`, `Proof-2-`, `Proof-1-`, diagram before `commit`; matching of "
+        "momenta before `reg-cond`; Φ̃^γ before `commit`, `condi`",
         "γ^{k+1} with dS^k; D3H⁺ in the left equations; D3S^k in the second identity of Step 3; F_q·H_q as the last "
-        "component of X_H∘γ and Tγ∘X^γ; ρ: T*Q×R → Q×R",
-        "dS^{k+1}; D3H⁻; D3S^{k+1}; F_q·H_p; ρ: T*Q×R → Q (a word, nothing to measure)",
+        "component of X_H∘γ and Tγ∘X^γ; ρ: T*Q×R → Q×R; p_k = p⁻_{k,k+1,k+1}; ds_d^{k+1}",
+        "dS^{k+1}; D3H⁻; D3S^{k+1}; F_q·H_p; and three symbols, with nothing to measure: ρ: T*Q×R → Q, "
+        "p_k = p⁻_{k,k+1,k}, dS_d^{k+1}",
         (
             Row(
                 f"dS(q_{{k+1}}) − p_{{k+1}} with S^k | S^{{k+1}}; quadratic S^k, damped oscillator, γ = 0.2, h = {h}",
@@ -133,5 +140,51 @@ def e8() -> Erratum:
             Row("D3H⁺ | D3H⁻, plus D3L⁻", *D3),
             Row(f"1 + D3S^k | 1 + D3S^{{k+1}}, less σ_{{k+1}}, k = {k}", *step3),
             Row("F_q·H_q − H | F_q·H_p − H, less ṡ; damped pendulum, F = sin q, q = 0.7", *proof),
+        ),
+    )
+
+
+def e10() -> Erratum:
+    c, h, kappa = 0.93, 0.1, 0.8
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, _h: Tensor) -> Tensor:
+        a, b = q0[..., 0], q1[..., 0]
+        return (c - 1) * s0 + 0.45 * a**2 - 1.4 * a * b + 0.55 * b**2
+
+    def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        q, p, s = Stepper(L_d).step(State(q, p, s), h).state
+        return q, p, s
+
+    zero = tensor(0.0)
+    P = partials(L_d, zero, zero, zero[0], h, order=2)
+    S0 = Quadratic(tensor(0.7)[:, None], tensor(-0.4), tensor(0.2)[0])
+    S1 = riccati_step(P, S0)
+    D22 = float(P.D22)
+    wrong = Quadratic(S1.alpha - D22, S1.beta + D22 * kappa, S1.delta - 0.5 * D22 * kappa**2)
+    q0 = torch.linspace(-1.5, 2.0, 15, dtype=torch.float64)[:, None]
+    H_plus, H_minus = RightHamiltonian(L_d, q0), LeftHamiltonian(L_d, q0)
+
+    def residuals(S: Quadratic, q1: Tensor) -> tuple[float, float]:
+        a, b = germ(S0, q0), germ(S, q1)
+        right = hamilton_jacobi_residual(b.S, a.S, b.dS, q1, H_plus(q0, b.dS, a.S, h))
+        return size(right), size(left_hamilton_jacobi_residual(b.S, a.S, a.dS, q0, H_minus(a.dS, q1, b.S, h)))
+
+    along = projected_flow(flow, S0, q0)
+    (right_wrong, left_wrong), (_, left) = residuals(wrong, along), residuals(S1, along)
+    assert right_wrong < 1e-13  # the equation on the flow does not notice δ
+    own = [residuals(S, projected_step(H_plus, S0, S, q0, h, along))[0] for S in (wrong, S1)]
+    commutes = [size(commutation_defect(flow, S0, S, q0)) for S in (wrong, S1)]
+    setting = "quadratic L_d, c = 0.93, δ = −½D22 (q − 0.8)², q_k from −1.5 to 2"
+    return Erratum(
+        "E10",
+        "`gHJ-discrete` (Theorem 3)",
+        "S solves `firstdiscrete-1` if and only if Φ̃∘γ^k = γ^{k+1}∘Φ̃^γ, without saying at which q_{k+1}",
+        "the diagram implies the equation; the converse needs q_{k+1} = D2H⁺(q_k, dS^{k+1}(q_{k+1}), S^k(q_k)), or the "
+        "left equation too. Along the flow the right residual of S^{k+1} + δ is δ + ½dδ·(D22 L_d)⁻¹dδ, which is 0 for "
+        "δ = −½(q − κ)·D22 (q − κ)",
+        (
+            Row(f"defect of the diagram: S^{{k+1}} + δ | S^{{k+1}}, both of right residual 0; {setting}", *commutes),
+            Row("left residual: S^{k+1} + δ | S^{k+1}", left_wrong, left),
+            Row("right residual at q_{k+1} by D2H⁺: S^{k+1} + δ | S^{k+1}", *own),
         ),
     )

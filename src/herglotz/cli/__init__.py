@@ -1,7 +1,7 @@
-"""The command line: simulate, fit, rollout, export, verify, plot.
+"""The command line: one module a subcommand.
 
-A user's mistake is one line on stderr and exit code 2; a failed verification is exit code 1; Ctrl-C is 130. PyTorch is
-imported by the subcommands that need it, so that help is immediate.
+A user's mistake is one line on stderr and exit code 2; a failed verification is exit code 1; Ctrl-C is 130. Only the
+subcommands that need PyTorch import it, so that help is immediate.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         The exit code: 0, 1 (a check failed), 2 (wrong input) or 130 (interrupted).
     """
-    # Matrices this small are fastest on one thread; on a busy machine a second one only waits for the first (9 times
-    # slower was measured). Read by torch when it is imported; your own setting wins.
+    # Small matrices are fastest on one thread: on a busy machine a second thread waits for the first (9 times slower
+    # was measured). PyTorch reads the variable when it is imported; a value that the user has set stays.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
         arguments = build_parser().parse_args(argv)

@@ -1,4 +1,4 @@
-"""What the subcommands share: number types, checks of outputs before any work, tables and JSON."""
+"""Shared by the subcommands: number types, checks of outputs before any work, tables, JSON."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from herglotz.errors import InputError
 
-KICKS = "kicks.h"  # in a folder of `tune`: the chosen step, where it is one of kicks
+KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kicks were chosen
 
 
 def positive(text: str) -> float:
@@ -42,7 +42,7 @@ def count(text: str) -> int:
 
 
 def check_output_file(path: Path, suffixes: Sequence[str]) -> None:
-    """Raise unless a file of this name could be written now; nothing is left behind.
+    """Raise unless a file of this name could be written now; no file is left behind.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def check_output_file(path: Path, suffixes: Sequence[str]) -> None:
 
 
 def check_output_folder(path: Path) -> None:
-    """Raise unless this folder, or the missing part of its path, could be made and written to; nothing is left behind.
+    """Raise unless this folder could be made and written to; no file is left behind.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def _probe(path: Path, folder: Path) -> None:
 
 
 def is_run(path: Path) -> bool:
-    """Whether a path is a folder, and so must be a run."""
+    """Return whether a path is a folder: a run is one, a data file is not."""
     return path.is_dir()
 
 

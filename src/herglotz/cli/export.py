@@ -8,7 +8,7 @@ from typing import Any
 
 from herglotz.cli.common import KICKS, check_output_file, positive, print_json
 
-# Extension of each format, and what may be said of the next thing to do.
+# File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
@@ -34,10 +34,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2, .onnx or (C) .h"
     )
-    parser.add_argument("--format", choices=tuple(SUFFIX), default="pt2", help="of the file (default %(default)s)")
+    parser.add_argument("--format", choices=tuple(SUFFIX), default="pt2", help="kind of file (default %(default)s)")
     parser.add_argument(
         "--h-range", type=positive, nargs=2, metavar=("LOW", "HIGH"),
-        help="steps h that the file may take (default: those of the data); others are flagged, or refused in Python",
+        help="range of steps h (default: that of the data); C flags other steps, Python refuses them",
     )  # fmt: skip
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
@@ -82,9 +82,9 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} coordinate(s), h {result.h:g}")
         if kicks.is_file():
-            print(f"The kicks that tune chose exist in C only (--format c); {arguments.out} is the model behind them")
+            print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
         if arguments.format != "c" and tuned.get("tol"):
-            print(f"The tolerance {tuned['tol']:g} that tune chose: PyTorch and C only; this file solves to rounding")
+            print(f"The tolerance {tuned['tol']:g} of tune applies to PyTorch and C only; this file solves to rounding")
         if arguments.format == "c":
             print(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
         print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
@@ -92,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _kicks(arguments: argparse.Namespace, kicks: Path) -> int:
-    """The step that `herglotz tune` chose, as it wrote it."""
+    """Copy the header of kicks that `herglotz tune` wrote."""
     from herglotz.data.files import write_atomically
 
     text = kicks.read_bytes()

@@ -1,4 +1,4 @@
-"""Flags of every command that trains, and the two that write a run, and how they are read."""
+"""Flags that several commands share, and their checks."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from herglotz.cli.common import check_output_folder, count, finite
 from herglotz.errors import InputError
 
-DTYPES = ("float64", "float32")  # a copy, so that help does not import PyTorch; a test compares
+DTYPES = ("float64", "float32")  # a copy, so that help does not import PyTorch; a test compares it with the package
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
@@ -28,7 +28,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
 
 def add_machine_flags(parser: argparse.ArgumentParser) -> None:
     """Add --seed, --device, --dtype and --json."""
-    parser.add_argument("--seed", type=count, default=0, help="of the initial weights (default %(default)s)")
+    parser.add_argument("--seed", type=count, default=0, help="seed of the initial weights (default %(default)s)")
     parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
     parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
@@ -42,7 +42,7 @@ def check_run_folder(out: Path, resume: bool) -> None:
 
 
 def parse_angles(text: str | None) -> list[str] | None:
-    """`none` → [], `a,b` → [a, b], nothing → None: what the file says."""
+    """Return [] for `none`, [a, b] for `a,b`, and None, which keeps the angles of the file, without a flag."""
     if text is None:
         return None
     return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]

@@ -35,7 +35,7 @@ SUFFIXES = (".pt2", ".onnx", ".h")
 
 @dataclass(frozen=True)
 class Source:
-    """A model that can be stepped, and what its file knows."""
+    """A model that can be stepped, with the start, labels and box that its file holds."""
 
     stepper: Stepper | ExportedStepper | CompiledStepper
     start: State | None
@@ -45,7 +45,7 @@ class Source:
     units: tuple[str, ...]
     angles: tuple[bool, ...]
     time_unit: str
-    box: Callable[..., torch.Tensor] | None  # (q, p, s): whether a state lies outside of what the model was fitted to
+    box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -124,18 +124,18 @@ def run(arguments: argparse.Namespace) -> int:
         per_step = 1e6 * seconds / arguments.steps
         print(f"{arguments.out}: {arguments.steps} steps of {h:g} {source.time_unit}, {per_step:.0f} µs each; {end}")
     if left is not None:
-        text = f"from step {left} on, the motion is not always among the states the model was fitted to (q, p, s)"
+        text = f"from step {left} on, the motion leaves the range of states (q, p, s) that the model was fitted to"
         print(f"herglotz: note: {text}", file=sys.stderr)
     return 0
 
 
 def read_source(path: Path, trajectory: int) -> Source:
-    """A run or an exported model, as something to step.
+    """Read a run or an exported model, to be stepped.
 
     Raises
     ------
     InputError
-        If it cannot be read, or has no such trajectory.
+        If the file cannot be read, or the run has no such trajectory.
     """
     import torch
 
@@ -166,7 +166,7 @@ def read_source(path: Path, trajectory: int) -> Source:
 
 
 def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
-    """The state to start from, in the model's dtype, and its time."""
+    """Return the state to start from, in the model's dtype, and its time."""
     import torch
 
     from herglotz.stepping import State
@@ -187,7 +187,7 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
 
 
 def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -> tuple[torch.Tensor | None, Any]:
-    """The inputs (K, m), and the steps: one size, or the recorded ones, (K,)."""
+    """Return the inputs (K, m) and h: one number, or the recorded steps, (K,)."""
     import torch
 
     from herglotz.data import load
@@ -213,7 +213,7 @@ def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -
 
 
 def _check(found: Rollout, h: float) -> None:
-    """Raise if a step failed: a motion that ends early is not written."""
+    """Raise if a step failed, so that no motion that ends early is written."""
     if not bool(found.ok):
         k = int((found.status != 0).nonzero()[0])
         raise InputError(f"step {k + 1} of h = {h:g} has no solution; take a smaller --h or another start")

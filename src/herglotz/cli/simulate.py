@@ -21,16 +21,16 @@ example:
 
 
 def __getattr__(name: str) -> str:
-    """`DESCRIPTION`, the text of --help, made when it is read: the list of scenes comes from their registry."""
+    """Return `DESCRIPTION`, the text of --help; the registry of scenes is read only when the text is."""
     if name != "DESCRIPTION":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from herglotz.systems import scene, scene_names
+    from herglotz.scenes import scene, scene_names
 
     return ABOUT.format(scenes="".join(f"  {name:<20}{scene(name).description}\n" for name in scene_names()))
 
 
 class Help(argparse.Action):
-    """Print the help, which lists the scenes: only here is that list worth the import of PyTorch."""
+    """Print the help with the list of scenes, which needs the import of PyTorch."""
 
     def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:  # noqa: ARG002
         """Print and exit."""
@@ -62,7 +62,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--gaps", type=count, default=0, metavar="G",
         help="runs of 1 to 3 samples deleted from each motion (default %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=count, default=0, help="of starts, noise and gaps (default %(default)s)")
+    parser.add_argument("--seed", type=count, default=0, help="seed of starts, noise and gaps (default %(default)s)")
     parser.add_argument(
         "--param", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of the scene, for example gamma=0.3; may come more than once",
@@ -77,7 +77,7 @@ def run(arguments: argparse.Namespace) -> int:
     parameters = parse_parameters(arguments.param)
 
     from herglotz.data import save, simulate
-    from herglotz.systems import scene
+    from herglotz.scenes import scene
 
     system = scene(arguments.scene, **parameters)
     h = system.h if arguments.h is None else arguments.h

@@ -1,4 +1,4 @@
-"""States to start from."""
+"""Start states of a rollout."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 def last_fitted(run: Run, trajectory: int) -> State:
-    """The state at the last sample of a trajectory that was trained on, with shapes (n,), (n,), ().
+    """Return the state at the last training sample of a trajectory, with shapes (n,), (n,), ().
 
     Raises
     ------

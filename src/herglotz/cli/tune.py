@@ -1,4 +1,4 @@
-"""`herglotz tune`: an error or a budget in, the setting that meets it out."""
+"""`herglotz tune`: find the step that meets an error or a budget."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Trade speed for accuracy: measure the error and the cost of stepping RUN at several steps, with its own model and with
 big-step corrections re-trained on motions of that model, in PyTorch and in C, in float64 and float32, and with large
-steps of a few learned kicks that solve nothing (one coordinate, one damping rate). Then take the cheapest setting
-within an error, or the most accurate one within a budget.
+explicit steps of a few learned kicks (one coordinate, one damping rate). Then take the cheapest setting within an
+error, or the most accurate one within a budget.
 
-The error is that of stepping: the largest departure of a position from the run's own motion over the horizon. 95 % of
-all starts keep the error quoted (with confidence 95 %); other starts than those that chose are counted to check it.
-FOLDER receives the tuned run (for `herglotz export`, `rollout`, ...), tuned.json and tuned.png; where kicks win, their
-C header kicks.h and the run as it was.
+The error is the error of stepping: the largest distance of a position from the run's own motion over the horizon. 95 %
+of all starts keep the quoted error (with confidence 95 %); starts that had no part in the choice check it. FOLDER
+receives the tuned run (for `herglotz export`, `rollout`, ...), tuned.json and tuned.png. Where kicks win, FOLDER
+receives their C header kicks.h and the unchanged run.
 
 examples:
   herglotz tune runs/pendulum --max-error 1e-3
@@ -52,7 +52,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--kicks", default="5,7", metavar="K",
-        help="kicks in a large step that solves nothing, with commas, or none; tried in C where the model has one "
+        help="numbers of kicks in an explicit large step, with commas, or none; tried in C where the model has one "
         "coordinate and one damping rate (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
@@ -60,17 +60,17 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="measure against the model at its own step, or as h goes to 0 (default %(default)s)",
     )  # fmt: skip
     parser.add_argument("--no-c", action="store_true", help="PyTorch only")
-    parser.add_argument("--starts", type=count, default=128, help="motions that choose (default %(default)s)")
-    parser.add_argument("--iterations", type=count, default=80, help="of a re-training, at most (default %(default)s)")
-    parser.add_argument("--seed", type=count, default=0, help="of the starts (default %(default)s)")
+    parser.add_argument("--starts", type=count, default=128, help="number of motions that choose (default %(default)s)")
+    parser.add_argument("--iterations", type=count, default=80, help="most in a re-training (default %(default)s)")
+    parser.add_argument("--seed", type=count, default=0, help="seed of the starts (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Search, save, draw, report."""
+    """Search, save, draw and report."""
     if (arguments.max_error is None) == (arguments.budget_us is None):
-        raise InputError("say what you need: either --max-error or --budget-us")
+        raise InputError("give either --max-error or --budget-us")
     multiples = _numbers("--multiples", arguments.multiples)
     widths, kicks = _whole("--widths", arguments.widths), _whole("--kicks", arguments.kicks)
     if arguments.source.is_file():
@@ -135,9 +135,9 @@ def _report(found: Tuning, out: Path) -> None:
 
     print(found.table())
     c, own, held = found.chosen, found.own, found.held_out
-    less = f"{own.us / c.us:.3g} times less than the run as it is"
+    less = f"{own.us / c.us:.3g} times faster than the unchanged run"
     if found.own_in_c is not None:
-        less += f", {found.own_in_c.us / c.us:.3g} times less than the same in C"
+        less += f", {found.own_in_c.us / c.us:.3g} times faster than the unchanged run in C"
     print(f"Chosen: {c.setting.name}: {c.us:.3g} {time_label(found.run)}")
     print(f"  {less}")
     print(

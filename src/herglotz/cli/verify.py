@@ -12,17 +12,17 @@ from herglotz.errors import InputError
 
 DESCRIPTION = """\
 Measure every identity that a discrete contact Lagrangian must satisfy on a scene, a run or an exported file, and
-compare each with its tolerance. The exit code is 0 when all pass and 1 when one fails. Of a file without derivatives
-(ONNX, aoti, C) they are measured by differences of order 8, with wider tolerances.
-A file is also stepped beside the run it was exported from, 1, 7 and 4096 samples over 1000 steps: the one that
---against names, or a folder with the same weights beside the file, here, or in runs/ of either.
+compare each with its tolerance. The exit code is 0 when all pass and 1 when one fails. A file without derivatives
+(ONNX, aoti, C) is differentiated by differences of order 8, with wider tolerances.
+A file is also stepped beside its run, 1, 7 and 4096 samples over 1000 steps. The run is the one that --against
+names, or a folder with the same weights beside the file, in the current folder, or in runs/ of either.
 
 examples:
   herglotz verify damped_oscillator
   herglotz verify runs/pendulum --json
   herglotz verify stepper.onnx --against runs/pendulum
 """
-# Two rollouts that feed back rounding alone; relative to the largest value.
+# Largest difference after 1000 steps, relative to the largest value: rounding that each step feeds back.
 AGREEMENT = {"float64": 1e-9, "float32": 1e-3}
 
 
@@ -35,9 +35,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--steps", type=count, default=8, help="steps of the checks along motions (default %(default)s)"
     )
-    parser.add_argument("--seed", type=count, default=0, help="of the states (default %(default)s)")
+    parser.add_argument("--seed", type=count, default=0, help="seed of the states (default %(default)s)")
     parser.add_argument(
-        "--against", type=Path, metavar="RUN", help="run that a file was exported from (default: looked for)"
+        "--against",
+        type=Path,
+        metavar="RUN",
+        help="run that a file was exported from (default: a run with its weights nearby)",
     )
     parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
     parser.set_defaults(run=run)
@@ -72,12 +75,12 @@ def run(arguments: argparse.Namespace) -> int:
         if agreement is not None:
             print(_table(agreement, arguments.against))
         elif path is not None:
-            print("not compared with its model: no run with these weights is near; name it with --against RUN")
+            print("not compared with its model: no run with these weights was found; name it with --against RUN")
     return 0 if passed else 1
 
 
 def _exported_from(exported: Any, file: Path) -> Path | None:
-    """A run near the file, or near here, that holds its weights."""
+    """Return a run with the weights of the file, from a folder near the file or the current one."""
     from herglotz.export import weights_digest
     from herglotz.training import load_run
 
@@ -86,13 +89,13 @@ def _exported_from(exported: Any, file: Path) -> Path | None:
             try:
                 if weights_digest(load_run(model.parent).model) == exported.metadata["weights_sha256"]:
                     return model.parent
-            except InputError:  # a folder of something else
+            except InputError:  # not a run of this package
                 continue
     return None
 
 
 def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
-    """The file beside the run's own stepper, and whether they agree."""
+    """Step the file beside the run's own stepper; return the differences and whether they are within the bound."""
     from herglotz.export import compare
     from herglotz.stepping import State
     from herglotz.training import load_run

@@ -1,41 +1,59 @@
-"""What a set of trajectories must satisfy before anything is learned from it; every failure is an `InputError`."""
+"""Checks of a set of trajectories before learning; every failure is an `InputError`."""
 
 from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 
-if TYPE_CHECKING:
-    from herglotz.data.trajectories import Trajectories
-
 ARRAYS = ("t", "q", "s", "p", "u")
-MIN_SAMPLES = 3  # a discrete Herglotz residual joins q_{k-1}, q_k, q_{k+1}
+MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
 DTYPES = (torch.float32, torch.float64)
 
 
-def check(trajectories: Trajectories) -> None:
-    """Check types, shapes, labels and values, in this order; return nothing when all is well.
+@dataclass(frozen=True)
+class Labels:
+    """What the coordinates and the time are called, and which coordinates are angles."""
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    angles: tuple[bool, ...]
+    time_unit: str
+
+
+def check(
+    where: str,  # begins every message
+    arrays: Mapping[str, Tensor],  # t (N,), q (N, n) and those of s, p, u that are known
+    lengths: tuple[int, ...],  # samples of each trajectory
+    labels: Labels,
+) -> None:
+    """Check types, shapes, labels and values of a set of trajectories, in this order.
 
     Raises
     ------
     InputError
         Naming the field, the trajectory and the sample (both counted from 0), the value and the remedy.
     """
-    where = trajectories.source or "trajectories"
-    arrays = {name: x for name in ARRAYS if (x := getattr(trajectories, name)) is not None}
     _check_tensors(where, arrays)
     _check_shapes(where, arrays)
-    _check_lengths(where, trajectories.lengths, len(trajectories.t))
-    _check_labels(where, trajectories)
+    _check_lengths(where, lengths, len(arrays["t"]))
+    _check_labels(where, labels, arrays["q"].shape[1])
+    offsets = offsets_of(lengths)
     for name, x in arrays.items():
-        _check_finite(where, trajectories, name, x)
-    _check_time(where, trajectories)
+        _check_finite(where, offsets, name, x)
+    _check_time(where, offsets, arrays["t"])
+
+
+def offsets_of(lengths: Sequence[int]) -> tuple[int, ...]:
+    """Row of the concatenation at which each trajectory starts."""
+    return (0, *accumulate(lengths[:-1]))
 
 
 def check_fraction(fraction: float) -> None:
@@ -50,7 +68,7 @@ def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
     return trajectory, row - offsets[trajectory]
 
 
-def _check_tensors(where: str, arrays: dict[str, Tensor]) -> None:
+def _check_tensors(where: str, arrays: Mapping[str, Tensor]) -> None:
     for name, x in arrays.items():
         if not isinstance(x, Tensor):
             kind = type(x).__name__
@@ -64,7 +82,7 @@ def _check_tensors(where: str, arrays: dict[str, Tensor]) -> None:
             )
 
 
-def _check_shapes(where: str, arrays: dict[str, Tensor]) -> None:
+def _check_shapes(where: str, arrays: Mapping[str, Tensor]) -> None:
     t, q = arrays["t"], arrays["q"]
     if t.ndim != 1:
         raise InputError(f"{where}: t must have shape (N,), got {tuple(t.shape)}; flatten it")
@@ -96,48 +114,44 @@ def _check_lengths(where: str, lengths: tuple[int, ...], samples: int) -> None:
         raise InputError(f"{where}: lengths add up to {sum(lengths)} but t has {samples} samples; correct the lengths")
 
 
-def _check_labels(where: str, trajectories: Trajectories) -> None:
-    n = trajectories.q.shape[1]
+def _check_labels(where: str, labels: Labels, n: int) -> None:
     for field in ("names", "units", "angles"):
-        labels = getattr(trajectories, field)
-        if len(labels) != n:
-            raise InputError(f"{where}: {field} has {len(labels)} entries for {n} coordinates; give one a coordinate")
-    if len(set(trajectories.names)) != n or not all(trajectories.names):
-        raise InputError(f"{where}: names {trajectories.names} must differ and not be empty; rename a coordinate")
-    if not all(trajectories.units) or not trajectories.time_unit:
-        raise InputError(
-            f"{where}: a unit is empty ({trajectories.units}, {trajectories.time_unit!r}); write '1' for none"
-        )
-    for name, unit, angle in zip(trajectories.names, trajectories.units, trajectories.angles, strict=True):
+        entries = getattr(labels, field)
+        if len(entries) != n:
+            raise InputError(f"{where}: {field} has {len(entries)} entries for {n} coordinates; give one a coordinate")
+    if len(set(labels.names)) != n or not all(labels.names):
+        raise InputError(f"{where}: names {labels.names} must differ and not be empty; rename a coordinate")
+    if not all(labels.units) or not labels.time_unit:
+        raise InputError(f"{where}: a unit is empty ({labels.units}, {labels.time_unit!r}); write '1' for none")
+    for name, unit, angle in zip(labels.names, labels.units, labels.angles, strict=True):
         if angle and unit != "rad":
             raise InputError(
                 f"{where}: the angle {name!r} is in {unit!r}; convert it to radians and give it the unit 'rad'"
             )
 
 
-def _check_finite(where: str, trajectories: Trajectories, name: str, x: Tensor) -> None:
+def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) -> None:
     bad = ~torch.isfinite(x.detach())
     if not bad.any():
         return
     place = bad.nonzero()[0].tolist()
-    b, k = locate(trajectories.offsets, place[0])
+    b, k = locate(offsets, place[0])
     value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
     raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
 
 
-def _check_time(where: str, trajectories: Trajectories) -> None:
-    steps = trajectories.steps()
-    bad = (~(steps.h > 0)).nonzero()
-    if not len(bad):
+def _check_time(where: str, offsets: tuple[int, ...], t: Tensor) -> None:
+    bad = ~(t.diff() > 0)
+    bad[torch.tensor(offsets[1:], dtype=torch.long, device=t.device) - 1] = False  # from one trajectory to the next
+    if not bad.any():
         return
-    row = int(steps.index[bad[0, 0]])
-    b, k = locate(trajectories.offsets, row)
-    before, after = float(trajectories.t[row]), float(trajectories.t[row + 1])
-    hint = "" if trajectories.t.dtype == torch.float64 else " (times may coincide in float32: use float64)"
+    row = int(bad.nonzero()[0, 0])
+    b, k = locate(offsets, row)
+    hint = "" if t.dtype == torch.float64 else " (times may coincide in float32: use float64)"
     raise InputError(
-        f"{where}: t of trajectory {b} does not increase from sample {k} to {k + 1} ({before!r} then {after!r}); "
-        f"sort the samples or delete one{hint}"
+        f"{where}: t of trajectory {b} does not increase from sample {k} to {k + 1} ({float(t[row])!r} then "
+        f"{float(t[row + 1])!r}); sort the samples or delete one{hint}"
     )
 
 

@@ -1,4 +1,4 @@
-"""What each column of a csv file is: time, trajectory, coordinate, action, momentum, input, or left aside."""
+"""The role of each csv column: time, trajectory, coordinate, action, momentum, input, or left aside."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from herglotz.errors import InputError
 HEADER_CELL = re.compile(r"([^\[\]]+?)\s*(?:\[([^\[\]]*)\])?")
 TIME, TRAJECTORY = ("t", "time"), ("trajectory", "trial")
 ACTION, MOMENTUM, INPUT = re.compile("s"), re.compile("p|p_.*"), re.compile("u|u_.*|torque")
-VELOCITY = re.compile(r"v|velocity|.*_dot")  # positions are enough, and a logged velocity is usually filtered
+VELOCITY = re.compile(r"v|velocity|.*_dot")  # left aside: a logged velocity is usually filtered
 
 
 @dataclass(frozen=True)
@@ -45,10 +45,11 @@ def assign(
     Raises
     ------
     InputError
-        If a cell cannot be read, a name comes twice, time or every coordinate is missing, or a named column is absent.
+        If a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named column is absent.
     """
     names, units = _parse(cells, where)
-    key = {name: name.casefold() if len(name) > 1 else name for name in names}  # Time is time, but V may be a volume
+    # "Time" means time, but a single "V" may be a volume.
+    key = {name: name.casefold() if len(name) > 1 else name for name in names}
     for asked in (() if time is None else (time,)) + tuple(coordinates or ()):
         if asked not in names:
             raise InputError(f"{where}: there is no column {quote(asked)}; the columns are {', '.join(names)}")

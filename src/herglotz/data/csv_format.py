@@ -53,8 +53,8 @@ def read_csv(
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
-    `comments` become lines that start with #. Of a set that `read_csv` understands differently only one kind can be
-    written: a coordinate in rad that is not an angle, which must be read with `angles=()`.
+    `comments` become lines that start with #. A coordinate in rad that is not an angle is written too, although
+    `read_csv` reads it as an angle unless it is given `angles=()`.
 
     Raises
     ------
@@ -132,7 +132,7 @@ def _build(
 
 
 def _check_header(path: Path, header: list[str], trajectories: Trajectories) -> None:
-    """Raise unless reading the header back gives every column the role it has."""
+    """Raise unless `read_csv` would give every column of this header its present role."""
     line = ",".join(header)
     try:
         if "\n" in line or "\r" in line:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import tempfile
+from contextlib import suppress
 from pathlib import Path
 
 from herglotz.errors import InputError
@@ -54,6 +56,9 @@ def read_lines(path: PathLike) -> list[str]:
 def write_atomically(path: PathLike, content: bytes) -> None:
     """Write a file under a temporary name in the same folder, then rename it: a crash leaves the old file whole.
 
+    The temporary name is random and the file must not exist (`tempfile.mkstemp`: O_EXCL, O_NOFOLLOW), so that no link
+    planted in the folder is written through. The folder is synced after the rename.
+
     Raises
     ------
     InputError
@@ -61,15 +66,37 @@ def write_atomically(path: PathLike, content: bytes) -> None:
     """
     path = Path(path)
     try:
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=".tmp")
         try:
-            with open(temporary, "wb") as file:
+            with open(handle, "wb") as file:
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
+            os.chmod(temporary, 0o666 & ~_umask())  # as `open` would have made it; mkstemp makes files private
             os.replace(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+        _sync(path.parent)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
         raise InputError(f"{path}: cannot be written ({reason}); check that its folder exists, writable") from error
+
+
+def _umask() -> int:
+    """The process's mask of permissions, which can only be read by setting it."""
+    mask = os.umask(0o077)
+    os.umask(mask)
+    return mask
+
+
+def _sync(folder: Path) -> None:
+    """Have the rename itself on the disk, where the system can sync a folder."""
+    if not hasattr(os, "O_DIRECTORY"):
+        return
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        with suppress(OSError):  # some network file systems refuse it, and the file is written all the same
+            os.fsync(handle)
+    finally:
+        os.close(handle)

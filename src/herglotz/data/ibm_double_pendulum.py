@@ -11,7 +11,7 @@ from herglotz.data.rows import number
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-# Pivot, elbow, tip. The first number of a pair grows downwards: the upper arm comes to rest along it in every run.
+# Pivot, elbow, tip. The first number of a pair grows downwards: in every run the upper arm comes to rest along +x.
 MARKERS = ("x_red", "y_red", "x_green", "y_green", "x_blue", "y_blue")
 RATE = 400.0  # frames per second
 

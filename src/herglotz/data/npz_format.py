@@ -1,4 +1,4 @@
-"""Trajectories as a NumPy archive: exact, compact, and read without pickle."""
+"""Trajectories as a NumPy archive: exact, compact, never unpickled."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 LABELS = ("names", "units", "angles", "time_unit", "source")
-# What numpy and zipfile raise on a damaged archive.
+# Exceptions that numpy and zipfile raise on a damaged archive.
 DAMAGE = (
     *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
     *(OverflowError, TypeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
@@ -98,7 +98,7 @@ def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
 
 
 def _labels(path: Path, metadata: np.ndarray | None) -> dict:
-    """Return the labels that are there, with the types that `Trajectories` wants."""
+    """Return the labels that the metadata have, with the types that `Trajectories` wants."""
     if metadata is None:
         return {}
     try:

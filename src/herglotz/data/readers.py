@@ -1,8 +1,9 @@
-"""One door for files: `load` and `save` choose the format."""
+"""`load` and `save` choose the format of a file."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from herglotz.data.csv_format import read_csv, write_csv
@@ -13,10 +14,27 @@ from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-READS = (
-    ".csv (t[s],q[rad],...; or six marker columns of the IBM double pendulum), .npz (arrays t, q, ...) and "
-    "Schmidt & Lipson .txt (first line '% o v' or '% x v')"
-)
+
+@dataclass(frozen=True)
+class Format:
+    """One kind of file: how to recognise it, and what reads it."""
+
+    name: str  # as messages say it
+    suffix: str
+    read: Callable[[Path], Trajectories]
+    first_line: Callable[[str], bool] = lambda _: True  # whether the first line can belong to this format
+
+
+# The first format that fits reads the file: a special case of a suffix stands before the general one.
+FORMATS = (
+    Format("IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, looks_like_markers),
+    Format("t[s],q[rad],... (.csv)", ".csv", read_csv),
+    Format("arrays t, q, ... (.npz)", ".npz", read_npz),
+    Format(
+        "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson,
+        lambda line: line.startswith("%"),
+    ),
+)  # fmt: skip
 WRITES = ".csv and .npz"
 
 
@@ -26,7 +44,7 @@ def load(
     angles: str | Sequence[str] | None = None,  # coordinates that are angles; left out: what the file says; () for none
     unwrap: bool = True,  # make angles continuous
 ) -> Trajectories:
-    """Read trajectories from any format that is known here.
+    """Read trajectories from any of `FORMATS`.
 
     Returns
     -------
@@ -64,14 +82,10 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
 
 def _read(path: Path) -> Trajectories:
     suffix = path.suffix.lower()
-    if suffix == ".npz":
-        return read_npz(path)
-    if suffix == ".csv":
-        if looks_like_markers(read_bytes(path)[:200].decode("utf-8", "replace").split("\n")[0]):
-            return read_ibm_double_pendulum(path)
-        return read_csv(path)
-    start = read_bytes(path).lstrip()[:1]
-    if suffix == ".txt" and start == b"%":
-        return read_schmidt_lipson(path)
-    what = f"{suffix} whose first line does not start with %" if suffix == ".txt" else suffix or "no extension"
-    raise InputError(f"{path}: {what} is not read here; what is read: {READS}")
+    line = read_bytes(path)[:200].decode("utf-8", "replace").lstrip().split("\n")[0] if suffix != ".npz" else ""
+    candidates = [one for one in FORMATS if one.suffix == suffix]
+    for one in candidates:
+        if one.first_line(line):
+            return one.read(path)
+    what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
+    raise InputError(f"{path}: cannot read {what}; known formats: {'; '.join(one.name for one in FORMATS)}")

@@ -1,20 +1,19 @@
-"""What no smooth motion explains of recorded positions: an upper bound on their noise, without a model."""
+"""An upper bound on the noise of recorded positions, without a model."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import torch
 
-if TYPE_CHECKING:
-    from herglotz.data.trajectories import Trajectories
+from herglotz.data.trajectories import Trajectories
 
-SAMPLES, DEGREE = 9, 5  # in a row, and of the polynomial through them
-MOST = 4000  # windows that are looked at
+SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
+MOST = 4000  # windows at most, evenly spread: more do not change an RMS
 
 
 def roughness(data: Trajectories) -> float:
-    """RMS residual of polynomials in time through nine samples in a row, in units of q; inf where there are fewer.
+    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q.
+
+    Infinite where no trajectory has nine samples.
 
     Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Steps may differ. Angles
     should be `unwrapped()`.

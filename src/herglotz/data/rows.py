@@ -33,7 +33,7 @@ def number(
         value = float(text)
     except ValueError:
         value = None
-    if value is None or "_" in text:  # Python reads 1_000 as a number, no data file means that
+    if value is None or "_" in text:  # Python reads 1_000 as a number; in a data file it is a mistake
         what = quote(text) if text else "a blank cell"
         raise InputError(f"{where}: {what} is not a number; correct or delete the row")
     if not math.isfinite(value):

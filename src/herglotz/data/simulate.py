@@ -1,4 +1,4 @@
-"""Trajectories of a scene with known answers: sampled, noisy, with gaps, the same for the same seed."""
+"""Sampled motions of a scene, with noise and gaps; the same seed gives the same numbers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-LONGEST_GAP = 3  # consecutive samples deleted at most
+LONGEST_GAP = 3  # consecutive samples that one gap deletes at most
 Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
 
 
 class Scene(Protocol):
-    """What `simulate` needs of a scene; those of `herglotz.systems` have it."""
+    """What `simulate` needs of a scene; the scenes of `herglotz.scenes` provide it."""
 
     @property
     def name(self) -> str: ...  # noqa: D102
@@ -60,10 +60,10 @@ def simulate(
 ) -> Trajectories:
     """Sample motions of a scene from uniform random initial positions and velocities and s = 0.
 
-    A scene with inputs is driven by its own, u(t) in the middle of a step held over that step, and they are stored;
-    beside a gap the mean of those that act in it.
+    A scene with inputs is driven by its own u(t): the value in the middle of a step is held over that step. These
+    inputs are stored; a step across a gap stores the mean of the inputs inside it.
 
-    Everything is drawn and computed in float64 from one `torch.Generator`; `dtype` only converts the result.
+    All numbers are drawn and computed in float64 from one `torch.Generator`; `dtype` only converts the result.
 
     Raises
     ------
@@ -123,7 +123,7 @@ def _roll(scene: Any, q: Tensor, v: Tensor, steps: int, h: float, u: Tensor | No
 
 
 def _mean_inputs(u: Tensor, keep: Tensor) -> Tensor:
-    """The inputs (steps + 1, m) from each kept sample to the next, averaged; that of the last sample as it is."""
+    """Return the mean input from each kept sample to the next, (kept, m); the last sample keeps its own input."""
     at = keep.nonzero()[:, 0]
     total = torch.cat([torch.zeros_like(u[:1]), u.cumsum(0)])
     means = (total[at[1:]] - total[at[:-1]]) / (at[1:] - at[:-1])[:, None]
@@ -134,7 +134,7 @@ def _kept(samples: int, gaps: int, generator: torch.Generator) -> Tensor:
     """Delete `gaps` separate runs of 1 to 3 interior samples; return which samples stay, (samples,) bool."""
     runs = torch.randint(1, LONGEST_GAP + 1, (gaps,), generator=generator)
     left = samples - int(runs.sum())
-    # Runs go into different slots between neighbours that stay: never at an end, never two together.
+    # Each run goes into its own slot between two samples that stay: no run is at an end, and no two runs touch.
     slots = torch.randperm(left - 1, generator=generator)[:gaps]
     missing_before = torch.zeros(left, dtype=torch.long)
     missing_before[slots + 1] = runs

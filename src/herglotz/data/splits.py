@@ -1,18 +1,15 @@
-"""Training and test parts, and which sets may be joined."""
+"""Training and test parts of a set of trajectories, as rows of their concatenation."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, MIN_SAMPLES, check_fraction
+from herglotz.data.checks import MIN_SAMPLES, check_fraction
 from herglotz.errors import InputError
-
-if TYPE_CHECKING:
-    from herglotz.data.trajectories import Trajectories
 
 Part = tuple[Tensor, tuple[int, ...]]  # rows of the concatenation, and how many of each trajectory
 
@@ -70,30 +67,21 @@ def trajectory_split(
     return sorted(order[:train]), sorted(order[train:])
 
 
-def check_alike(sets: Sequence[Trajectories]) -> None:
-    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined.
+class Concatenation(Protocol):
+    """Trajectories stored one after the other."""
 
-    Raises
-    ------
-    InputError
-        Naming what differs.
-    """
-    if not sets:
-        raise InputError("cat needs at least one set of trajectories, got none")
-    for other in sets[1:]:
-        for what in ("names", "units", "angles", "time_unit"):
-            one, two = getattr(sets[0], what), getattr(other, what)
-            if one != two:
-                raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")
-    for name in ARRAYS:
-        arrays = [x for one in sets if (x := getattr(one, name)) is not None]
-        if len(arrays) not in (0, len(sets)):
-            raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
-        if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
-            raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")
+    @property
+    def t(self) -> Tensor:
+        """Time, (N,)."""
+        ...
+
+    @property
+    def offsets(self) -> tuple[int, ...]:
+        """Row at which each trajectory starts."""
+        ...
 
 
-def leading_rows(data: Trajectories, lengths: Sequence[int]) -> Tensor:
+def leading_rows(data: Concatenation, lengths: Sequence[int]) -> Tensor:
     """Rows of the first `lengths[b]` samples of every trajectory b."""
     spans = [torch.arange(first, first + k) for first, k in zip(data.offsets, lengths, strict=True)]
     return torch.cat(spans).to(data.t.device)

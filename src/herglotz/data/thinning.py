@@ -1,46 +1,39 @@
-"""Every m-th sample only: less work where a motion is sampled far faster than it changes."""
+"""Samples left out of recorded motion: the inputs of the steps that become longer keep their impulse."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 
-if TYPE_CHECKING:
-    from herglotz.data.trajectories import Trajectories
 
-
-def thinned(data: Trajectories, every: int) -> Trajectories:
-    """Samples 0, m, 2m, … of every trajectory.
-
-    An input acts from its sample to the next, so that of a long step is the mean of those it covers, weighted by
-    their time: the impulse is kept.
+def every_mth(lengths: Sequence[int], every: int) -> Tensor:
+    """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
 
     Raises
     ------
     InputError
-        If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
+        If `every` is not a whole number >= 1.
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be a whole number >= 1, got {every!r}")
-    spans = list(zip(data.offsets, data.lengths, strict=True))
-    kept = [torch.arange(first, first + length, every) for first, length in spans]
-    rows = torch.cat(kept).to(data.t.device)
-    u = None
-    if data.u is not None:
-        u = torch.cat([_means(data.t[a : a + n], data.u[a : a + n], every) for a, n in spans])
-    columns = {name: x[rows] for name in ("t", "q", "s", "p") if (x := getattr(data, name)) is not None}
-    return replace(data, **columns, u=u, lengths=tuple(len(x) for x in kept))
+    return torch.cat([torch.arange(length) % every == 0 for length in lengths])
 
 
-def _means(t: Tensor, u: Tensor, every: int) -> Tensor:
-    """Time-weighted means of u over the steps between kept samples, (kept, m); the last one acts on no step."""
+def inputs_of_kept(
+    t: Tensor,  # (N,) time
+    u: Tensor,  # (N, m) inputs; each acts from its sample to the next
+    lengths: Sequence[int],  # samples of each trajectory
+    kept: Tensor,  # (N,) bool; the first sample of every trajectory is kept
+) -> Tensor:
+    """Return the time-weighted mean of u over the step that starts at each kept sample, (kept, m)."""
     h = torch.cat([t.diff(), t.new_zeros(1)])
-    block = torch.arange(len(t), device=t.device) // every
-    impulse = u.new_zeros(int(block[-1]) + 1, u.shape[1]).index_add(0, block, u * h[:, None])
-    time = h.new_zeros(len(impulse)).index_add(0, block, h)
-    return torch.where(time[:, None] > 0, impulse / time.clamp_min(1e-300)[:, None], u[::every])
+    h[torch.tensor(lengths).cumsum(0) - 1] = 0  # no step starts at the last sample of a trajectory
+    step = kept.cumsum(0) - 1
+    time = h.new_zeros(int(step[-1]) + 1).index_add(0, step, h)
+    impulse = u.new_zeros(len(time), u.shape[1]).index_add(0, step, u * h[:, None])
+    mean = impulse / time.clamp_min(torch.finfo(h.dtype).tiny)[:, None]
+    return torch.where(time[:, None] > 0, mean, u[kept])

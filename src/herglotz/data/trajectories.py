@@ -1,4 +1,4 @@
-"""`Trajectories`: a ragged set of sampled motions, irregular steps and gaps welcome."""
+"""`Trajectories`: a ragged set of sampled motions; steps may be irregular and samples missing."""
 
 from __future__ import annotations
 
@@ -7,19 +7,18 @@ import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import accumulate
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, DTYPES, check
-from herglotz.data.splits import check_alike, time_split, trajectory_split
-from herglotz.data.thinning import thinned
+from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
+from herglotz.data.splits import time_split, trajectory_split
+from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
 
-GAP = 1.5  # a longer step, in typical steps, is a gap
+GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,10 +44,11 @@ class Trajectories:
     p: Tensor | None = None  # (N, n) momentum, where known
     u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
     time_unit: str = "s"
-    source: str = ""  # where it came from, for messages
+    source: str = ""  # file or scene of origin, for messages
 
     def __post_init__(self) -> None:
-        check(self)
+        labels = Labels(self.names, self.units, self.angles, self.time_unit)
+        check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
 
     @classmethod
     def of(
@@ -116,7 +116,7 @@ class Trajectories:
     @cached_property
     def offsets(self) -> tuple[int, ...]:
         """Row of the concatenation at which each trajectory starts."""
-        return (0, *accumulate(self.lengths[:-1]))
+        return offsets_of(self.lengths)
 
     @cached_property
     def trajectory(self) -> Tensor:
@@ -156,8 +156,26 @@ class Trajectories:
         return self.select(train), self.select(test)
 
     def thinned(self, every: int) -> Trajectories:
-        """Return every `every`-th sample of each trajectory, with inputs averaged over the steps they then span."""
-        return thinned(self, every)
+        """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the steps they then span.
+
+        Raises
+        ------
+        InputError
+            If `every` is not a whole number >= 1, or a trajectory keeps fewer than three samples.
+        """
+        return self.keep(every_mth(self.lengths, every).to(self.t.device))
+
+    def keep(self, kept: Tensor) -> Trajectories:
+        """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.
+
+        A longer step takes the mean of the inputs in it, weighted by their time. The first sample of every trajectory
+        must be kept.
+        """
+        columns = self._map(lambda x: x[kept])
+        if self.u is not None:
+            columns["u"] = inputs_of_kept(self.t, self.u, self.lengths, kept)
+        lengths = tuple(int(own.sum()) for own in kept.split(list(self.lengths)))
+        return replace(self, **columns, lengths=lengths)
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
@@ -174,7 +192,7 @@ class Trajectories:
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
         """Join sets of the same coordinates, units and optional arrays."""
         sets = list(sets)
-        check_alike(sets)
+        _check_alike(sets)
         present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
         lengths = tuple(length for one in sets for length in one.lengths)
@@ -190,7 +208,7 @@ class Trajectories:
     def unwrapped(self) -> Trajectories:
         """Return the set with every angle continuous: jumps longer than π lose their multiple of 2π.
 
-        Right as long as no angle truly turns by more than π between two samples.
+        The result is wrong where an angle truly turns by more than π between two samples.
         """
         turning = torch.tensor(self.angles, device=self.q.device)
         if not turning.any():
@@ -248,3 +266,20 @@ def _tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
 
 def _column(x: Tensor) -> Tensor:
     return x[:, None] if x.ndim == 1 else x
+
+
+def _check_alike(sets: Sequence[Trajectories]) -> None:
+    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined."""
+    if not sets:
+        raise InputError("cat needs at least one set of trajectories, got none")
+    for other in sets[1:]:
+        for what in ("names", "units", "angles", "time_unit"):
+            one, two = getattr(sets[0], what), getattr(other, what)
+            if one != two:
+                raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")
+    for name in ARRAYS:
+        arrays = [x for one in sets if (x := getattr(one, name)) is not None]
+        if len(arrays) not in (0, len(sets)):
+            raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
+        if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
+            raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")

@@ -24,9 +24,9 @@ class Steps:
 
 @dataclass(frozen=True)
 class Triples:
-    """Three consecutive samples of one trajectory: what one discrete Herglotz residual joins."""
+    """All windows of three consecutive samples of one trajectory; one discrete Herglotz residual joins three."""
 
-    q0: Tensor  # (T, n)
+    q0: Tensor  # (T, n) positions q_{k−1}, q_k, q_{k+1}
     q1: Tensor  # (T, n)
     q2: Tensor  # (T, n)
     h0: Tensor  # (T,) from q0 to q1
@@ -38,7 +38,7 @@ class Triples:
         return len(self.index)
 
     def spread_out(self, most: int) -> Triples:
-        """At most so many of them, evenly spread."""
+        """Return at most `most` windows, evenly spread."""
         if len(self) <= most:
             return self
         rows = torch.linspace(0, len(self) - 1, most, device=self.index.device).round().long()
@@ -71,7 +71,7 @@ def triples(
 
 
 def join(first: Triples, second: Triples) -> Triples:
-    """Both, one after the other."""
+    """Return the windows of both, one after the other."""
     pairs = zip(vars(first).values(), vars(second).values(), strict=True)
     return Triples(*(torch.cat(pair) for pair in pairs))
 

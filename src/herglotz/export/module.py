@@ -11,10 +11,11 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.errors import InputError
-from herglotz.export.equation import Equations, dense, eliminate
+from herglotz.export.equation import Equations, dense
 from herglotz.export.newton import ITERATIONS, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
 from herglotz.models import ContactLagrangian
+from herglotz.stepping.linearise import eliminate
 
 
 def solved(

@@ -23,8 +23,7 @@ from herglotz.export.equation import dense, example, inverse, length
 from herglotz.export.newton import CARRIED, CONVERGED, NewtonIteration, Values, first_carry, status_of
 from herglotz.export.trace import traced
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.equation import model_equation
-from herglotz.stepping.explicit import Leapfrog, has_leapfrog
+from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
 
 # The guess of Δ/h continues the parabola through the last velocities of equally long steps. Its error (ω h)³ leaves
@@ -37,8 +36,9 @@ class Layout:
     """Which tensors the carry of a model holds, and where."""
 
     def __init__(self, model: ContactLagrangian):
-        self.field = 2 if model_equation(model) is not None else 0
-        self.iterates = not has_leapfrog(model)
+        made_of = model.capabilities
+        self.field = 2 * made_of.by_terms  # V and V′
+        self.iterates = not made_of.explicit
         self.compensated = next(model.parameters()).dtype == torch.float32
         self.size = STATE + self.field + self.iterates + 2 * self.compensated
 

@@ -18,6 +18,13 @@ SAME = (  # what leaves its first argument as it is, wherever shape and dtype st
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
     aten.broadcast_to.default, aten.movedim.intlist,
 )  # fmt: skip
+# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value.
+INSTEAD: dict[Any, Any] = {
+    aten.view.default: aten.reshape.default,
+    aten._unsafe_view.default: aten.reshape.default,
+    aten.sub_.Tensor: aten.sub.Tensor,
+    aten.fill_.Scalar: aten.full_like.default,
+}
 
 
 class Graph(nn.Module):
@@ -70,7 +77,7 @@ def example_batch(sizes: set[int]) -> int:
     return next(prime for prime in PRIMES if all(size % prime for size in sizes if size))
 
 
-def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
+def traced(module: nn.Module, arguments: tuple[Tensor, ...], derivatives: bool = False) -> Graph:
     """The module as a graph without classes, repetitions and constant parts, for any batch size.
 
     Parameters
@@ -79,6 +86,9 @@ def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
         Takes and returns tensors whose batch is axis 0; not changed.
     arguments
         Examples, with a batch from `example_batch`.
+    derivatives
+        Whether the module differentiates by `torch.func`: its operations are then recorded below those transforms, as
+        smaller ones (`mm` and `addmm` for `linear`).
     """
     from torch._guards import TracingContext, tracing
     from torch._subclasses import FakeTensorMode
@@ -88,7 +98,7 @@ def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
         module(*arguments)  # fills index caches outside the trace
         # A mode of our own: without one, torch makes a new one for the description of every value, half of the time.
         with tracing(TracingContext(FakeTensorMode(allow_fallback_kernels=True))):
-            found = make_fx(module, pre_dispatch=True)(*arguments)
+            found = make_fx(module, pre_dispatch=not derivatives)(*arguments)
         values = _values(found, arguments)
         lean = _lean(found, values, next(len(x) for x in arguments if x.ndim))
         values = _values(lean.code, (*arguments, *lean.constants))
@@ -149,6 +159,8 @@ def _lean(found: fx.GraphModule, values: dict[str, Any], batch: int) -> Graph:
         value = values[node.name]
         if not isinstance(value, Tensor):
             return value
+        if value.is_meta:  # the derivative of a constant, which torch.func keeps without numbers
+            value = torch.zeros(value.shape, dtype=value.dtype)
         key = (value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes())
         if key not in constants:
             with graph.inserting_before(new[places[0]]):
@@ -169,10 +181,14 @@ def _lean(found: fx.GraphModule, values: dict[str, Any], batch: int) -> Graph:
         if _changes_nothing(node, values):
             new[node] = moved(node.args[0])
             continue
+        if node.target == aten.copy_.default:  # into zeros that nothing else reads
+            shape = _with_batch(list(values[node.name].shape), batch, symbol)
+            new[node] = graph.call_function(aten.expand.default, (moved(node.args[1]), shape))
+            continue
         arguments = fx.map_arg(node.args, moved)
         arguments, options = (_with_batch(x, batch, symbol) for x in (arguments, node.kwargs))
         new[node] = _gathered(graph, node, values, arguments) or graph.create_node(
-            "call_function", node.target, arguments, fx.map_arg(options, moved), node.name
+            "call_function", INSTEAD.get(node.target, node.target), arguments, fx.map_arg(options, moved), node.name
         )
     graph = fx_graph_cse(graph)
     graph.eliminate_dead_code()

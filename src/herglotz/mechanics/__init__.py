@@ -1,62 +1,6 @@
-"""What is true of every discrete contact Lagrangian."""
+"""What learning and stepping need of every discrete contact Lagrangian: derivatives, momenta, regularity."""
 
-from herglotz.mechanics.action import Action, curve_action, herglotz_action
 from herglotz.mechanics.contact import contact_defect, contact_form, flow_derivative
-from herglotz.mechanics.continuous import (
-    contact_vector_field,
-    derivatives,
-    evolution_vector_field,
-    herglotz_acceleration,
-)
-from herglotz.mechanics.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
-from herglotz.mechanics.gauge import Rescaled, joined_action
-from herglotz.mechanics.generating import (
-    GeneratingFunction,
-    generating_function,
-    hamilton_jacobi_residual,
-    left_generating_function,
-    left_hamilton_jacobi_residual,
-)
-from herglotz.mechanics.hamilton_equations import left_equations, left_step, right_equations, right_step
-from herglotz.mechanics.hamilton_jacobi import (
-    PointSource,
-    Quadratic,
-    commutation_defect,
-    projected_flow,
-    projected_step,
-    riccati_step,
-)
-from herglotz.mechanics.hamiltonian import (
-    LeftHamiltonian,
-    RightHamiltonian,
-    left_hamiltonian,
-    left_hamiltonian_on_flow,
-    right_hamiltonian,
-    right_hamiltonian_on_flow,
-    solve_right_position,
-)
-from herglotz.mechanics.hj_on_q import energy_on_section, projected_field, relatedness_defect
-from herglotz.mechanics.hj_on_qxr import (
-    discrete_section_residuals,
-    section_asymmetry,
-    section_hamilton_jacobi_residual,
-    section_relatedness_defect,
-    transport_section,
-)
-from herglotz.mechanics.jacobi import (
-    bivector,
-    contact_curvature,
-    differential,
-    divergence,
-    flat,
-    jacobi_bracket,
-    lie_derivative_of_contact_form,
-    reeb_field,
-    sharp,
-    sharp_bivector,
-)
-from herglotz.mechanics.jets import Function, Jet, jet, prolongation
-from herglotz.mechanics.left import LeftLagrangian, left_momenta
 from herglotz.mechanics.legendre import (
     herglotz_residual,
     legendre_minus,
@@ -66,22 +10,6 @@ from herglotz.mechanics.legendre import (
     momentum_minus,
     momentum_plus,
     momentum_residual,
-)
-from herglotz.mechanics.legendre_dual import fiber_derivative, fiber_inverse, legendre_dual
-from herglotz.mechanics.legendrian import (
-    LegendrianDefect,
-    contact_complement,
-    contact_product_point,
-    contact_product_states,
-    legendrian_defect,
-    product_potential,
-)
-from herglotz.mechanics.noether import (
-    dissipation_defect,
-    infinitesimal_generator,
-    invariance_defect,
-    momentum_map,
-    noether_defect,
 )
 from herglotz.mechanics.partials import (
     ClosedForm,
@@ -94,108 +22,29 @@ from herglotz.mechanics.partials import (
     partials,
 )
 from herglotz.mechanics.regularity import Regularity, regularity
-from herglotz.mechanics.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
 from herglotz.mechanics.tangent import step_derivative
 
 __all__ = [
-    "Action",
     "ClosedForm",
     "DiscreteLagrangian",
     "Driven",
     "Forced",
     "Forces",
-    "Function",
-    "GeneratingFunction",
-    "Jet",
-    "LeftHamiltonian",
-    "LeftLagrangian",
-    "LegendrianDefect",
     "Partials",
-    "PointSource",
-    "Quadratic",
     "Regularity",
-    "Rescaled",
-    "RightHamiltonian",
     "autograd_partials",
-    "bivector",
-    "cayley",
-    "commutation_defect",
-    "contact_complement",
-    "contact_curvature",
     "contact_defect",
     "contact_form",
-    "contact_product_point",
-    "contact_product_states",
-    "contact_vector_field",
-    "curve_action",
-    "derivatives",
-    "differential",
-    "discrete_section_residuals",
-    "dissipation_defect",
-    "divergence",
-    "energy_on_section",
-    "evolution_vector_field",
-    "exp_so3",
-    "fiber_derivative",
-    "fiber_inverse",
-    "flat",
     "flow_derivative",
-    "generating_function",
-    "hamilton_jacobi_residual",
-    "hat",
-    "herglotz_acceleration",
-    "herglotz_action",
     "herglotz_residual",
-    "increment_gradient",
-    "infinitesimal_generator",
-    "invariance_defect",
-    "inverse_cayley",
-    "jacobi_bracket",
-    "jet",
-    "joined_action",
-    "left_equations",
-    "left_generating_function",
-    "left_hamilton_jacobi_residual",
-    "left_hamiltonian",
-    "left_hamiltonian_on_flow",
-    "left_momenta",
-    "left_step",
-    "legendre_dual",
     "legendre_minus",
     "legendre_plus",
-    "legendrian_defect",
-    "lie_derivative_of_contact_form",
-    "log_so3",
-    "mean_value_gradient",
-    "midpoint_gradient",
     "mixed_hessian",
     "momentum_jacobian",
-    "momentum_map",
     "momentum_minus",
     "momentum_plus",
     "momentum_residual",
-    "noether_defect",
     "partials",
-    "product_potential",
-    "projected_field",
-    "projected_flow",
-    "projected_step",
-    "prolongation",
-    "reeb_field",
     "regularity",
-    "relatedness_defect",
-    "riccati_step",
-    "right_equations",
-    "right_hamiltonian",
-    "right_hamiltonian_on_flow",
-    "right_step",
-    "section_asymmetry",
-    "section_hamilton_jacobi_residual",
-    "section_relatedness_defect",
-    "sharp",
-    "sharp_bivector",
-    "solve_right_position",
     "step_derivative",
-    "transport_section",
-    "vee",
 ]

@@ -58,7 +58,7 @@ ABSENT: Tensor = cast(Tensor, None)
 class Forces:
     """Discrete forces at (q0, q1, s0), in units of momentum; derivatives only when order 2 was asked for.
 
-    They change the momenta, p_k = −(D1 + F⁻)/c and p_{k+1} = D2 + F⁺ (trap 4 of `mathematics.md`), not the action.
+    They change the momenta, p_k = −(D1 + F⁻)/c and p_{k+1} = D2 + F⁺ (trap 4 of `docs/mathematics.md`), not the action.
     """
 
     minus: Tensor  # (..., n) F⁻

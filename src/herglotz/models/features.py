@@ -11,53 +11,14 @@ whole sum, which is how parameters are shared. Short names stand for lists of fe
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from inspect import signature
 from itertools import combinations, product
 
 from herglotz.errors import InputError
+from herglotz.models.feature_grammar import Feature, Product, parse
 
-_NUMBER = r"\d+(?:\.\d*)?(?:[eE][-+]?\d+)?|\.\d+"
-_SPLIT = re.compile(r"\s*([-+])(?<!\^[-+])(?<!\d[eE][-+])(?![^()]*\))\s*")  # signs between products
-_FACTOR = re.compile(
-    rf"\s*\*?\s*(?:(?P<function>cos|sin)\((?P<angle>[^()]+)\)|\((?P<form>[^()]+)\)\s*(?:\^(?P<power>\d+))?"
-    rf"|r\^(?P<radial>-?\d+)|(?P<radius>r)\b|q(?P<q>\d+)(?:\^(?P<qpower>\d+))?|v(?P<v>\d+)(?:\^(?P<vpower>\d+))?"
-    rf"|(?P<number>{_NUMBER}))"
-)
-_ADDEND = re.compile(rf"\s*([-+]?)\s*({_NUMBER})?\s*\*?\s*q(\d+)\s*")
-
-
-@dataclass(frozen=True)
-class Product:
-    """factor · f(w·q) · ∏ v, with f = cos, sin, a power of the linear form, or a power of r = |q| (no w)."""
-
-    factor: float
-    function: str  # "cos", "sin", "power" or "radius"
-    form: tuple[float, ...] = ()  # w, n numbers
-    power: int = 0
-    velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
-
-
-Feature = tuple[Product, ...]
-
-
-def parse(text: str, angles: Sequence[bool]) -> Feature:
-    """The products that a feature is the sum of.
-
-    Raises
-    ------
-    InputError
-        Naming the feature and the part of it that cannot be read.
-    """
-    pieces = _SPLIT.split(text.strip())
-    pieces = pieces[1:] if pieces[0] == "" else ["+", *pieces]
-    terms = zip(pieces[::2], pieces[1::2], strict=True)
-    feature = tuple(_product(body, -1.0 if sign == "-" else 1.0, text, angles) for sign, body in terms)
-    if len({bool(p.velocities) for p in feature}) > 1:
-        raise InputError(f"feature '{text}': some products hold velocities and some do not; make two features of it")
-    return feature
+__all__ = ["LIBRARIES", "Feature", "Product", "expand", "parse"]
 
 
 def expand(names: Sequence[str], angles: Sequence[bool]) -> list[str]:
@@ -153,60 +114,3 @@ LIBRARIES: dict[str, Callable[..., list[str]]] = {
     "revolute": revolute,
     "lengths": lengths,
 }
-
-
-def _product(body: str, factor: float, text: str, angles: Sequence[bool]) -> Product:
-    n = len(angles)
-    found: list[tuple[str, tuple[float, ...], int]] = []
-    velocities: list[int] = []
-    at = 0
-    while at < len(body.rstrip()):
-        match = _FACTOR.match(body, at)
-        if match is None:
-            raise InputError(
-                f"feature '{text}': cannot read '{body[at:].strip()}'; write sums of products of numbers, v1, "
-                "and one of cos(q1 - q2), sin(q1), (q1 - q2)^2, q1^3, r^-1"
-            )
-        part, at = match.groupdict(), match.end()
-        if part["number"]:
-            factor *= float(part["number"])
-        elif part["v"]:
-            velocities += [_coordinate(part["v"], n, text)] * int(part["vpower"] or 1)
-        elif part["radial"] or part["radius"]:
-            found.append(("radius", (), int(part["radial"] or 1)))
-        elif part["function"]:
-            found.append((part["function"], _form(part["angle"], n, text), 0))
-        elif part["form"]:
-            found.append(("power", _form(part["form"], n, text), int(part["power"] or 1)))
-        else:
-            found.append(("power", _form(f"q{part['q']}", n, text), int(part["qpower"] or 1)))
-    if len(found) > 1:
-        raise InputError(
-            f"feature '{text}': '{body.strip()}' has {len(found)} functions of the position, and a product takes one; "
-            "q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
-        )
-    function, form, power = found[0] if found else ("power", (0.0,) * n, 0)
-    used = [True] * n if function == "radius" else form
-    if power and any(w and angle for w, angle in zip(used, angles, strict=True)):
-        raise InputError(f"feature '{text}': a power of an angle is not periodic; use cos or sin")
-    if function == "radius" and velocities:
-        raise InputError(f"feature '{text}': powers of r join the potential; write the product without velocities")
-    return Product(factor, function, form, power, tuple(velocities))
-
-
-def _form(words: str, n: int, text: str) -> tuple[float, ...]:
-    """The n numbers w of a linear form such as 2q1 - q3."""
-    w, at = [0.0] * n, 0
-    while at < len(words):
-        match = _ADDEND.match(words, at)
-        if match is None or (at and not match[1]):
-            raise InputError(f"feature '{text}': cannot read the linear form '{words}'; write q1 - q2 or 2*q1 + q3")
-        w[_coordinate(match[3], n, text)] += float(match[2] or 1) * (-1.0 if match[1] == "-" else 1.0)
-        at = match.end()
-    return tuple(w)
-
-
-def _coordinate(digits: str, n: int, text: str) -> int:
-    if not 1 <= int(digits) <= n:
-        raise InputError(f"feature '{text}': there is no coordinate {digits}; they are numbered 1 … {n}")
-    return int(digits) - 1

@@ -11,14 +11,15 @@ from herglotz.errors import InputError
 from herglotz.mechanics import Forces, Partials
 from herglotz.models.action import ActionFlow
 from herglotz.models.blocks import action_partials, affine_partials
+from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
-from herglotz.models.fourth import Bend, missing
 from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
+from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
@@ -103,16 +104,30 @@ class ContactLagrangian(nn.Module):
     @property
     def s_enters_motion(self) -> bool:
         """Whether the positions depend on s at all (they do at the affine and full levels)."""
-        return self.damping is not None and not self.damping.constant
+        return self.capabilities.carries_s
 
     @property
     def linear_in_q1(self) -> bool:
         """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
-        if self.config.order == 4:
-            return False
-        if self.s_enters_motion or self.correction is not None or not isinstance(self.kinetic, Kinetic):
-            return False
-        return self.friction is None or self.friction.linear
+        return self.capabilities.linear_in_q1
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """What the model is made of, and what follows for its steps."""
+        return Capabilities(
+            order=self.config.order,
+            baseline=self.config.baseline,
+            constant_mass=type(self.kinetic) is Kinetic,
+            constant_c=self.damping is None or self.damping.constant,
+            known_damping=type(self.damping) in (LinearDamping, AffineDamping, type(None)),
+            correction=self.correction is not None,
+            action_flow=self.action is not None,
+            position_features=self.potential.features is not None,
+            friction=self.friction is not None,
+            dry_friction=self.friction is not None and not self.friction.linear,
+            coupling=self.coupling is not None,
+            inputs=self.inputs,
+        )
 
     def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Terms:
         """Evaluate every term once."""
@@ -233,7 +248,7 @@ class ContactLagrangian(nn.Module):
         assert not isinstance(kinetic, PositionKinetic)
         assert not isinstance(damping, AffineDamping)
         rate = phase.q0.new_zeros(()) if damping is None else damping.rate
-        return missing(Bend(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
+        return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
     def _forces(
         self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None

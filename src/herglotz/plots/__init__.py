@@ -1,4 +1,4 @@
-"""Figures of data, runs and the theory, as matplotlib `Figure` objects: nothing global, no window, no display."""
+"""Figures of data, runs and the theory, as matplotlib `Figure` objects; no function opens a window."""
 
 from __future__ import annotations
 
@@ -26,17 +26,17 @@ FIGURES = {
     "hj_residual.png": plot_hamilton_jacobi_residual,
     "training.png": plot_training,
 }
-UNFORCED = {"momentum_vs_dS.png", "hj_residual.png"}  # of an action S^k, which a model with forces has not
+UNFORCED = {"momentum_vs_dS.png", "hj_residual.png"}  # figures of S^k, which a model with forces does not have
 
 
 def save_figures(run: Run, folder: PathLike) -> list[Path]:
-    """Draw every figure of a run and write them as PNG into `folder`, which is made if need be.
+    """Draw every figure of a run and write them as PNG into `folder`, which is made if it is missing.
 
     Returns
     -------
     list of Path
-        In the order of `FIGURES`, those of the action left out at the forced level. Nothing is written before all are
-        drawn.
+        In the order of `FIGURES`; a model with forces has no figures of S^k. All figures are drawn before one is
+        written.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Residuals inside the band that the posterior promises."""
+"""Residuals of a run and the predictive band of its posterior."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MOST_PANELS = 4
 
 
 def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
-    """Draw data − model against time, with the band for the model's position and the one for a measured value."""
+    """Draw data − model against time, with the bands of the model's position and of a measured value."""
     data = run.data.unwrapped()
     inside, held = bands.inside(data.q, level), ~trained_mask(run)
     part, word = (held, "held-out ") if bool(held.any()) else (~held, "")

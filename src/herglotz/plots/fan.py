@@ -1,4 +1,4 @@
-"""Fans of solutions: where the figures of the generating function and of the Hamilton–Jacobi equation start from."""
+"""Fans of solutions for the figures of the generating function and of the Hamilton–Jacobi equation."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian, GeneratingFunction, generating_function
+from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.theory import GeneratingFunction, generating_function
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -21,7 +22,7 @@ CAUSTIC = 1e-3  # smallest spread of ∂q_k/∂p̂0, relative to the median, at 
 
 @dataclass(frozen=True)
 class Fan:
-    """Initial states, the step, and the model that moves them."""
+    """Initial states, a step size and the L_d that moves the states."""
 
     L_d: DiscreteLagrangian
     start: State  # (F, n), (F, n), (F,)
@@ -30,7 +31,7 @@ class Fan:
     action_unit: str = ""
 
     def generating_function(self, k: int, start: State | None = None) -> GeneratingFunction:
-        """S^k and its derivatives along every solution of the fan, k >= 1 steps from its start."""
+        """Return S^k and its derivatives along every solution of the fan, k >= 1 steps from its start."""
         stepper = Stepper(self.L_d)
 
         def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -40,7 +41,7 @@ class Fan:
 
 
 def regular(S: GeneratingFunction) -> Tensor:
-    """(F,) where S^k exists: finite, and not at a caustic."""
+    """Return where S^k exists, (F,) bool: it is finite and not at a caustic."""
     finite = torch.isfinite(S.S) & torch.isfinite(S.D2).all(-1) & torch.isfinite(S.p).all(-1)
     spread = torch.where(finite, S.spread, torch.zeros_like(S.spread))
     typical = spread[finite].median() if bool(finite.any()) else spread.sum()
@@ -48,7 +49,7 @@ def regular(S: GeneratingFunction) -> Tensor:
 
 
 def spread_fan(source: Run | ContactLagrangian, size: int, h: float | None = None) -> Fan:
-    """`size` solutions from all over the data (a run) or over the model's typical box (a model alone)."""
+    """Return `size` solutions that start all over the data (a run) or the model's typical box (a model alone)."""
     if isinstance(source, ContactLagrangian):
         return _box_fan(source, size, h)
     states = source.states
@@ -62,7 +63,7 @@ def spread_fan(source: Run | ContactLagrangian, size: int, h: float | None = Non
 
 
 def point_fan(run: Run, size: int) -> Fan:
-    """`size` solutions that leave one point of the data, q̂0 and ŝ0, with different momenta p̂0 along one direction."""
+    """Return `size` solutions that leave one point (q̂0, ŝ0) of the data with different p̂0 along one direction."""
     states = run.states
     finite = torch.isfinite(states.p).all(-1) & torch.isfinite(states.q).all(-1) & torch.isfinite(states.s)
     if not bool(finite.any()):
@@ -77,7 +78,7 @@ def point_fan(run: Run, size: int) -> Fan:
 
 
 def units(run: Run) -> tuple[str, str]:
-    """Units of p and s: the first entry of the mass is fixed at 1, so p is a velocity and s a squared length a time."""
+    """Return the units of p and s: with the first mass fixed at 1, p is a velocity and s a length² over a time."""
     length, time = run.data.units[0], run.data.time_unit
     if len(set(run.data.units)) > 1:
         return "", ""

@@ -11,19 +11,20 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from herglotz.mechanics import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 from herglotz.models import ContactLagrangian
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
+from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 
 if TYPE_CHECKING:
     from herglotz.training import Run
 
 STEPS, SIZE = 8, 31
 NULL_STEPS = (1, 4, 8)
-DISTANCES, ANCHOR = np.logspace(-5, -0.5, 10), 7  # of q_{k+1} from the flow, in units of the fan's width
-BELOW = 1 / 200  # of a rounding error: where a difference of exactly 0 is drawn
+DISTANCES = np.logspace(-5, -0.5, 10)  # of p̂0 from the fan's solution, in widths of the fan
+ANCHOR = 7  # index of the distance through which the reference line of slope 2 is drawn
+BELOW = 1 / 200  # rounding errors at which a difference of exactly 0 is drawn
 
 
 def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: float | None = None) -> Figure:
@@ -102,9 +103,9 @@ def plot_hamilton_jacobi_residual(run: Run) -> Figure:
 
 
 def _residual(fan: Fan, S0: GeneratingFunction, S1: GeneratingFunction, near: GeneratingFunction) -> Tensor:
-    """(F,) |residual| between S^k at S0 and S^{k+1} at S1, relative to its terms; NaN at a caustic.
+    """Return |residual| between S^k at S0 and S^{k+1} at S1 over its terms, (F,); NaN at a caustic.
 
-    H⁺ has branches: Newton's iteration for it starts at the solution that `near` belongs to.
+    H⁺ has branches: its Newton iteration starts at the solution `near`.
     """
     H_plus = right_hamiltonian(fan.L_d, S0.q, S1.D2, S0.s, fan.h, near.q)
     residual = hamilton_jacobi_residual(S1.S, S0.S, S1.D2, S1.q, H_plus).detach().abs()
@@ -113,7 +114,7 @@ def _residual(fan: Fan, S0: GeneratingFunction, S1: GeneratingFunction, near: Ge
 
 
 def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.ndarray]:
-    """Distances and residuals, medians (K, D), with q_{k+1} taken from a solution of slightly larger p̂0."""
+    """Return median distances and residuals, (K, D), with q_{k+1} taken from a solution of slightly larger p̂0."""
     q, p, s = fan.start
     width = float((p.amax(0) - p.amin(0)).abs().max())
     count = len(DISTANCES)
@@ -175,7 +176,7 @@ def _draw_null(ax: Axes, distance: np.ndarray, off_flow: np.ndarray, on_flow: fl
 
 
 def _slope(d: np.ndarray, r: np.ndarray, noise: float) -> float:
-    """Slope of log r in log d above round-off and below saturation."""
+    """Return the slope of log r in log d above round-off and below saturation."""
     fine = np.isfinite(r) & (r > noise) & (r < 1e-2) & (d > 0)
     return float(np.polyfit(np.log(d[fine]), np.log(r[fine]), 1)[0]) if fine.sum() > 1 else float("nan")
 

@@ -1,4 +1,4 @@
-"""Positions against time: the data, the free run of the model, and what lies between them."""
+"""Positions against time: the data, the free run of the model, and the residual."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plot_data(data: Trajectories) -> Figure:
 
 
 def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
-    """Draw data, free run and residual against time; what was not trained on is shaded.
+    """Draw data, free run and residual against time; the part beyond training is shaded.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
 
 
 def trajectory_title(run: Run) -> str:
-    """The message of the figure: how far the free run is from data that the fit has not seen."""
+    """Return the message of the figure: the distance of the free run from data that the fit has not seen."""
     data = run.data
     unit = data.units[0] if len(set(data.units)) == 1 else ""
     error = (run.prediction - data.q).detach()
@@ -86,7 +86,7 @@ def trajectory_title(run: Run) -> str:
 
 
 def trained_mask(run: Run) -> torch.Tensor:
-    """(N,) whether a sample was trained on: the leading `train_lengths` of every trajectory."""
+    """Return which samples were trained on, (N,) bool: the first `train_lengths` of every trajectory."""
     data = run.data
     mask = torch.zeros(data.samples, dtype=torch.bool)
     for start, count in zip(data.offsets, run.train_lengths, strict=True):
@@ -125,7 +125,7 @@ def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled:
 def _draw_labels(
     run: Run, top: Axes, bottom: Axes, series: tuple[np.ndarray, np.ndarray], count: int, labelled: bool
 ) -> None:
-    """Say what is what beside it, once a figure; the RMS of each part in every panel."""
+    """Label data, fit and free run once a figure, and write the RMS of each part into every panel."""
     t, residual = series
     unit = run.data.units[0] if len(set(run.data.units)) == 1 else ""
     split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
@@ -149,7 +149,7 @@ def _draw_labels(
 
 
 def _cells(data: Trajectories, trajectory: int | None) -> list[tuple[int, int]]:
-    """Which (trajectory, coordinate) a panel shows: a single trajectory's coordinates, else coordinate 0 of several."""
+    """Return the (trajectory, coordinate) of each panel: one trajectory's coordinates, or coordinate 0 of several."""
     if trajectory is not None or len(data) == 1:
         return [(trajectory or 0, i) for i in range(min(data.dof, MOST_PANELS))]
     chosen = np.linspace(0, len(data) - 1, min(len(data), MOST_PANELS)).round().astype(int)
@@ -161,7 +161,7 @@ def _size(cells: int, height: float) -> tuple[float, float]:
 
 
 def _axes(figure: Figure, cells: int, rows: int) -> list[list[Axes]]:
-    """`cells` groups of panels in at most two columns, each of one or two rows that share their time axis."""
+    """Make `cells` groups of panels in at most two columns; the rows of a group share their time axis."""
     columns = 1 if cells == 1 else 2
     grid = figure.add_gridspec(math.ceil(cells / columns), columns)
     found = []

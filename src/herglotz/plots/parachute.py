@@ -1,4 +1,4 @@
-"""The parachute, twice: the map that the paper prints, and a fall."""
+"""Two figures of the parachute: the map that the paper prints, and a fall."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class PrintedOrbit:
 
 @dataclass(frozen=True)
 class Fall:
-    """A fall in closed form, from h·0 to the last step before the ground; slopes from k = 1."""
+    """A fall in closed form, from t = 0 to the last step before the ground; slopes from k = 1."""
 
     t: np.ndarray
     q: np.ndarray

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from herglotz.training import Run
 
 LINES, MOST_PANELS = 13, 3
-SHORT, MOST_STEPS = 0.35, 400  # how long a rollout from the grid is drawn, in units of the typical time |q|/|p|
-NEAR_PI = 1.6  # an angle that goes further than this is drawn with ±π in sight
+SHORT, MOST_STEPS = 0.35, 400  # length of a rollout from the grid, in the typical time |q|/|p|, and its steps at most
+NEAR_PI = 1.6  # the panel of an angle that goes beyond this (rad) reaches to ±π
 
 
 def plot_phase_portrait(run: Run) -> Figure:
@@ -60,7 +60,7 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
 
 
 def _background(run: Run, q_range: tuple[float, float], p_range: tuple[float, float]) -> np.ndarray:
-    """(lines, K + 1, 2, n) positions and momenta of rollouts; NaN after a step that failed."""
+    """Return positions and momenta of rollouts, (lines, K + 1, 2, n); NaN after a step that failed."""
     model, data = run.model, run.data
     typical = (q_range[1] - q_range[0]) / (p_range[1] - p_range[0])
     duration = max(float(one.t[-1] - one.t[0]) for one in data)
@@ -79,7 +79,7 @@ def _background(run: Run, q_range: tuple[float, float], p_range: tuple[float, fl
 
 
 def _draw_line(ax: Axes, q: np.ndarray, p: np.ndarray) -> None:
-    """A thin line with one arrow head, so that the direction of time is seen."""
+    """Draw a thin line with one arrow head, which shows the direction of time."""
     fine = np.isfinite(q) & np.isfinite(p)
     q, p = q[fine], p[fine]
     if len(q) < 2:
@@ -107,7 +107,7 @@ def _limits(x: np.ndarray, angle: bool | None = None) -> tuple[float, float]:
 
 
 def _mark_pi(ax: Axes, low: float, high: float) -> None:
-    """Lines at the odd multiples of π in sight, where a pendulum stands upright; ticks in multiples of π."""
+    """Draw lines at the odd multiples of π, where a pendulum stands upright, and ticks in multiples of π."""
     for k in range(math.ceil(low / math.pi), math.floor(high / math.pi) + 1):
         if k % 2:
             ax.axvline(k * math.pi, color=MUTED, lw=0.9, ls=(0, (4, 3)), zorder=0)
@@ -119,7 +119,7 @@ def _mark_pi(ax: Axes, low: float, high: float) -> None:
 
 
 def _title(run: Run) -> str:
-    """How much of the momentum one unit of time leaves, where the model has one damping rate."""
+    """Return a title: the share of the momentum that one unit of time leaves, where the model has one damping rate."""
     damping = getattr(run.model, "damping", None)
     rate = getattr(damping, "rate", None)
     if rate is None or not getattr(damping, "constant", False):

@@ -1,4 +1,4 @@
-"""Held-out error against the levels of the ladder: why `select` chose what it chose."""
+"""Held-out error of each level of the ladder: the reason for the choice of `select`."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def plot_selection(selection: Selection) -> Figure:
             if any(failed) and math.isfinite(c.error):
                 label(ax, k, ceiling, f"{sum(failed)} failed", MUTED, ha="center", xytext=(0, 6))
         ax.set_yscale("log")
-        ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade: a few per cent should look like a few per cent
+        ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade, so that a few per cent look small
         names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
         ax.set_xticks(range(len(names)), names)
         ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=f"held-out RMS{f' ({unit})' if unit else ''}")

@@ -1,4 +1,4 @@
-"""One look for every figure, without touching matplotlib's global settings or needing a display."""
+"""The style of every figure; matplotlib's global settings stay as they are, and no display is needed."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ STYLE: Any = {
 
 @contextmanager
 def styled() -> Iterator[None]:
-    """Draw with matplotlib's defaults and this style, whatever the caller's settings are, and restore them."""
+    """Draw with matplotlib's defaults and this style; the caller's settings are restored afterwards."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams.update(STYLE)
@@ -57,7 +57,7 @@ def styled() -> Iterator[None]:
 
 
 def new_figure(width: float, height: float, title: str) -> Figure:
-    """Return an empty figure (inches) with its message on top; no pyplot: no window, no global list of figures."""
+    """Return an empty figure (inches) with a title; without pyplot there is no window and no global list of figures."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
     return figure
@@ -95,10 +95,10 @@ def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left"
 
 
 def with_unit(name: str, unit: str) -> str:
-    """An axis label: `theta (rad)`, or the name alone for a number without unit."""
+    """Return an axis label: `theta (rad)`, or the name alone for a number without unit."""
     return name if unit in ("", "1") else f"{name} ({unit})"
 
 
 def number(value: float, unit: str = "") -> str:
-    """A number for people: three significant digits, and its unit."""
+    """Return a number with three significant digits and its unit."""
     return f"{value:.3g}" + ("" if unit in ("", "1") else f" {unit}")

@@ -1,4 +1,4 @@
-"""Error against cost of every setting that `tune` tried, and the front it chose from."""
+"""Error against cost of every setting that `tune` tried, and their Pareto front."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_f
 if TYPE_CHECKING:
     from herglotz.tune.result import Candidate, Tuning
 
-FLOOR = 1e-16  # an error of zero (the run's own setting) has no place on a logarithmic axis
+FLOOR = 1e-16  # an error of 0 (the run's own setting) is drawn here, because the axis is logarithmic
 KINDS = (
     ("eager", "float64", "o", MUTED, "PyTorch"),
     ("c", "float64", "s", MODEL, "C, float64"),
@@ -27,7 +27,7 @@ def _form(candidate: Candidate) -> str:
 
 
 def plot_tuning(tuning: Tuning) -> Figure:
-    """Draw the error bound against the cost; filled: distilled, half: kicks; a circle: the choice."""
+    """Draw the error bound against the cost: filled marks: distilled models, half: kicks, circle: the choice."""
     good = [c for c in tuning.candidates if math.isfinite(c.bound)]
     share, unit = f"{100 * tuning.config.quantile:g} % of starts", tuning.run.data.time_unit
     units = tuning.run.data.units

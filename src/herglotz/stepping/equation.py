@@ -79,13 +79,13 @@ class ModelEquation:
     Parameters
     ----------
     model
-        As `model_equation` accepts it.
+        One whose step equation is known `by_terms`.
     fold
         Fold h into the networks' last layers: fewer operations where h is one number for all samples.
     """
 
     def __init__(self, model: ContactLagrangian, fold: bool = True):
-        assert isinstance(model.kinetic, Kinetic)  # `model_equation` checked
+        assert isinstance(model.kinetic, Kinetic)  # the capabilities say so
         self.model, self.fold = model, fold
         self.config = model.config
         self.field = FieldOf(model.potential)
@@ -300,10 +300,4 @@ class StepOfModel:
 
 def model_equation(L_d: DiscreteLagrangian, fold: bool = True) -> ModelEquation | None:
     """The step equations of L_d by terms, or None where only its partials know them; `fold` as in `ModelEquation`."""
-    if type(L_d) is not ContactLagrangian or L_d.action is not None or not L_d.config.baseline:
-        return None
-    if L_d.coupling is not None or L_d.config.order == 4:
-        return None
-    if type(L_d.kinetic) is not Kinetic or type(L_d.damping) not in (LinearDamping, AffineDamping, type(None)):
-        return None
-    return ModelEquation(L_d, fold)
+    return ModelEquation(L_d, fold) if type(L_d) is ContactLagrangian and L_d.capabilities.by_terms else None

@@ -40,7 +40,7 @@ def explain_step(
     list of str
         E.g. `sample (3,), h = 5: SINGULAR: c = 0: FL⁻ is not defined`.
 
-    Source: erratum E4 and the critical steps of section 4 of `mathematics.md`.
+    Source: erratum E4 and the critical steps of section 4 of `docs/mathematics.md`.
     """
     q, p, s = (x.detach() for x in state)
     sizes = torch.as_tensor(h, dtype=q.dtype, device=q.device)

@@ -58,7 +58,7 @@ class Leapfrog:
     Parameters
     ----------
     model
-        As `has_leapfrog` accepts it.
+        One whose capabilities are `explicit`.
     invert
         Inverse of a batch of matrices, for where `torch.linalg` cannot go.
     field
@@ -71,7 +71,7 @@ class Leapfrog:
         invert: Callable[[Tensor], Tensor] | None = None,
         field: Callable[[Tensor], Field] | None = None,
     ):
-        assert isinstance(model.kinetic, Kinetic)  # `leapfrog` checked
+        assert isinstance(model.kinetic, Kinetic)  # the capabilities say so
         self.model = model
         self.field = FieldOf(model.potential) if field is None else field
         self.mass = model.kinetic.mass()
@@ -151,16 +151,7 @@ class Leapfrog:
 
 def leapfrog(L_d: DiscreteLagrangian) -> Leapfrog | None:
     """The explicit step of L_d, or None where its terms ask for an iteration."""
-    return Leapfrog(L_d) if type(L_d) is ContactLagrangian and has_leapfrog(L_d) else None
-
-
-def has_leapfrog(L_d: DiscreteLagrangian) -> bool:
-    """Whether `leapfrog` knows a step of L_d."""
-    if type(L_d) is not ContactLagrangian or not (L_d.linear_in_q1 and L_d.config.baseline):
-        return False
-    if L_d.coupling is not None:
-        return False
-    return type(L_d.kinetic) is Kinetic and type(L_d.damping) in (LinearDamping, type(None))
+    return Leapfrog(L_d) if type(L_d) is ContactLagrangian and L_d.capabilities.explicit else None
 
 
 def explicit_status(q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, regular: bool) -> Tensor | None:

@@ -9,10 +9,11 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
+from herglotz.models import capabilities
 from herglotz.stepping.engine import Engine, driven_by
 from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.explain import explain_step
-from herglotz.stepping.explicit import has_leapfrog
+from herglotz.stepping.linearise import Linearised, linearise
 from herglotz.stepping.rollout import Advance, Plan, Walk, roll_out
 from herglotz.stepping.state import (
     Crossings,
@@ -110,6 +111,28 @@ class Stepper:
             self._throw(step, state, h, u)
         return step
 
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step with its derivatives d(q, p, s)′ / d(q, p, s), d/dh and d/du, by the implicit-function theorem.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`.
+
+        Returns
+        -------
+        Linearised
+            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, and the step itself.
+
+        Raises
+        ------
+        InputError
+            As `step`.
+        """
+        with torch.no_grad():
+            step = self.step(state, h, u=u)
+        return linearise(self.L_d, state, check_h(h, state.q), u, step)
+
     def step_pair(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h0: Tensor | float, h1: Tensor | float | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
@@ -178,7 +201,8 @@ class Stepper:
             raise InputError("events and checkpoint exclude one another; leave one out")
         watch = Watch(events, start) if events else None
         plan = Plan(h_all.shape[-1], every, chunk, checkpoint)
-        iterates = not (self.explicit and has_leapfrog(self.L_d))
+        of_model = capabilities(self.L_d)
+        iterates = not (self.explicit and of_model is not None and of_model.explicit)
         return roll_out(start, h_all, lambda: self._advance(h_all, inputs, watch), plan, watch, iterates)
 
     def _checked_inputs(self, inputs: Tensor, q: Tensor) -> Tensor:

@@ -4,7 +4,8 @@ With A = JᵀJ of the fit, prior included, the information that the data hold on
 the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Scaled to a
 unit diagonal it has no units, and a small eigenvalue λ is a combination that moves the prediction √(λ_max/λ) times
 less than the best determined one: the condition index of Belsley, Kuh & Welsch (1980), who call 30 harmful. Its
-eigenvector says which parameters are traded.
+eigenvector says which parameters are traded. Where eigenvalues are equal, as those of exact null directions are, any
+basis of their span consists of eigenvectors; the span is then described by sparse vectors (`sparse_basis`).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from herglotz.training.uncertainty import Laplace
 
@@ -20,6 +22,10 @@ PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt
 HARMFUL = 30.0  # condition index from which parameters count as traded
 LARGEST = 1e7  # condition index that rounding leaves of an exact null direction
 PART = 0.05  # least share of a combination that is named
+# Eigenvalues of the scaled information closer than this (of the largest) count as equal: rounding moves them by some
+# 1e-15, which turns eigenvectors across a gap g by 1e-15/g, so that names stay below PART by a margin of 1e4.
+EQUAL = 1e-10
+NEAR_LARGEST = 0.9  # pivots this near the largest are ties, and the first is taken: rounding must not choose
 WORDS = {
     "kinetic.log_diagonal": "the mass",
     "kinetic.off_diagonal": "the coupling of masses",
@@ -86,8 +92,10 @@ def traded(posterior: Laplace, index: float = HARMFUL) -> list[Trade]:
     if not len(rows):
         return found
     size = M.diagonal().sqrt()
-    values, vectors = torch.linalg.eigh(M / size[:, None] / size)
-    for value, vector in zip(values, vectors.T, strict=True):  # ascending
+    M = M / size[:, None] / size
+    values, vectors = torch.linalg.eigh(M)
+    for vector in _within_equal(values, vectors).T:  # values ascend
+        value = vector @ M @ vector
         condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
         if condition < index:
             break
@@ -95,3 +103,28 @@ def traded(posterior: Laplace, index: float = HARMFUL) -> list[Trade]:
         order = [k for k in share.argsort(descending=True).tolist() if share[k] >= PART]
         found.append(Trade(condition, tuple((names[rows[k]], float(share[k])) for k in order)))
     return found
+
+
+def _within_equal(values: Tensor, vectors: Tensor) -> Tensor:
+    """The eigenvectors, those of equal eigenvalues replaced by a sparse basis of their span; values ascend."""
+    last = torch.cat([values.diff() > EQUAL * values[-1], torch.ones(1, dtype=torch.bool)])  # of its group
+    ends = (last.nonzero()[:, 0] + 1).tolist()
+    groups = zip([0, *ends[:-1]], ends, strict=True)
+    return torch.cat([vectors[:, a:b] if b - a == 1 else sparse_basis(vectors[:, a:b]) for a, b in groups], 1)
+
+
+def sparse_basis(span: Tensor) -> Tensor:
+    """A basis of the same span, (m, k), in reduced echelon form, columns of length 1: few entries differ from 0.
+
+    Where the span has a basis of vectors that share no entry, this is that basis.
+    """
+    basis = span.clone()
+    for j in range(basis.shape[1]):
+        size = basis[:, j:].norm(dim=1)
+        row = int((size >= NEAR_LARGEST * size.max()).nonzero()[0])
+        column = j + int(basis[row, j:].abs().argmax())
+        basis[:, [j, column]] = basis[:, [column, j]]
+        basis[:, j] /= basis[row, j].clone()
+        others = torch.arange(basis.shape[1]) != j
+        basis[:, others] -= basis[:, j : j + 1] * basis[row, others]
+    return basis / basis.norm(dim=0)

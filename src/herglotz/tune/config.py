@@ -1,4 +1,4 @@
-"""What a search is asked to do: plain values, stored beside its result."""
+"""Settings of a search, stored beside its result."""
 
 from __future__ import annotations
 
@@ -19,28 +19,28 @@ class TuneConfig:
     Parameters
     ----------
     multiples
-        Steps to try, in steps of the run: whole numbers, and multiples of 1/4 where the reference is the limit.
+        Step sizes to try, in steps of the run: whole numbers, or multiples of 1/4 where the reference is the limit.
     widths
-        Hidden units of the distilled corrections; none: nothing is re-trained.
+        Hidden units of the distilled corrections; an empty tuple re-trains nothing.
     kicks
-        Numbers of kicks of the large steps that solve nothing (`KickStepper`), tried at every step of the run or more
-        where the model has one coordinate and a constant c, in C; none: not tried.
+        Numbers of kicks of explicit large steps (`KickStepper`), tried in C at every whole multiple where the model has
+        one coordinate and a constant c; an empty tuple tries none.
     artefacts
         "eager" (PyTorch), "c" (compiled C, in float64 and float32).
     tolerances
-        Newton tolerances of the eager stepper, relative to the size of the positions; None: its own.
+        Newton tolerances of the eager stepper, relative to the size of the positions; None is its default.
     reference
-        "own": the run's model at its own step; "limit": the same as h → 0.
+        "own": the run's model at the run's step; "limit": that model as h → 0.
     starts
-        Motions that choose; as many others judge the choice.
+        Number of motions that choose a setting; the same number of other motions judges the choice.
     quantile, confidence
-        The bound e of a setting: with this confidence this share of all starts stay within e.
+        The bound of a setting is an error that, with this confidence, this share of all starts keeps.
     seed
-        Of the starts: training, choosing and judging ones are drawn separately.
+        Seed of the starts; training, choosing and judging starts are drawn separately.
     iterations, pairs
-        Of a distillation: iterations at most, and pairs of states.
+        Largest number of iterations, and number of pairs of states, of a distillation.
     rounds
-        Timings of each setting, in turn.
+        Number of timings of each setting; all settings take turns.
     """
 
     multiples: tuple[float, ...] = (1, 2, 4, 8)
@@ -71,9 +71,9 @@ class TuneConfig:
         if not self.multiples:
             raise InputError("multiples is empty; give at least one, such as 1")
         if any(w < 1 for w in self.widths):
-            raise InputError(f"widths must be >= 1, got {self.widths}; leave them all out for no distillation")
+            raise InputError(f"widths must be >= 1, got {self.widths}; give an empty tuple for no distillation")
         if any(k < 1 for k in self.kicks):
-            raise InputError(f"kicks must be >= 1, got {self.kicks}; leave them all out for none")
+            raise InputError(f"kicks must be >= 1, got {self.kicks}; give an empty tuple for none")
         for name in ("quantile", "confidence"):
             if not 0 < getattr(self, name) < 1:
                 raise InputError(f"{name} must be in (0, 1), got {getattr(self, name):g}")
@@ -88,15 +88,15 @@ class TuneConfig:
 
 
 def allowed_failures(count: int, quantile: float, confidence: float) -> int:
-    """How many of `count` starts may exceed a bound that `quantile` of all starts keep, with this confidence.
+    """Return how many of `count` starts may exceed a bound that `quantile` of all starts keep, with this confidence.
 
-    The largest k with P(at most k of `count` exceed | each does with probability 1 − quantile) ≤ 1 − confidence: a
-    tolerance limit, true whatever the distribution of the errors.
+    The result is the largest k with P(at most k of `count` exceed | each exceeds with probability 1 − quantile) ≤
+    1 − confidence. This tolerance limit holds for every distribution of the errors.
 
     Raises
     ------
     InputError
-        If so few starts cannot support the claim.
+        If `count` starts are too few for the claim.
 
     Source: S. S. Wilks, Ann. Math. Stat. 12 (1941) 91.
     """

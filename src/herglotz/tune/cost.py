@@ -1,4 +1,4 @@
-"""What a step costs: wall time of one motion at a time, all settings in turn, so that a slow minute hits them alike.
+"""Wall time of a step, one motion at a time; all settings take turns, so that a slow minute hits them alike.
 
 Only steps inside the horizon are timed: a damped motion comes to rest, and a step at rest costs next to nothing.
 """
@@ -15,10 +15,11 @@ import torch
 
 from herglotz.export import CompiledStepper
 from herglotz.stepping import State
-from herglotz.tune.kicks_c import CompiledKicks
+from herglotz.tune.kick_composition_c import CompiledKicks
 
-EAGER_STEPS, EAGER_STARTS = 48, 2  # each enough to make the call around them small
-C_STARTS, C_STEPS = 16, 4096  # motions, and steps of them all in one timing, at least
+# One timing takes enough steps that the call around them is small beside them.
+EAGER_STEPS, EAGER_STARTS = 48, 2  # steps of each motion, and motions
+C_STARTS, C_STEPS = 16, 4096  # motions, and least number of steps of all motions together
 
 
 @dataclass(frozen=True)
@@ -31,7 +32,7 @@ class Cost:
 
 @dataclass(frozen=True)
 class Timed:
-    """Something to time: `steps` steps, and the same calls without a step, where those cost anything."""
+    """A call that takes `steps` steps, and, where its overhead counts, the same call without a step."""
 
     run: Callable[[], None]
     steps: int
@@ -39,7 +40,7 @@ class Timed:
 
 
 def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
-    """Time each, `rounds` times, in turn; one untimed round first. What the idle calls take at best is left out."""
+    """Time every entry `rounds` times, in turn, after one untimed round; the least idle time is subtracted."""
     times = torch.zeros(2, len(timed), rounds, dtype=torch.float64)
     for k in range(-1, rounds):
         for i, one in enumerate(timed):
@@ -47,13 +48,13 @@ def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
             times[1, i, max(k, 0)] = 0.0 if one.idle is None else _seconds(one.idle)
     steps = torch.tensor([one.steps for one in timed], dtype=torch.float64)
     best, middle = times[0].amin(1), times[0].median(1).values
-    idle = torch.minimum(times[1].amin(1), best / 2)  # on a busy machine an idle call may seem the longer one
+    idle = torch.minimum(times[1].amin(1), best / 2)  # on a busy machine an idle call may take longer than the run
     costs = 1e6 * torch.stack([best - idle, middle - best]) / steps
     return [Cost(float(a), float(b)) for a, b in costs.T]
 
 
 def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
-    """Rollouts of `steps` steps, one start after the other, without what surrounds them where that is possible."""
+    """Return rollouts of `steps` steps, one start after the other; for C the overhead of the call is timed too."""
     if isinstance(stepper, CompiledStepper):
         count = min(C_STARTS, len(starts.s))
         repeats = max(1, C_STEPS // (count * steps))
@@ -90,7 +91,7 @@ def _repeated(call: Callable[[], None], times: int) -> Callable[[], None]:
 def _native(
     stepper: CompiledStepper, starts: State, count: int, h: float, steps: int, repeats: int
 ) -> Callable[[], None]:
-    """Calls of the loop in C with arguments made beforehand: the checks in Python would take longer than the steps."""
+    """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
     n, dtype = stepper.dof, stepper.dtype
     h_all = torch.full((max(steps, 1),), h, dtype=dtype)
     outputs = [torch.empty(size, dtype=dtype) for size in ((steps + 1, n), (steps + 1, n), steps + 1, steps + 1)]

@@ -1,12 +1,13 @@
 """Re-train a model's big-step correction at another step, on motions of the accurate model.
 
-A motion known at every small step is an exact flow map at every multiple H of it. One discrete Lagrangian generates
-that map, in the same coordinates (q, p, s), so each pair of states (q0, p0, s0) → (q1, p1, s1) gives three residuals,
+A motion known at every small step gives an exact flow map at every multiple H of that step. One discrete Lagrangian
+generates the map in the same coordinates (q, p, s), so each pair of states (q0, p0, s0) → (q1, p1, s1) gives three
+residuals,
 
     J⁻¹(D1 L_d + c p0),    J⁻¹(D2 L_d − p1),    (s0 + L_d − s1)/P,
 
-lengths all, with J = ∂(D1 L_d + c p0)/∂q1 and P a typical momentum. Nothing is latent and nothing is noisy, so
-Levenberg–Marquardt converges; and states of the run stay states of the distilled model.
+all in units of q, with J = ∂(D1 L_d + c p0)/∂q1 and P a typical momentum. No state is latent or noisy, so
+Levenberg–Marquardt converges. States of the run are states of the distilled model too.
 """
 
 from __future__ import annotations
@@ -34,11 +35,11 @@ class FlowProblem:
     Parameters
     ----------
     model
-        Its current parameters are not changed.
+        The model to re-train; its parameters are read, not changed.
     before, after
-        (T, n), (T, n), (T,) each.
+        T pairs of states, (T, n), (T, n), (T,) each.
     h
-        The time H between them.
+        The time H between the states of a pair.
     """
 
     def __init__(self, model: ContactLagrangian, before: State, after: State, h: float, chunk: int = 1024):
@@ -50,20 +51,20 @@ class FlowProblem:
         self.prior = Prior(model, low, high, departure=None)
 
     def start(self) -> Tensor:
-        """The parameters (P,)."""
+        """Return the parameters, (P,)."""
         return self.flat.get()
 
     def residuals(self, theta: Tensor) -> Tensor:
-        """(T, 2n + 1), in units of q."""
+        """Return the residuals, (T, 2n + 1), in units of q."""
         with torch.no_grad():
             return self._local(theta, *self.before, *self.after)
 
     def cost(self, x: Tensor) -> Tensor:
-        """½ Σ |r|²/σ² + prior."""
+        """Return ½ Σ |r|²/σ² + prior."""
         return self.residuals(x).square().sum() / (2 * self.sigma**2) + self.prior.cost(x)
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
+        """Return (cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
         cost, A, b = self.prior.normal_equations(x)
         slopes = vmap(jacrev(self._local), (None, *(0,) * 6))
         for part in torch.arange(len(self.before.s)).split(self.chunk):
@@ -82,7 +83,7 @@ class FlowProblem:
 
 
 def widened(model: ContactLagrangian, width: int, depth: int = 2) -> ContactLagrangian:
-    """The same model with a correction of this size: its own where it has that size already, else a new one, zero."""
+    """Return the model with a correction of this size: its own if the size is the same, else a new one that is zero."""
     config = replace(model.config, correction_width=width, correction_depth=depth)
     new = ContactLagrangian(config)
     same = config == model.config
@@ -92,7 +93,7 @@ def widened(model: ContactLagrangian, width: int, depth: int = 2) -> ContactLagr
 
 
 def pairs_of(states: State, stride: int, count: int, seed: int) -> tuple[State, State]:
-    """At most `count` random pairs (state, state `stride` later) of motions (B, K+1, …)."""
+    """Return at most `count` random pairs (state, state `stride` later) of motions (B, K+1, …)."""
     size = states.s.shape[1] - stride
     flat = [(x[:, :size].flatten(0, 1), x[:, stride:].flatten(0, 1)) for x in states]
     rows = torch.randperm(len(flat[2][0]), generator=torch.Generator().manual_seed(seed))[:count]
@@ -108,7 +109,7 @@ def distil(
     iterations: int = 80,
     callback: Callback | None = None,
 ) -> tuple[ContactLagrangian, float]:
-    """Fit every parameter of a model to a flow map over h; the model given is only the start.
+    """Fit every parameter of a model to a flow map over h; the given model is the starting point.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Was a rollout resolved? Each step against two of half its length: what no status can know."""
+"""Local errors of a rollout: each step is compared with two steps of half its length. A status cannot know them."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from herglotz.stepping.state import check_h, step_sizes
 
 
 class Steps(Protocol):
-    """Anything that steps over any h, such as `Stepper`, `Composition` or `ContactSplitting`."""
+    """A stepper that takes any h, such as `Stepper`, `Composition` or `ContactSplitting`."""
 
     def step(self, state: State, h: Any, /) -> Step:
         """One step."""
@@ -22,21 +22,21 @@ class Steps(Protocol):
 
 
 def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
-    """|q after a step − q after two half steps|, the largest coordinate, relative to the step's move; (..., K).
+    """Return |q after a step − q after two half steps|, the largest coordinate, over the step's move; (..., K).
 
-    Values near 1 and above mean that h does not see the motion, however well every step equation was solved: a step
-    over the pericentre of a thin ellipse is as regular as any other. Of a method of order p it estimates the error of
-    the step times 1 − 2^{−p}. Costs two steps for one. A model with a learned correction is right at its own step
-    only, and this number says nothing about it.
+    Values near 1 and above mean that h does not resolve the motion, even where every step equation was solved: a step
+    over the pericentre of a thin ellipse is as regular as any other. For a method of order p the value estimates the
+    error of the step times 1 − 2^{−p}. The estimate takes two steps for each one. It says nothing about a model with a
+    learned correction, which is right at its own step only.
 
     Parameters
     ----------
     stepper
-        What made the rollout, without inputs.
+        The stepper that made the rollout, without inputs.
     out
-        Its result, every step kept.
+        The rollout, with every step kept.
     h
-        Its step: a scalar, (K,) or (..., K).
+        Step of the rollout: a scalar, (K,) or (..., K).
 
     Raises
     ------
@@ -61,7 +61,7 @@ def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
 
 
 def flag_unresolved(stepper: Steps, out: Rollout, h: Tensor | float, bound: float = 0.1) -> Rollout:
-    """The same rollout with `Status.UNRESOLVED` at every converged step whose `local_errors` exceed a bound.
+    """Return the rollout with `Status.UNRESOLVED` at every converged step whose `local_errors` exceed a bound.
 
     The states stay as they are; `Rollout.ok` is then False for a motion that is finite and wrong, such as one that
     crosses the pericentre of a thin ellipse in a single step. A half step that fails is unresolved too.

@@ -1,4 +1,4 @@
-"""What a setting is measured against: motions of the run's own model, from starts inside its box."""
+"""Reference motions of a search: rollouts of the run's own model from starts inside its box."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from herglotz.stepping import State, Stepper
 from herglotz.training import Run
 
 REFERENCES = ("own", "limit")
-FINEST = 4  # the limit is recorded this often in one step of the run
-INNER = 8  # and made with this many steps in between, and with twice as many
-JITTER = 0.05  # of the box: starts lie near recorded states, not on them
+FINEST = 4  # states that the reference "limit" records in one step of the run
+INNER = 8  # steps between two such states; twice as many give the Richardson estimate
+JITTER = 0.05  # share of the box by which a start is moved away from a recorded state
 
 
 @dataclass(frozen=True)
@@ -24,21 +24,23 @@ class Motions:
 
     base: float
     states: State  # (B, K+1, n), (B, K+1, n), (B, K+1)
-    error: float  # largest error of the reference itself in q, estimated; 0 where the run's own step defines it
+    error: (
+        float  # estimated largest error of the reference in q; 0 for the reference "own", which is exact by definition
+    )
 
     def every(self, stride: int) -> State:
-        """The states `stride` bases apart."""
+        """Return the states `stride` bases apart."""
         return State(*(x[:, ::stride] for x in self.states))
 
     def starts(self) -> State:
-        """The states at time 0, (B, n), (B, n), (B,)."""
+        """Return the states at time 0, (B, n), (B, n), (B,)."""
         return State(*(x[:, 0] for x in self.states))
 
 
 def draw_starts(run: Run, count: int, seed: int) -> State:
-    """States near recorded ones: a random sample of the run, moved by up to 5 % of the box, kept inside it.
+    """Draw states near recorded ones: a random sample of the run, moved by up to 5 % of the box, inside the box.
 
-    A uniform draw would fill the box's corners too, where the data never were and the model answers for nothing.
+    A uniform draw would fill the corners of the box too, where no data hold the model.
     """
     generator = torch.Generator().manual_seed(seed)
     trained = [
@@ -60,14 +62,14 @@ def draw_starts(run: Run, count: int, seed: int) -> State:
 
 
 def record(run: Run, starts: State, horizon: float, reference: str) -> Motions:
-    """Motions over `horizon` from these starts; those that fail are left out.
+    """Return motions over `horizon` from these starts; motions that fail are left out.
 
     Parameters
     ----------
     reference
-        "own": the run's model at the run's own step, whose error against the data the run has measured. "limit": the
-        same model as h → 0, by Richardson extrapolation; for models without a learned correction, which is right at
-        its own step only.
+        "own": the run's model at the run's own step; the run has measured the error of this flow against the data.
+        "limit": the model as h → 0, by Richardson extrapolation; refused for a model with a learned correction, which
+        is right at its own step only.
 
     Raises
     ------
@@ -96,7 +98,7 @@ def record(run: Run, starts: State, horizon: float, reference: str) -> Motions:
 
 
 def frozen_double(run: Run) -> ContactLagrangian:
-    """A copy of the run's model in float64, without gradients."""
+    """Return a copy of the run's model in float64, without gradients."""
     return deepcopy(run.model).cpu().double().requires_grad_(False)
 
 

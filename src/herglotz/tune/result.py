@@ -1,4 +1,4 @@
-"""What `tune` found: every setting with its error and cost, the front, and the choice as a run."""
+"""The result of `tune`: every setting with its error and cost, the front, and the choice as a run."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from herglotz.stepping import State
 from herglotz.training import Run
 from herglotz.tune.config import TuneConfig
 from herglotz.tune.cost import Cost
-from herglotz.tune.kicks import KickStepper
+from herglotz.tune.kick_composition import KickStepper
 
 
 @dataclass(frozen=True)
 class Setting:
-    """One way to step: which model, at which step, in which form."""
+    """One way to step: a model, a step size and a form."""
 
     multiple: float  # of the run's step
     h: float
@@ -28,11 +28,11 @@ class Setting:
     artefact: str
     dtype: str
     tol: float | None  # of the eager Newton iteration
-    kicks: int | None = None  # of a step that solves nothing, in place of a model
+    kicks: int | None = None  # number of kicks, where a `KickStepper` replaces the model
 
     @property
     def name(self) -> str:
-        """For tables."""
+        """Return the name for tables."""
         if self.kicks is not None:
             return f"h {self.h:.4g}, {self.kicks} kicks, C {self.dtype}"
         net = "own model" if self.width is None else f"distilled {self.width}"
@@ -42,24 +42,24 @@ class Setting:
 
 @dataclass(frozen=True)
 class Candidate:
-    """A setting, measured."""
+    """A setting with its measured error and cost."""
 
     setting: Setting
     median: float  # error of the median start: largest |q − reference| over the horizon, in units of q
-    bound: float  # what the asked share of all starts keeps
+    bound: float  # error that the demanded share of all starts keeps
     worst: float
     cost: Cost
     model: ContactLagrangian = field(repr=False)
-    kicks: KickStepper | None = field(default=None, repr=False)  # what steps in place of the model
+    kicks: KickStepper | None = field(default=None, repr=False)  # steps in place of the model
 
     @property
     def us(self) -> float:
-        """Microseconds for one unit of simulated time."""
+        """Return microseconds for one unit of simulated time."""
         return self.cost.step_us / self.setting.h
 
     @property
     def spread(self) -> float:
-        """Of `us`: the median round above the best."""
+        """Return how far the median round lies above the best, in the unit of `us`."""
         return self.cost.spread_us / self.setting.h
 
     def to_dict(self) -> dict[str, Any]:
@@ -77,7 +77,7 @@ class Candidate:
 
 
 def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """Those that no other beats in both error bound and cost, cheapest first."""
+    """Return the candidates that no other beats in both error bound and cost, cheapest first."""
     front: list[Candidate] = []
     for c in sorted(candidates, key=lambda c: (c.us, c.bound)):
         if c.bound < float("inf") and (not front or c.bound < front[-1].bound):
@@ -87,7 +87,7 @@ def pareto(candidates: Sequence[Candidate]) -> list[Candidate]:
 
 @dataclass(frozen=True)
 class Tuning:
-    """All settings tried, the one chosen, and how it did on starts that had no part in the choice."""
+    """All settings tried, the chosen one, and its errors on starts that had no part in the choice."""
 
     run: Run
     config: TuneConfig
@@ -98,33 +98,33 @@ class Tuning:
     held_out: dict[str, Any]
     reference_error: float  # of the reference itself
     motions: State  # the reference's training motions at the chosen step, (B, K+1, …)
-    notes: list[str]  # what could not be tried, and why
+    notes: list[str]  # settings that could not be tried, with the reason
 
     @property
     def front(self) -> list[Candidate]:
-        """The Pareto front, cheapest first."""
+        """Return the Pareto front, cheapest first."""
         return pareto(self.candidates)
 
     @property
     def own(self) -> Candidate:
-        """The run as it is: its own model at its own step, eager."""
+        """Return the run as it is: its own model at its own step, eager."""
         return self.candidates[0]
 
     @property
     def own_in_c(self) -> Candidate | None:
-        """The run's own model at its own step in C, the faster of the two precisions; None without C."""
+        """Return the run's own model at its own step in C, in the faster precision; None without C."""
         found = [c for c in self.candidates if c.setting.artefact == "c" and c.model is self.own.model]
         found = [c for c in found if c.setting.multiple == 1]
         return min(found, key=lambda c: c.us, default=None)
 
     @property
     def model_error(self) -> dict[str, float | None]:
-        """Errors of the run against its data, RMS in units of q: what the errors of stepping come on top of."""
+        """Return the RMS errors of the run against its data, in units of q; errors of stepping add to them."""
         names = ("extrapolation_rms", "train_rms", "one_step_rms")
         return {name: self.run.metrics.get(name) for name in names}
 
     def tuned_run(self) -> Run:
-        """The chosen model as a run with its own step, on motions of the reference: `save_run` it, then export it.
+        """Return the chosen model as a run with its own step, on motions of the reference, for `save_run` and export.
 
         States (q, p, s) of the old run are states of this one. Where kicks were chosen, which are no model, it is the
         old run's model at its own step: `export_kicks_c(tuning.chosen.kicks, …)` writes the kicks.

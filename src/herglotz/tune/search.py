@@ -19,13 +19,13 @@ from herglotz.training import Run
 from herglotz.tune.config import TuneConfig, allowed_failures
 from herglotz.tune.cost import Cost, measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
-from herglotz.tune.kicks import KickStepper, can_kick, fit_kicks
-from herglotz.tune.kicks_c import CompiledKicks
+from herglotz.tune.kick_composition import KickStepper, can_kick, fit_kicks
+from herglotz.tune.kick_composition_c import CompiledKicks
 from herglotz.tune.reference import Motions, draw_starts, frozen_double, record
 from herglotz.tune.result import Candidate, Setting, Tuning
 
-HOPELESS = 10.0  # a distilled model this many times over the limit: no larger step is tried at its width
-LONGEST = 200  # steps of the run in a horizon that nobody gave
+HOPELESS = 10.0  # where a distilled model exceeds the limit this many times, no larger step is tried at its width
+LONGEST = 200  # steps of the run in the default horizon, at most
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class _Tried:
     setting: Setting
     model: ContactLagrangian
     stepper: Any
-    errors: Tensor  # (B,) of the choosing starts
+    errors: Tensor  # (B,) on the choosing starts
     kicks: KickStepper | None = None
 
 
@@ -48,18 +48,18 @@ def tune(
 ) -> Tuning:
     """Search step, correction, precision and form of a run's stepper.
 
-    The error of a setting is that of its *stepping*: the largest |q − q_ref| over the horizon, for each start. The
-    reference is the run's own model (`TuneConfig.reference`); its error against the data, which comes on top, is in
-    `Tuning.model_error`. Costs are wall time, one motion at a time.
+    The error of a setting is the error of its *stepping*: the largest |q − q_ref| over the horizon, for each start. The
+    reference is the run's own model (`TuneConfig.reference`). `Tuning.model_error` has the error of that model against
+    the data, which adds to the error of stepping. Costs are wall time, one motion at a time.
 
     Parameters
     ----------
     run
-        Not changed.
+        The run to tune; it is not changed.
     max_error
-        Take the cheapest setting whose bound is no larger, in units of q.
+        Take the cheapest setting whose bound is at most this, in units of q.
     budget_us
-        Take the most accurate setting that costs no more microseconds per unit of simulated time.
+        Take the most accurate setting that costs at most this, in microseconds per unit of simulated time.
     horizon
         Length of the motions, in the data's unit of time; default: a typical trajectory, at most 200 steps.
     progress
@@ -75,7 +75,7 @@ def tune(
     if run.model.inputs:
         raise InputError("tune cannot steer a model with inputs: the reference motions would need them")
     horizon = _horizon(run, config, horizon)
-    # Three sets of starts that have nothing in common: to train on, to choose by, to judge with.
+    # Three disjoint sets of starts: the first trains, the second chooses, the third judges.
     training, choosing, judging = (
         record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon, config.reference) for k in range(3)
     )
@@ -103,7 +103,7 @@ def tune(
 def _demand(max_error: float | None, budget_us: float | None) -> dict[str, float]:
     asked = {k: v for k, v in (("max_error", max_error), ("budget_us", budget_us)) if v is not None}
     if len(asked) != 1:
-        raise InputError("say what you need: either --max-error or --budget-us")
+        raise InputError("give either --max-error or --budget-us")
     ((name, value),) = asked.items()
     if not (value > 0 and math.isfinite(value)):
         raise InputError(f"{name} must be a finite number > 0, got {value:g}")
@@ -111,7 +111,7 @@ def _demand(max_error: float | None, budget_us: float | None) -> dict[str, float
 
 
 def _horizon(run: Run, config: TuneConfig, horizon: float | None) -> float:
-    """The horizon asked for, or that of a typical trajectory; room for two of the largest steps."""
+    """Return the demanded horizon, or that of a typical trajectory; either holds two of the largest steps."""
     if horizon is None:
         length = float(torch.tensor(run.data.lengths).double().median()) - 1
         horizon = run.h * max(min(length, LONGEST), 2 * max(config.multiples))
@@ -130,9 +130,9 @@ def _models(
     notes: list[str],
     bar: tqdm,
 ) -> Iterator[tuple[tuple[float, int | None], ContactLagrangian]]:
-    """((multiple, width), model) of everything to try: the run's own at every step, then the distilled ones."""
+    """Yield ((multiple, width), model) to try: the run's own model at every step, then the distilled models."""
     own = frozen_double(run)
-    yield (1, None), own  # the run as it is comes first
+    yield (1, None), own  # `Tuning.own` relies on the run as it is being the first
     multiples = sorted(config.multiples)
     for m in multiples:
         if m != 1:
@@ -141,7 +141,7 @@ def _models(
         for m in multiples:
             start = widened(own, width, max(run.model.config.correction_depth, 2))
             if m < 1 or (m == 1 and config.reference == "own" and _size(start) >= _size(own)):
-                continue  # nothing to gain: the run's own model is exact there, and no larger
+                continue  # the run's own model is exact at this step and no larger
             h = m * run.h
             bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
             before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
@@ -166,7 +166,7 @@ def _forms(
     choosing: Motions,
     notes: list[str],
 ) -> Iterator[_Tried]:
-    """A model in every form asked for, with its errors; the first is always the eager one in float64."""
+    """Yield a model in every demanded form, with its errors; the first form is always eager float64."""
 
     def tried(stepper: Any, artefact: str, dtype: str, tol: float | None = None) -> _Tried:
         setting = Setting(key[0], h, key[1], artefact, dtype, tol)
@@ -174,7 +174,7 @@ def _forms(
 
     own = key == (1, None)
     if own or "eager" in config.artefacts:
-        solved = model.linear_in_q1  # nothing iterates
+        solved = model.linear_in_q1  # then a tolerance changes nothing
         for tol in dict.fromkeys((None, *(() if solved else config.tolerances))):
             yield tried(Stepper(model, tol=tol), "eager", "float64", tol)
     if "c" in config.artefacts:
@@ -188,7 +188,7 @@ def _forms(
 def _kicks(
     run: Run, config: TuneConfig, training: Motions, choosing: Motions, notes: list[str], bar: tqdm
 ) -> Iterator[_Tried]:
-    """Steps of a few kicks and drifts, fitted to the reference's motions, in C."""
+    """Yield steps of a few kicks and drifts in C, fitted to motions of the reference."""
     own = frozen_double(run)
     if not config.kicks or "c" not in config.artefacts or not can_kick(own):
         return
@@ -209,7 +209,7 @@ def _kicks(
 
 
 def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
-    """Largest |q − reference| of each motion, (B,), in float64; infinite where a step fails."""
+    """Return the largest |q − reference| of each motion, (B,), in float64; infinite where a step fails."""
     reference = motions.every(round(h / motions.base))
     dtype = getattr(stepper, "dtype", torch.float64)
     with torch.no_grad():
@@ -220,7 +220,7 @@ def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
 
 
 def bound_of(errors: Tensor, config: TuneConfig) -> float:
-    """The error that `quantile` of all starts keep, with `confidence`: an order statistic of these."""
+    """Return the error that `quantile` of all starts keep, with `confidence`: an order statistic of `errors`."""
     allowed = allowed_failures(len(errors), config.quantile, config.confidence)
     return float(errors.sort(descending=True).values[allowed])
 
@@ -240,12 +240,12 @@ def _candidate(t: _Tried, cost: Cost, config: TuneConfig) -> Candidate:
 
 
 def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:
-    """The cheapest candidate within max_error, or the most accurate one within budget_us.
+    """Return the cheapest candidate within max_error, or the most accurate one within budget_us.
 
     Raises
     ------
     InputError
-        If there is none; the message says what can be had.
+        If there is none; the message names the nearest demand that can be met.
     """
     if "max_error" in asked:
         good = [c for c in candidates if c.bound <= asked["max_error"]]
@@ -267,7 +267,7 @@ def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:
 
 
 def _held_out(errors: Tensor, limit: float, config: TuneConfig) -> dict[str, Any]:
-    """How the choice does on starts that had no part in it: `limit` is what it promised."""
+    """Return the errors of the choice on starts that had no part in it; `limit` is its promised bound."""
     return {
         "starts": len(errors),
         "limit": limit,
@@ -275,4 +275,4 @@ def _held_out(errors: Tensor, limit: float, config: TuneConfig) -> dict[str, Any
         "median": float(errors.median()),
         "quantile": float(errors.quantile(config.quantile, interpolation="higher")),
         "worst": float(errors.max()),
-    }  # infinite where a step failed
+    }  # an error is infinite where a step failed

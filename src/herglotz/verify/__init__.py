@@ -1,4 +1,4 @@
-"""Is it a contact integrator, and does it predict? Every claim measured on a scene, a fit, a file or any L_d."""
+"""Checks that a scene, a fit, a file or any L_d is a contact integrator, and that a fit predicts its data."""
 
 from herglotz.verify.report import Check, Report
 from herglotz.verify.verifier import verify

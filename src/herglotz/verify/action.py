@@ -1,7 +1,7 @@
 """Checks of the generating functions S^k and of the discrete Hamilton–Jacobi equation.
 
-S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 is taken through the flow; its derivatives through the endpoint map; H⁺ through L_d and H⁻
-through L⁻. None of the identities that are checked enters the computation of the other side.
+S^k(q̂0, q_k, ŝ0) = s_k − ŝ0 comes from the flow, its derivatives from the endpoint map, H⁺ from L_d and H⁻ from L⁻. No
+identity is used to compute the side that it is compared with.
 """
 
 from __future__ import annotations
@@ -12,28 +12,26 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
+from herglotz.mechanics import flow_derivative, mixed_hessian, partials
+from herglotz.mechanics.regularity import left_hessian, scaled_margin
+from herglotz.stepping import State
+from herglotz.theory import (
     GeneratingFunction,
-    flow_derivative,
     generating_function,
     hamilton_jacobi_residual,
     left_hamilton_jacobi_residual,
     left_hamiltonian,
-    mixed_hessian,
-    partials,
     right_hamiltonian,
     right_hamiltonian_on_flow,
 )
-from herglotz.mechanics.regularity import left_hessian, scaled_margin
-from herglotz.stepping import State
 from herglotz.verify.report import Check
+from herglotz.verify.sampled_rollout import worst
 from herglotz.verify.subject import Subject
-from herglotz.verify.walk import worst
 
-FAN = 4  # momenta p̂0 from each start (q̂0, ŝ0): together they cover an open set of q_k, which E7 asks for
-OPENING = 0.1  # of the fan, in standard deviations of p̂0
-CAUSTIC = 1e-2  # spread of a fan over k times that of one step, below which S^k is not defined well enough
-FOLD = 1e-3  # D2D2 L_d over its own typical size, below which H⁺ is not (erratum E4: steps do not need it)
+FAN = 4  # momenta p̂0 from each start (q̂0, ŝ0): together they cover an open set of q_k, which erratum E7 asks for
+OPENING = 0.1  # standard deviation of p̂0 within a fan, in standard deviations of p̂0 over all starts
+CAUSTIC = 1e-2  # S^k is not used where the spread of a fan is below this share of k times the spread after one step
+FOLD = 1e-3  # H⁺ is not used where D2D2 L_d is below this share of its typical size (steps do not need H⁺: E4)
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class Fan:
     failed: int = 0  # solutions dropped because a step failed or has no finite derivative
 
     def left_out(self) -> str:
-        """How many solutions the checks do not count."""
+        """Say how many solutions the checks leave out."""
         failed = self.failed * len(self.keep)
         lost = sum(int((~keep).sum()) for keep in self.keep.values()) + failed
         total = sum(keep.numel() for keep in self.keep.values()) + failed
@@ -79,7 +77,7 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
 
 
 def derivatives(f: Fan, bound: float) -> list[Check]:
-    """D2S^k = p_k, D1S^k = −σ_k p̂0 and 1 + D3S^k = σ_k, relative to the largest momentum and to σ_k."""
+    """Check D2S^k = p_k, D1S^k = −σ_k p̂0 and 1 + D3S^k = σ_k, relative to the largest momentum and to σ_k."""
     size = max([worst(f.start.p.abs())] + [worst(g.p[f.keep[k]].abs()) for k, g in f.S.items() if f.keep[k].any()])
 
     def largest(error: Callable[[int, GeneratingFunction], Tensor]) -> float:
@@ -97,10 +95,10 @@ def derivatives(f: Fan, bound: float) -> list[Check]:
 
 
 def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
-    """S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
+    """Check S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
 
     H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is
-    known it is p1·q1 − (s1 − s0) along the step.
+    known, H⁺ is p1·q1 − (s1 − s0) along the step.
     """
     residuals, sizes, folds = [], [], 0
     for k in [k for k in f.S if k + 1 in f.S]:
@@ -129,7 +127,7 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
 
 
 def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
-    """S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k·q_k + H⁻(dS^k, q_{k+1}, s_{k+1}) = 0 (erratum E6), relative to its terms.
+    """Check S^{k+1}(q_{k+1}) − S^k(q_k) + dS^k·q_k + H⁻(dS^k, q_{k+1}, s_{k+1}) = 0 (erratum E6), over its terms.
 
     H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
     """
@@ -142,7 +140,7 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
             regular = _left_single_valued(subject, before, after)
             folds += int((keep & ~regular).sum())
             b, a = (_selected(g, keep & regular) for g in (before, after))
-            guess = b.q - 1e-3 * (a.q - b.q)  # off by a little, so that the equation is really solved
+            guess = b.q - 1e-3 * (a.q - b.q)  # slightly wrong, so that the solver has to work
             H = left_hamiltonian(subject.L_d, b.D2, a.q, a.s, subject.h, guess)
             residuals.append(left_hamilton_jacobi_residual(a.S, b.S, b.D2, b.q, H).abs())
             sizes.append(a.S.abs() + b.S.abs() + (b.D2 * b.q).abs().sum(-1) + H.abs())
@@ -161,16 +159,16 @@ def _selected(g: GeneratingFunction, keep: Tensor) -> GeneratingFunction:
 
 
 def _right_hamiltonian(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """H⁺(q_k, dS^{k+1}, s_k)."""
+    """Return H⁺(q_k, dS^{k+1}, s_k)."""
     if subject.L_d is None:
         return right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
-    # The guess picks the branch of H⁺ and is off by a little, so that the equation is really solved.
+    # The guess picks the branch of H⁺. It is slightly wrong, so that the solver has to work.
     guess = after.q + 1e-3 * (after.q - before.q)
     return right_hamiltonian(subject.L_d, before.q, after.D2, before.s, subject.h, guess)
 
 
 def _single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """Whether det D2D2 L_d is away from 0, so that H⁺ exists there."""
+    """Return whether det D2D2 L_d is away from 0, so that H⁺ exists."""
     assert subject.L_d is not None
     P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
     finite = torch.isfinite(P.D22).all(-1).all(-1)
@@ -181,7 +179,7 @@ def _single_valued(subject: Subject, before: GeneratingFunction, after: Generati
 
 
 def _left_single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """Whether det D1D1 L⁻ is away from 0, so that H⁻ exists there."""
+    """Return whether det D1D1 L⁻ is away from 0, so that H⁻ exists."""
     assert subject.L_d is not None
     P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
     M = mixed_hessian(P)
@@ -189,12 +187,12 @@ def _left_single_valued(subject: Subject, before: GeneratingFunction, after: Gen
 
 
 def _usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
-    """Away from a caustic: the fan has opened, compared with k free steps."""
+    """Return whether S^k is away from a caustic: the fan has opened, compared with k free steps."""
     return (g.spread > CAUSTIC * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)
 
 
 def _accumulated(subject: Subject, start: State, steps: int) -> dict[int, Tensor]:
-    """σ_k for k = 1 … K, from the factors that the stepper reports."""
+    """Return σ_k for k = 1 … K, from the factors c that the stepper reports."""
     sigma, state, product = {}, start, torch.ones_like(start.s)
     with torch.no_grad():
         for k in range(1, steps + 1):

@@ -1,4 +1,4 @@
-"""Does a fitted model predict the motion it was fitted to? The identities cannot tell: any regular L_d has them all."""
+"""Checks that a fitted model predicts its data. The identities cannot tell: every regular L_d satisfies them."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from herglotz.training.grid import segment_grid
 from herglotz.training.inputs import step_inputs
 from herglotz.verify.report import Check
 
-# Half the null model's error: far above what a fitted model leaves (1e-2 and less on clean data), far below the ratio
-# of about 1 and more that a model with nothing in it, or a collapsed one, has.
+# Bound of the one-step error over that of uniform motion, the null model. A fitted model reaches 1e-2 and less on clean
+# data; an empty or a collapsed model has about 1 and more.
 ONE_STEP = 0.5
-# A free run over 20 recorded steps from a fitted state; noise and a good model stay far below a tenth of the spread.
+# Bound of free runs over 20 recorded steps, over the spread; noise and a good model stay far below a tenth.
 FOLLOW = 0.1
 WINDOW = 20
-# Predicting the mean of the extrapolated samples would give exactly 1.
+# Bound of the free run beyond training, over the spread: the mean of the unseen samples would give exactly 1.
 FREE_RUN = 1.0
-DECIDABLE = 2.0  # the null model's squared error must be this many times the noise's
+DECIDABLE = 2.0  # one step is judged where the null model's squared error exceeds this multiple of the noise's
 
 
 def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
-    """The checks that need recorded motion, and the numbers behind them.
+    """Return the checks that need recorded motion, and the numbers behind them.
 
-    One step: RMS of J⁻¹R over the recorded triples, each coordinate in units of its own spread, against that of uniform
-    motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both alike, so before a model fails its share,
-    estimated from the data alone, is taken off both; where the null model's error *is* noise, one step decides nothing
-    and the check is left out.
+    One step: the RMS of J⁻¹R over the recorded triples, each coordinate in units of its own spread, over that of
+    uniform motion q2 = q1 + (h1/h0)(q1 − q0), the null model. Noise enters both. Before a model fails, the share of the
+    noise, estimated from the data alone, is subtracted from both; the check is left out where the null model's error is
+    mostly noise.
 
-    Follow: RMS of free runs over windows of 20 recorded steps from the run's states, relative to the spread; a step
-    that fails counts as infinitely wrong. A model that collapsed has small residuals and cannot do this.
+    Follow: the RMS of free runs over windows of 20 recorded steps from the run's states, over the spread; a step that
+    fails counts as infinite. A collapsed model has small residuals and fails here.
 
-    Samples that the fit takes for gross errors are no part of either.
+    Free run: the RMS of prediction − data over the samples beyond the training part, over their spread; left out where
+    the fit held nothing out.
 
-    Free run: RMS of prediction − data over the samples beyond the training part, relative to their spread; left out
-    where the fit held nothing out.
+    No check counts samples that the fit takes for gross errors.
     """
     run = _without_spikes(run)
     q = run.data.unwrapped().q
@@ -54,7 +54,7 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     checks, extra = [], ""
     if null**2 > DECIDABLE * floor**2:
         ratio = model / null if math.isfinite(model) else math.inf
-        if ratio > ONE_STEP:  # perhaps only noise keeps it there
+        if ratio > ONE_STEP:  # perhaps because of noise alone
             ratio = math.sqrt(max(model**2 - floor**2, 0.0) / (null**2 - floor**2))
         note = f"RMS {model:.3g}, uniform motion {null:.3g}, noise {floor:.3g}, in units of the data's spread"
         checks.append(Check.at_most("one_step", "predicts a step: |J⁻¹R| over uniform motion", ratio, ONE_STEP, note))
@@ -71,7 +71,7 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
 
 
 def _without_spikes(run: Run) -> Run:
-    """The run without the samples that are gross errors."""
+    """Return the run without the samples that are gross errors."""
     bad = spikes(run.data.unwrapped())
     if run.config.robust == "off" or not bool(bad.any()):
         return run
@@ -84,7 +84,7 @@ def _without_spikes(run: Run) -> Run:
 
 
 def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
-    """RMS over spread of free runs that start afresh from the run's state every `WINDOW` recorded steps."""
+    """Return RMS over spread of free runs that start again from the run's state every `WINDOW` recorded steps."""
     grid = segment_grid(run.data, WINDOW, GAP * run.h)
     states = [x[grid.start_sample] for x in run.states]
     if not all(bool(torch.isfinite(x).all()) for x in states):
@@ -99,7 +99,7 @@ def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
 
 
 def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]:
-    """RMS errors of the model, of uniform motion and of the noise in either, in units of the spread."""
+    """Return the RMS errors of the model and of uniform motion, and the noise in both, in units of the spread."""
     t = run.data.unwrapped().triples()
     dtype = next(run.model.parameters()).dtype
     keep = (t.h0 <= GAP * run.h) & (t.h1 <= GAP * run.h)  # no single step across a gap
@@ -122,10 +122,10 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
 
 
 def noise_level(t: Tensor, q: Tensor, data: Trajectories, orders: tuple[int, ...] = (3, 4, 5, 6)) -> Tensor:
-    """Upper estimate of the standard deviation of white noise in each coordinate, (n,), without a model.
+    """Return an upper estimate of the standard deviation of white noise in each coordinate, (n,), without a model.
 
-    Divided differences of order d, with weights scaled to leave white noise as it is, remove any smooth motion; the
-    order that leaves least is the best estimate.
+    Divided differences of order d remove smooth motion; their weights are scaled so that white noise keeps its size.
+    The order with the smallest remainder is the best estimate.
     """
     estimates = []
     for d in orders:
@@ -136,7 +136,7 @@ def noise_level(t: Tensor, q: Tensor, data: Trajectories, orders: tuple[int, ...
 
 
 def _divided(t: Tensor, q: Tensor, d: int) -> Tensor:
-    """Normalised divided differences of order d along one trajectory, (N − d, n)."""
+    """Return normalised divided differences of order d along one trajectory, (N − d, n)."""
     times = t.unfold(0, d + 1, 1)  # (N − d, d + 1)
     times = (times - times[:, :1]) / (times[:, -1:] - times[:, :1])
     gaps = times[:, :, None] - times[:, None, :] + torch.eye(d + 1, dtype=t.dtype, device=t.device)
@@ -146,7 +146,7 @@ def _divided(t: Tensor, q: Tensor, d: int) -> Tensor:
 
 
 def _free_run(run: Run) -> tuple[float, str]:
-    """RMS of prediction − data over the samples after the training part, over their spread."""
+    """Return the RMS of prediction − data over the samples after the training part, over their spread."""
     q = run.data.unwrapped().q
     rows = [torch.arange(a + k, b) for (a, b), k in zip(_spans(run.data), run.train_lengths, strict=True) if b - a > k]
     note = f"{sum(len(x) for x in rows)} samples the fit did not see"
@@ -163,7 +163,7 @@ def _spans(data: Trajectories) -> Iterator[tuple[int, int]]:
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Standard deviation of each coordinate, (n,); 1 for one that never moves."""
+    """Return the standard deviation of each coordinate, (n,); 1 for a coordinate that never moves."""
     spread = q.std(0, correction=0)
     return torch.where(spread > 0, spread, 1.0)
 

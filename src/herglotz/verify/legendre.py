@@ -5,30 +5,24 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
-    LeftHamiltonian,
-    herglotz_residual,
-    left_equations,
-    mixed_hessian,
-    momentum_jacobian,
-    momentum_plus,
-    partials,
-)
+from herglotz.mechanics import herglotz_residual, mixed_hessian, momentum_jacobian, momentum_plus, partials
 from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import solve
+from herglotz.theory import LeftHamiltonian, left_equations
 from herglotz.verify.report import Check
+from herglotz.verify.sampled_rollout import SampledRollout, worst
 from herglotz.verify.subject import Subject
-from herglotz.verify.walk import Walk, worst
 
-# A kinetic term gives 1/3 (1/2 for a file); the collapsed models of trap 2 give 0 or change sign.
+# Bound of the margin of det M. A kinetic term gives 1/3 (1/2 for a file); models collapsed by trap 2 give 0 or change
+# sign.
 MARGIN = 1e-3
 
 
-def momentum_matching(subject: Subject, w: Walk, bound: float) -> Check:
-    """FL⁺ of one step = FL⁻ of the next: the discrete Herglotz residual J⁻¹R, relative to the size of positions.
+def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Check:
+    """Check that FL⁺ of one step is FL⁻ of the next: the residual J⁻¹R, relative to the size of positions.
 
-    With L_d, R is evaluated on (q_{k−1}, q_k, q_{k+1}, s_{k−1}) alone. Without it, D1 L_d and D2 L_d are taken from the
-    derivative of the map: by the chain rule of the one-step generating function S¹ = L_d.
+    With L_d, R is evaluated on (q_{k−1}, q_k, q_{k+1}, s_{k−1}) alone. Without L_d, D1 L_d and D2 L_d come from the
+    derivative of the map, by the chain rule of the one-step generating function S¹ = L_d.
     """
     statement, note = "momenta match: discrete Herglotz equation, |J⁻¹R|/|q|", ""
     both = w.ok[:, :-1] & w.ok[:, 1:]
@@ -49,11 +43,11 @@ def momentum_matching(subject: Subject, w: Walk, bound: float) -> Check:
     return Check.at_most("momentum", statement, worst(error.abs().amax(-1) / size), bound, note)
 
 
-def left_formalism(subject: Subject, w: Walk, bound: float) -> Check:
-    """The left equations (erratum E5) give back q0, p1 and s0 from (p0, q1, s1), relative to the largest q, p and s.
+def left_formalism(subject: Subject, w: SampledRollout, bound: float) -> Check:
+    """Check that the left equations (erratum E5) give back q0, p1 and s0 from (p0, q1, s1), relative to the largest.
 
-    q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻, with H⁻ from L_d by its own Newton solves. Left out are
-    steps near a fold of H⁻, where det D1D1L⁻ = 0.
+    q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻, with H⁻ from L_d by its own Newton solves. Steps near a
+    fold of H⁻, where det D1D1L⁻ = 0, are left out.
     """
     assert subject.L_d is not None
     q0, p0, s0 = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
@@ -75,11 +69,11 @@ def _size(x: Tensor) -> float:
     return float(x.abs().max()) if x.numel() and bool((x != 0).any()) else 1.0
 
 
-def regularity(subject: Subject, w: Walk) -> Check:
-    """Regularity, det M ≠ 0 with a margin: smallest singular value of M, in units that make D11, D22 and M of size 1.
+def regularity(subject: Subject, w: SampledRollout) -> Check:
+    """Check det M ≠ 0 with a margin: the smallest singular value of M, scaled so that D11, D22 and M have size 1.
 
-    Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. A determinant of
-    either sign among the samples means that M is singular somewhere between them.
+    Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. Determinants of both
+    signs among the samples mean that M is singular between them.
     """
     with torch.no_grad():
         if subject.L_d is None:
@@ -99,8 +93,8 @@ def regularity(subject: Subject, w: Walk) -> Check:
     return Check.more_than("regularity", "regular: margin of det M ≠ 0", value, MARGIN, note, also=same)
 
 
-def _hessians(subject: Subject, w: Walk) -> tuple[Tensor, list[Tensor], str]:
-    """M and the blocks it is compared with, at every step; a step that failed is replaced by rest, q1 = q0."""
+def _hessians(subject: Subject, w: SampledRollout) -> tuple[Tensor, list[Tensor], str]:
+    """Return M and the blocks that scale it, at every step; rest, q1 = q0, replaces a step that failed."""
     q0, q1 = w.q[:, :-1], w.q[:, 1:]
     q1 = torch.where(w.ok[..., None], q1, q0)
     assert subject.L_d is not None
@@ -110,8 +104,8 @@ def _hessians(subject: Subject, w: Walk) -> tuple[Tensor, list[Tensor], str]:
     return M, [M, P.D11, P.D22], note
 
 
-def _map_hessians(w: Walk) -> tuple[Tensor, list[Tensor], str]:
-    """M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map."""
+def _map_hessians(w: SampledRollout) -> tuple[Tensor, list[Tensor], str]:
+    """Return M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map."""
     n = w.q.shape[-1]
     D = w.derivative[w.ok]
     inverse = torch.linalg.inv_ex(D[..., :n, n : 2 * n])[0]
@@ -119,8 +113,8 @@ def _map_hessians(w: Walk) -> tuple[Tensor, list[Tensor], str]:
     return M, [M, D[..., n : 2 * n, n : 2 * n] @ inverse], "no L_d in the file: M from the derivative of the map"
 
 
-def _from_map(w: Walk) -> tuple[Tensor, Tensor, Tensor]:
-    """D1 and D2 of S¹ = L_d by the chain rule through q1(q0, p0, s0), and ∂q1/∂p0."""
+def _from_map(w: SampledRollout) -> tuple[Tensor, Tensor, Tensor]:
+    """Return D1 and D2 of S¹ = L_d, by the chain rule through q1(q0, p0, s0), and ∂q1/∂p0."""
     n = w.q.shape[-1]
     D = w.derivative
     Y_q, Y_p = D[..., :n, :n], D[..., :n, n : 2 * n]

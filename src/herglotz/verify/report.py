@@ -1,4 +1,4 @@
-"""What a verification found, as data, as a table and as JSON."""
+"""The result of a verification: data, a table, JSON."""
 
 from __future__ import annotations
 
@@ -10,30 +10,30 @@ from typing import Any
 
 @dataclass(frozen=True)
 class Check:
-    """One claim, what was measured and what was allowed."""
+    """One claim, the measured value and its bound."""
 
     name: str  # short and stable, for programs
     statement: str  # the claim, for people
-    value: float  # worst over all samples; not finite where nothing could be measured
+    value: float  # largest error of all samples; not finite where no sample could be measured
     bound: float
     passed: bool
     note: str = ""
-    relation: str = "<="  # how value and bound must compare
+    relation: str = "<="  # that value and bound must satisfy
 
     @classmethod
     def at_most(cls, name: str, statement: str, value: float, bound: float, note: str = "") -> Check:
-        """A check that passes when value ≤ bound; a value that is not a number fails."""
+        """Return a check that passes when value ≤ bound; NaN fails."""
         return cls(name, statement, value, bound, value <= bound, note)
 
     @classmethod
     def more_than(
         cls, name: str, statement: str, value: float, bound: float, note: str = "", also: bool = True
     ) -> Check:
-        """A check that passes when value > bound and `also` holds."""
+        """Return a check that passes when value > bound and `also` holds."""
         return cls(name, statement, value, bound, also and value > bound, note, ">")
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON; a value that is not finite becomes None."""
+        """Return a plain dictionary for JSON; a value that is not finite becomes None."""
         value = self.value if math.isfinite(self.value) else None
         return {
             "name": self.name,
@@ -67,7 +67,7 @@ class Report:
         raise KeyError(f"no check {name!r}; there are {', '.join(c.name for c in self.checks)}")
 
     def table(self) -> str:
-        """An aligned table: claim, measured, bound, ok or FAIL; notes below it."""
+        """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below."""
         rows = [("claim", "measured", "bound", "")]
         notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
         for check in self.checks:
@@ -99,5 +99,5 @@ def _pad(text: str, width: int) -> str:
 
 
 def _width(text: str) -> int:
-    """Columns that a text takes: the tilde of Φ̃ has none of its own."""
+    """Return the columns that a text takes; a combining character, such as the tilde of Φ̃, takes none."""
     return sum(not unicodedata.combining(character) for character in text)

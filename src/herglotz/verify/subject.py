@@ -1,4 +1,4 @@
-"""What is verified: a step map with sample states, whatever it came from."""
+"""The subject of a verification: a step map and sample states, made from any target."""
 
 from __future__ import annotations
 
@@ -16,20 +16,21 @@ from herglotz.export import CompiledStepper, DifferencedStepper, ExportedStepper
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
+from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import State, Step, Stepper
-from herglotz.systems import Scene, scene, scene_names
 from herglotz.training import Run, load_run
 
-# Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). Rounding: a step is
-# good to 10–100 eps, an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative is good to 1e-13–1e-12 (1e-5);
-# truncation, offset⁸ f⁽⁹⁾/630, is below that where f is smooth over the offsets. Products of such derivatives over k
-# steps and divisions by ∂q1/∂p0 ~ h multiply it by 10–1000. Null models miss by 1e-3 and more.
+# Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). A step has a
+# rounding error of 10–100 eps and an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative has a rounding error of
+# 1e-13–1e-12 (float32: 1e-5). The truncation error, offset⁸ f⁽⁹⁾/630, is smaller where f is smooth over the offsets.
+# Products of such derivatives over k steps and divisions by ∂q1/∂p0 ~ h multiply the error by 10–1000. Null models
+# exceed 1e-3.
 DIFFERENCED = {torch.float64: 1e-9, torch.float32: 2e-3}
 
 
 @dataclass(frozen=True)
 class Subject:
-    """A step map, where it is sampled and what else is known of it."""
+    """A step map, its sample states, and the L_d, scene or run behind the map where they are known."""
 
     name: str
     kind: str  # "scene", "run", "pt2", "aoti", "onnx", "c", "stepper" or "L_d"
@@ -39,8 +40,8 @@ class Subject:
     L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
     scene: Scene | None = None
     run: Run | None = None
-    forced: bool = False  # whether it is a file of the forced level, which is no contact map
-    differenced: bool = False  # whether autograd cannot enter the map, so that derivatives are differences
+    forced: bool = False  # whether the target is a file of the forced level, whose map is no contact map
+    differenced: bool = False  # whether derivatives of the map are differences, because autograd cannot enter it
 
     @property
     def dof(self) -> int:
@@ -48,7 +49,7 @@ class Subject:
         return self.states.q.shape[-1]
 
     def flow(self, k: int = 1) -> Flow:
-        """The k-step map (q, p, s) → (q_k, p_k, s_k); NaN in a sample whose step failed."""
+        """Return the k-step map (q, p, s) → (q_k, p_k, s_k); a sample whose step failed is NaN."""
 
         def flow_k(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
             state = State(q, p, s)
@@ -62,8 +63,8 @@ class Subject:
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     """Turn anything that `verify` takes into a `Subject`.
 
-    States are drawn: for a scene from its `q_range` and `v_range` with s in [−1, 1]; for a run from its fitted states;
-    for a file from its box. A pair (L_d or stepper, states) brings its own.
+    States are drawn from the `q_range` and `v_range` of a scene with s in [−1, 1], from the fitted states of a run, or
+    from the box of a file. A pair (L_d or stepper, states) brings its own states.
 
     Raises
     ------
@@ -107,7 +108,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
 
 
 def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper | CompiledStepper:
-    """A scene by name, a run by its folder, or an exported file."""
+    """Return a scene by its name, a run by its folder, or an exported file."""
     if target in scene_names():
         return scene(str(target))
     path = Path(target)
@@ -119,7 +120,7 @@ def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper | Com
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:
-    """A discrete Lagrangian, or anything with `step(state, h) -> Step`, with states given as (q, p, s)."""
+    """Return the subject of an L_d, or of anything with `step(state, h) -> Step`, and given states (q, p, s)."""
     if h is None:
         raise InputError("h must be given with a pair (L_d or stepper, states), e.g. h=0.1")
     q, p, s = states
@@ -143,7 +144,7 @@ def _step_size(h: float | None, default: float) -> float:
 
 
 def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
-    """Uniform draws; a range is a pair of numbers for all coordinates or a pair (low, high) of n numbers each."""
+    """Draw states uniformly; a range is two numbers for all coordinates, or (low, high) of n numbers each."""
     shape = (samples, scene.dof)
 
     def draw_from(limits: Any) -> Tensor:
@@ -156,7 +157,7 @@ def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
 
 
 def _run_states(run: Run, samples: int, make: torch.Generator) -> State:
-    """Fitted states of a run, drawn without repetition; those that are not finite are passed over."""
+    """Draw fitted states of a run without repetition; states that are not finite are skipped."""
     dtype = next(run.model.parameters()).dtype
     q, p, s = (x.detach().to(dtype) for x in run.states)
     finite = (torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s)).nonzero()[:, 0]

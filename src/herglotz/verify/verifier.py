@@ -13,13 +13,22 @@ from herglotz.verify.action import derivatives, fan, hamilton_jacobi, left_hamil
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.legendre import left_formalism, momentum_matching, regularity
 from herglotz.verify.report import Check, Report
+from herglotz.verify.sampled_rollout import (
+    SampledRollout,
+    contact,
+    convergence,
+    positive_factor,
+    sampled_rollout,
+    volume,
+    worst,
+)
 from herglotz.verify.subject import DIFFERENCED, Subject, subject
-from herglotz.verify.walk import Walk, contact, convergence, positive_factor, volume, walk, worst
 
-# Relative to the terms that cancel. Measured: 2e-13 on models, 8e-13 on the parachute, whose Newton tolerance (64 eps
-# of q ≈ 100 m) is large beside its steps of 0.1 m; null models miss by 1e-3 and more.
+# Bounds of the contact property, relative to the terms that cancel. Measured: 2e-13 on models and 8e-13 on the
+# parachute, whose Newton tolerance (64 eps of q ≈ 100 m) is large beside its steps of 0.1 m. Null models exceed 1e-3.
 CONTACT = {torch.float64: 1e-11, torch.float32: 5e-4}
-FORCED = "Friction and inputs make it no contact map: the other checks need the model's forces (--against RUN)"
+FORCED = "A map with friction or inputs is no contact map: the other checks need the model's forces (--against RUN)"
+# Bounds of the other identities; docs/verification.md lists the measured values.
 IDENTITY = {torch.float64: 1e-10, torch.float32: 1e-3}
 
 
@@ -33,13 +42,13 @@ def verify(
     tolerance: float | None = None,
     model: DiscreteLagrangian | None = None,
 ) -> Report:
-    """Measure the identities that every discrete contact Lagrangian's flow satisfies, on this one.
+    """Measure, on one target, the identities that the flow of every discrete contact Lagrangian satisfies.
 
-    On rollouts of `steps` steps from `samples` states: convergence, c > 0, DΦ̃ᵀη = cη, det DΦ̃ = c^{n+1}, momentum
-    matching, regularity; on fans of solutions: D2S^k = p_k, D1S^k = −σ_k p̂0, 1 + D3S^k = σ_k and the discrete
-    Hamilton–Jacobi equation; where L_d is known the left Hamilton equations and the left Hamilton–Jacobi equation; for
-    a scene with an exact L_d also its closed-form flow, for a run its data. An L_d with forces is not a contact map:
-    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and what rests on generating functions is left out.
+    Rollouts of `steps` steps from `samples` states give convergence, c > 0, DΦ̃ᵀη = cη, det DΦ̃ = c^{n+1}, momentum
+    matching and regularity. Fans of solutions give D2S^k = p_k, D1S^k = −σ_k p̂0, 1 + D3S^k = σ_k and the discrete
+    Hamilton–Jacobi equation. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
+    scene with an exact L_d its closed-form flow, a run its data. The step of an L_d with forces is not a contact map:
+    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out.
 
     Parameters
     ----------
@@ -49,26 +58,26 @@ def verify(
     h
         Step; default that of the target, required for a pair.
     samples, steps, seed
-        How many states are drawn, how many steps are taken from each, and the seed of the draw.
+        Number of states, number of steps from each state, and seed of the drawn states.
     tolerance
         Bound on every identity, instead of 1e-11 (contact, with L_d) and 1e-10 in float64, 5e-4 and 1e-3 in float32;
         1e-9 and 2e-3 for a file without derivatives (ONNX, machine code, C), whose map is differentiated by
         differences.
     model
-        What a file was exported from. A file of the forced level is no contact map, and its forces are not to be had
-        from its steps: with the model it is judged as a forced map, without it on what holds in any case.
+        The model that a file was exported from. The map of a forced file is no contact map, and its steps do not tell
+        the forces: with the model it is checked as a forced map, without it by the checks that need no forces.
 
     Returns
     -------
     Report
-        One check per claim. Samples near a caustic are left out and counted; a check that is left with none fails.
+        One check a claim. Samples near a caustic are left out and counted; a check without any sample fails.
 
     Raises
     ------
     InputError
         If the target or a setting is not usable.
 
-    Source: sections 1–3 of `mathematics.md`, errata E4–E7.
+    Source: sections 1–3 of `docs/mathematics.md`, errata E4–E7.
     """
     if steps < 2:
         raise InputError(f"steps must be >= 2, got {steps}; momentum matching joins two")
@@ -82,7 +91,7 @@ def verify(
     identity = usual[dtype] if tolerance is None else tolerance
     strict = CONTACT[dtype] if tolerance is None and known.L_d is not None else identity
 
-    w = walk(known, steps)
+    w = sampled_rollout(known, steps)
     behind = replace(known, L_d=model) if known.forced else known
     force = _forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
@@ -116,8 +125,8 @@ def verify(
     return Report(known.name, tuple(checks), details)
 
 
-def _forces(known: Subject, w: Walk) -> Forces | None:
-    """F⁻ and F⁺ at the steps that are ok; None where the subject has none."""
+def _forces(known: Subject, w: SampledRollout) -> Forces | None:
+    """Return F⁻ and F⁺ at the steps that are ok; None where the subject has no forces."""
     if known.L_d is None:
         return None
     q0, q1, s0 = w.q[:, :-1][w.ok], w.q[:, 1:][w.ok], w.s[:, :-1][w.ok]
@@ -125,8 +134,8 @@ def _forces(known: Subject, w: Walk) -> Forces | None:
         return partials(known.L_d, q0, q1, s0, known.h).force
 
 
-def _exact_flow(known: Subject, w: Walk, bound: float) -> Check:
-    """Every step equals the closed-form flow, relative to the largest q, p and s."""
+def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:
+    """Check that every step equals the closed-form flow, relative to the largest q, p and s."""
     assert known.scene is not None
     q, p, s = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
     with torch.no_grad():

@@ -23,7 +23,7 @@ from peer_models.rollouts import Flow, ThreePoint, fitted_start, rk4  # noqa: E4
 from peer_models.samples import Motion, Samples, differences  # noqa: E402
 from peer_models.simulated import DOUBLE, double_momentum, double_motion, pendulum  # noqa: E402
 
-from herglotz.systems import scene  # noqa: E402
+from herglotz.scenes import scene  # noqa: E402
 
 H = 0.25
 

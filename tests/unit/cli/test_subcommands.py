@@ -16,7 +16,7 @@ import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.data import load
 from herglotz.models import LEVELS
-from herglotz.systems import scene_names
+from herglotz.scenes import scene_names
 from herglotz.training import load_run
 from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 

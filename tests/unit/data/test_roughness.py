@@ -7,7 +7,7 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.data.roughness import roughness
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 
 @pytest.mark.parametrize("gaps", [0, 3])

@@ -154,8 +154,8 @@ def test_every_mistake_has_its_message(changes, message):
 
 
 def test_the_real_damped_pendulum():  # fails if scenes and `simulate` disagree on shapes or names
-    systems = pytest.importorskip("herglotz.systems", reason="herglotz.systems is not there yet")
-    scene = systems.scene("damped_pendulum")
+    scenes = pytest.importorskip("herglotz.scenes", reason="herglotz.scenes is not there yet")
+    scene = scenes.scene("damped_pendulum")
     data = simulate(scene, trajectories=3, steps=40, h=0.1, seed=2, keep_state=True)
     assert (data.names, data.angles, data.units) == (scene.coordinates, (True,), ("rad",))
     triples = data.triples()

@@ -8,7 +8,7 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.data.spikes import spikes, without
 from herglotz.errors import InputError
-from herglotz.systems import scene
+from herglotz.scenes import scene
 
 
 @pytest.mark.parametrize("h", [0.02, 0.2, 0.5, 1.0])

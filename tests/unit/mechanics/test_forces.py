@@ -1,4 +1,4 @@
-"""Discrete forces: p_k = −(D1L + F⁻)/c, p_{k+1} = D2L + F⁺ (trap 4 of `mathematics.md`)."""
+"""Discrete forces: p_k = −(D1L + F⁻)/c, p_{k+1} = D2L + F⁺ (trap 4 of `docs/mathematics.md`)."""
 
 import math
 

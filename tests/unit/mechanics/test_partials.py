@@ -5,19 +5,18 @@ import torch
 
 from herglotz.mechanics import (
     autograd_partials,
-    contact_vector_field,
     herglotz_residual,
     legendre_minus,
     legendre_plus,
     mixed_hessian,
     momentum_jacobian,
     partials,
-    right_hamiltonian,
     step_derivative,
 )
 from herglotz.mechanics.contact import flow_derivative
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
+from herglotz.theory import contact_vector_field, right_hamiltonian
 
 
 def polynomial(q0, q1, s0, h):

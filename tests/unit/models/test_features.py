@@ -5,13 +5,16 @@ from typing import Any
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models.feature_grammar import HIGHEST_POWER
 from herglotz.models.features import LIBRARIES, expand, parse
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training.residual import MANY, ResidualProblem
 
 ANGLES, LENGTHS = (True, True), (False, False)
@@ -98,6 +101,18 @@ def test_texts_are_read_as_written():
     assert parse("v1^2", ANGLES)[0].velocities == (0, 0)
 
 
+@given(st.text(alphabet="qvr123.+-*^() cosine", max_size=30))
+def test_any_text_is_a_feature_or_an_error(text):
+    # fails if a text ends in a traceback, in a number that is not finite, or in more velocities than it can have
+    try:
+        feature = parse(text, LENGTHS)
+    except InputError as error:
+        assert text in str(error)  # noqa: PT017  either outcome is right
+    else:
+        assert all(math.isfinite(x) for p in feature for x in (p.factor, *p.form))
+        assert all(len(p.velocities) <= HIGHEST_POWER * len(text) for p in feature)
+
+
 def test_mistakes_in_texts_are_named():
     # fails if a typo is read as something else
     wrong = {
@@ -110,6 +125,20 @@ def test_mistakes_in_texts_are_named():
         "r^2 v1": "powers of r join the potential",
         "chain two": "this library takes one whole number, as 'chain 2' does",
         "pendulums 2": "this library takes no number; write 'pendulums'",
+    }
+    wrong |= {
+        "-9.81 q1^1.5": r"a power must be a whole number, got '1.5'",
+        "q1^": "a power must be a whole number, got 'nothing'",
+        "q1^-2": r"got '-2' \(only r takes negative ones\)",
+        "1.1.1 q1": "'1.1' and '.1' stand side by side",
+        "2 q1 3": "has two numbers in one product",
+        "1e999 q1": "the number 1e999 is too large",
+        "v1^1000000000": "a power must be at most 16, got 1000000000",
+        "q99999999999999999999": "there is no coordinate 99999999999999999999",
+        "q1 *": r"cannot read 'q1 \*'",
+        "q1 + + q2": r"cannot read '\+ q2'",
+        "(q1 - q2": "cannot read the linear form 'q1 - q2'",
+        "rad^2": r"cannot read 'rad\^2'",
     }
     for text, words in wrong.items():
         with pytest.raises(InputError, match=words):

@@ -10,8 +10,8 @@ from herglotz.mechanics import autograd_partials
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import unit_increment
 from herglotz.models.jet import Jet
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 
 
 def build(config) -> Any:

@@ -5,8 +5,8 @@ import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.terms import AffineDamping
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 
 
 def pendulum_model(gamma):

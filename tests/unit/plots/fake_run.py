@@ -4,8 +4,8 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, Run
 
 

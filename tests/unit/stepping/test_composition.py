@@ -7,19 +7,9 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_defect, flow_derivative
-from herglotz.stepping import (
-    Composition,
-    ContactSplitting,
-    State,
-    Status,
-    StepError,
-    Stepper,
-    adjoint_pair,
-    kahan_li,
-    suzuki,
-    yoshida,
-)
-from herglotz.systems import damped_pendulum, left, midpoint, midpoint_heun, reference_flow, right, scene
+from herglotz.scenes import damped_pendulum, left, midpoint, midpoint_heun, reference_flow, right, scene
+from herglotz.stepping import Composition, State, Status, StepError, Stepper, adjoint_pair, kahan_li, suzuki, yoshida
+from herglotz.theory import ContactSplitting
 
 GAMMA, HORIZON = 0.4, 2.0
 PENDULUM = damped_pendulum(gamma=GAMMA)

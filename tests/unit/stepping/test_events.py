@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.stepping.events import Event
-from herglotz.systems import scene
 
 GAMMA = 0.2
 OMEGA = math.sqrt(1 - GAMMA**2 / 4)

@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics import LeftHamiltonian, RightHamiltonian, regularity
+from herglotz.mechanics import regularity
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, StepError, Stepper, explain_step
 from herglotz.stepping.explain import longest_step
-from herglotz.systems import scene
+from herglotz.theory import LeftHamiltonian, RightHamiltonian
 from herglotz.verify import verify
 
 OSCILLATOR = scene("damped_oscillator")  # m = Ω = 1, γ = 0.2

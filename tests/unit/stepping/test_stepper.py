@@ -5,8 +5,8 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, StepError, Stepper
-from herglotz.systems import scene
 
 
 def start(batch=3, dtype=torch.float64):

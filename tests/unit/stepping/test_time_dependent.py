@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from herglotz.mechanics import contact_defect, flow_derivative
+from herglotz.scenes import reference_flow
 from herglotz.stepping import State, Stepper
-from herglotz.systems import reference_flow
 
 OMEGA, GAMMA, FORCE, NU = 1.3, 0.4, 0.9, 1.7
 F64 = torch.float64

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.data import simulate
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import Prior, ResidualProblem, adam
 from herglotz.training.supervision import SupervisedProblem
 

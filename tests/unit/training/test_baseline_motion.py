@@ -8,7 +8,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.baseline_motion import fit_baseline_motion

@@ -14,7 +14,7 @@ import sys
 import torch
 from herglotz.data import simulate
 from herglotz.training import distributed
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.build import build_model

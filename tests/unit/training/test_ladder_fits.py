@@ -8,8 +8,8 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import reference_solve, scene
 from herglotz.stepping import Stepper
-from herglotz.systems import reference_solve, scene
 from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.trajectory_fit import make_prior

@@ -8,8 +8,8 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt, lifted
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten

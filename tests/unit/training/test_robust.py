@@ -7,8 +7,8 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import FitConfig, fit, laplace
 from herglotz.training.baseline import outliers_pull
 from herglotz.training.robust import FEW, FREEDOM, far_out, heavy_tailed, loss, root_weights, scale_of

@@ -12,7 +12,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.plots import plot_selection, save_figure
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import FitConfig, select
 from herglotz.training.run import Run
 from herglotz.training.selection import Candidate, Selection, _simplest, block_errors, levels_for

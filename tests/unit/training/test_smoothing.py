@@ -8,8 +8,8 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
 from herglotz.training import ShootingProblem, levenberg_marquardt, smooth
 from herglotz.training.grid import segment_grid
 from herglotz.training.trajectory_fit import StatesOnly

@@ -11,9 +11,9 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.models.features import lengths, parse, revolute
+from herglotz.scenes import scene
+from herglotz.scenes.reference import reference_flow
 from herglotz.stepping import Stepper
-from herglotz.systems import scene
-from herglotz.systems.reference import reference_flow
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.build import build_model

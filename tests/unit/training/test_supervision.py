@@ -6,7 +6,7 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.systems import reference_solve, scene
+from herglotz.scenes import reference_solve, scene
 from herglotz.training import FitConfig, Prior, fit
 from herglotz.training.supervision import SupervisedProblem
 

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.data import simulate
 from herglotz.errors import InputError
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.training import FitConfig, ensemble_bands, fit, laplace
 
 NOISE = 0.01

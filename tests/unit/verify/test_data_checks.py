@@ -7,8 +7,8 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import State
-from herglotz.systems import scene
 from herglotz.training import FitConfig, Run, save_run
 from herglotz.verify import verify
 from herglotz.verify.data_checks import data_checks, noise_level

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import torch
 
-from herglotz.systems import scene
+from herglotz.scenes import scene
 from herglotz.verify import verify
 from herglotz.verify.subject import subject
 

@@ -8,8 +8,8 @@ import torch
 from herglotz.errors import InputError
 from herglotz.export import export_pt2, load_pt2
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.systems import scene
 from herglotz.verify import Check, Report, verify
 
 BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-0.5], "s_high": [0.5]}

@@ -1,0 +1,204 @@
+"""The text of a feature, read by a grammar.
+
+    feature = [sign] product { sign product }
+    product = factor { ["*"] factor }             one function of the position at most
+    factor  = number | ("cos" | "sin") "(" form ")" | base [ "^" integer ]
+    base    = "r" | "q" index | "v" index | "(" form ")"
+    form    = [sign] addend { sign addend }
+    addend  = [ number ["*"] ] "q" index
+
+Only r takes negative powers. Blanks separate, and mean nothing else.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from herglotz.errors import InputError
+
+HIGHEST_POWER = 16  # of data that vary by a factor of 10, such a power varies by 1e16: all the digits of float64
+_TOKEN = re.compile(
+    r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<coordinate>[qv]\d+)|(?P<word>cos|sin|r(?![a-z]))"
+    r"|(?P<mark>[-+*^()]))"
+)
+HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), (q1 - q2)^2, q1^3, r^-1"
+
+
+@dataclass(frozen=True)
+class Product:
+    """factor · f(w·q) · ∏ v, with f = cos, sin, a power of the linear form, or a power of r = |q| (no w)."""
+
+    factor: float
+    function: str  # "cos", "sin", "power" or "radius"
+    form: tuple[float, ...] = ()  # w, n numbers
+    power: int = 0
+    velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
+
+
+Feature = tuple[Product, ...]
+
+
+def parse(text: str, angles: Sequence[bool]) -> Feature:
+    """The products that a feature is the sum of.
+
+    Raises
+    ------
+    InputError
+        Naming the feature and the part of it that cannot be read.
+    """
+    feature = _Reader(text, angles).feature()
+    if len({bool(p.velocities) for p in feature}) > 1:
+        raise InputError(f"feature '{text}': some products hold velocities and some do not; make two features of it")
+    return feature
+
+
+class _Reader:
+    """Recursive descent, a method a rule of the grammar."""
+
+    def __init__(self, text: str, angles: Sequence[bool]):
+        self.text, self.angles, self.n = text, angles, len(angles)
+        self.tokens: list[tuple[str, str, int]] = []  # kind, text, where it begins
+        at, end = 0, len(text.rstrip())
+        while at < end:
+            match = _TOKEN.match(text, at)
+            if match is None:
+                raise self._unread(at)
+            kind = str(match.lastgroup)
+            self.tokens.append((kind, match[kind], match.start(kind)))
+            at = match.end()
+        self.tokens.append(("end", "", end))
+        self.at = 0
+
+    def feature(self) -> Feature:
+        """The whole text."""
+        products = [self._product(self._sign() or 1.0)]
+        while (sign := self._sign()) is not None:
+            products.append(self._product(sign))
+        if self._next()[0] != "end":
+            raise self._unread(self._next()[2])
+        return tuple(products)
+
+    def _product(self, factor: float) -> Product:
+        begin = self._next()[2]
+        functions: list[tuple[str, tuple[float, ...], int]] = []
+        velocities: list[int] = []
+        numbers = count = 0
+        while count == 0 or self._take("*") or self._next()[0] in ("number", "coordinate", "word") or self._is("("):
+            kind, token, _ = self._next()
+            if kind == "number":
+                numbers += 1
+                factor *= self._number()
+            elif kind == "coordinate" and token[0] == "v":
+                velocities += [self._coordinate()] * self._power()
+            else:
+                functions.append(self._function())
+            if numbers > 1:
+                raise self._error(f"'{self.text[begin:].strip()}' has two numbers in one product; write their product")
+            count += 1
+        body = self.text[begin : self._next()[2]].strip()
+        if len(functions) > 1:
+            raise self._error(
+                f"'{body}' has {len(functions)} functions of the position, and a product takes one; "
+                "q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
+            )
+        function, form, power = functions[0] if functions else ("power", (0.0,) * self.n, 0)
+        used = [True] * self.n if function == "radius" else form
+        if power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
+            raise self._error("a power of an angle is not periodic; use cos or sin")
+        if function == "radius" and velocities:
+            raise self._error("powers of r join the potential; write the product without velocities")
+        return Product(factor, function, form, power, tuple(velocities))
+
+    def _function(self) -> tuple[str, tuple[float, ...], int]:
+        """cos, sin, or a power of a form, a coordinate or r."""
+        kind, token, where = self._next()
+        if token in ("cos", "sin"):
+            self.at += 1
+            if not self._is("("):
+                raise self._unread(where)
+            return token, self._form(), 0
+        if token == "r":
+            self.at += 1
+            return "radius", (), self._power(negative=True)
+        if token == "(":
+            return "power", self._form(), self._power()
+        if kind == "coordinate":
+            i = self._coordinate()
+            return "power", tuple(float(i == j) for j in range(self.n)), self._power()
+        raise self._unread(where)
+
+    def _form(self) -> tuple[float, ...]:
+        """The n numbers w of a linear form in parentheses."""
+        begin = self._next()[2]
+        self.at += 1
+        w = [0.0] * self.n
+        sign: float | None = self._sign() or 1.0
+        while sign is not None:
+            if self._next()[0] == "number":
+                sign *= self._number()
+                self._take("*")
+            kind, token, _ = self._next()
+            if kind != "coordinate" or token[0] != "q":
+                break
+            w[self._coordinate()] += sign
+            sign = self._sign()
+        if sign is not None or not self._take(")"):
+            words = self.text[begin + 1 :].partition(")")[0]
+            raise self._error(f"cannot read the linear form '{words}'; write q1 - q2 or 2*q1 + q3")
+        return tuple(w)
+
+    def _power(self, negative: bool = False) -> int:
+        """The power after the present base; 1 where none is written."""
+        if not self._take("^"):
+            return 1
+        sign = -1 if negative and self._take("-") else 1
+        kind, token, where = self._next()
+        if kind != "number" or not token.isdigit():
+            found = self.text[where:].split(maxsplit=1)[0] if self.text[where:].strip() else "nothing"
+            below = " (only r takes negative ones)" if self._is("-") else ""
+            raise self._error(f"a power must be a whole number, got '{found}'{below}")
+        if len(token) > 6 or int(token) > HIGHEST_POWER:
+            raise self._error(f"a power must be at most {HIGHEST_POWER}, got {token[:12]}")
+        self.at += 1
+        return sign * int(token)
+
+    def _number(self) -> float:
+        _, token, _ = self._next()
+        self.at += 1
+        value = float(token)
+        if not math.isfinite(value):
+            raise self._error(f"the number {token} is too large")
+        if self._next()[0] == "number":
+            raise self._error(f"'{token}' and '{self._next()[1]}' stand side by side; write one number")
+        return value
+
+    def _coordinate(self) -> int:
+        digits = self._next()[1][1:]
+        if len(digits) > 6 or not 1 <= int(digits) <= self.n:
+            raise self._error(f"there is no coordinate {digits}; they are numbered 1 … {self.n}")
+        self.at += 1
+        return int(digits) - 1
+
+    def _sign(self) -> float | None:
+        return 1.0 if self._take("+") else -1.0 if self._take("-") else None
+
+    def _next(self) -> tuple[str, str, int]:
+        return self.tokens[self.at]
+
+    def _is(self, mark: str) -> bool:
+        return self._next()[:2] == ("mark", mark)
+
+    def _take(self, mark: str) -> bool:
+        found = self._is(mark)
+        self.at += found
+        return found
+
+    def _unread(self, at: int) -> InputError:
+        rest = self.text[at:].strip() or self.text
+        return self._error(f"cannot read '{rest}'; {HOW}")
+
+    def _error(self, what: str) -> InputError:
+        return InputError(f"feature '{self.text}': {what}")

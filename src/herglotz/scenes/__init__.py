@@ -1,0 +1,83 @@
+"""Scenes with known answers, the rules that discretise them, and the reference flow they are measured against."""
+
+from herglotz.scenes.chain import chain
+from herglotz.scenes.double_pendulum import double_pendulum
+from herglotz.scenes.driven_pendulum import DrivenRule, driven_pendulum
+from herglotz.scenes.exact import NumericallyExact, Reason, exact_discrete_lagrangian
+from herglotz.scenes.galerkin import GalerkinLobatto, lobatto4, lobatto6
+from herglotz.scenes.kepler import kepler
+from herglotz.scenes.linear_drag import ExactLinearDrag, linear_drag
+from herglotz.scenes.motion import Motion, hamiltonian_motion, herglotz_motion, lagrangian_motion
+from herglotz.scenes.nonlinear_action import nonlinear_action
+from herglotz.scenes.oscillator import ExactOscillator, damped_oscillator
+from herglotz.scenes.parachute import ExactParachute, parachute
+from herglotz.scenes.path import path_action
+from herglotz.scenes.pendulum import damped_pendulum
+from herglotz.scenes.printed_parachute import PrintedParachute
+from herglotz.scenes.quadratic_drag import quadratic_drag
+from herglotz.scenes.reference import ReferenceSolution, reference_flow, reference_solve
+from herglotz.scenes.registry import scene, scene_names
+from herglotz.scenes.rigid_body import rigid_body
+from herglotz.scenes.rules import (
+    ORDERS,
+    adjoint,
+    all_rules,
+    left,
+    midpoint,
+    midpoint_heun,
+    midpoint_plain,
+    right,
+    strang,
+    trapezoid,
+    trapezoid_heun,
+    trapezoid_plain,
+)
+from herglotz.scenes.scene import Scene
+
+__all__ = [
+    "ORDERS",
+    "DrivenRule",
+    "ExactLinearDrag",
+    "ExactOscillator",
+    "ExactParachute",
+    "GalerkinLobatto",
+    "Motion",
+    "NumericallyExact",
+    "PrintedParachute",
+    "Reason",
+    "ReferenceSolution",
+    "Scene",
+    "adjoint",
+    "all_rules",
+    "chain",
+    "damped_oscillator",
+    "damped_pendulum",
+    "double_pendulum",
+    "driven_pendulum",
+    "exact_discrete_lagrangian",
+    "hamiltonian_motion",
+    "herglotz_motion",
+    "kepler",
+    "lagrangian_motion",
+    "left",
+    "linear_drag",
+    "lobatto4",
+    "lobatto6",
+    "midpoint",
+    "midpoint_heun",
+    "midpoint_plain",
+    "nonlinear_action",
+    "parachute",
+    "path_action",
+    "quadratic_drag",
+    "reference_flow",
+    "reference_solve",
+    "right",
+    "rigid_body",
+    "scene",
+    "scene_names",
+    "strang",
+    "trapezoid",
+    "trapezoid_heun",
+    "trapezoid_plain",
+]

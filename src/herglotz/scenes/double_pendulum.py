@@ -1,0 +1,75 @@
+"""The damped double pendulum, m = ℓ = 1, angles from the vertical: chaotic, no closed form.
+
+L = v1² + v2²/2 + v1v2 cos(q1 − q2) − g[2(1 − cos q1) + (1 − cos q2)] − γs. The default ranges start below the
+horizontal, |q| ≤ 1.2 rad and |v| ≤ 1.5 rad/s, which is chaotic only weakly: reference and computed motions can be
+compared for tens of seconds.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.natural import scene_without_closed_form
+from herglotz.scenes.scene import Scene
+
+
+def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
+    """Two equal pendulums in a chain, one damping rate.
+
+    Parameters
+    ----------
+    g
+        Gravity over length, 1/s².
+    gamma
+        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
+    """
+
+    def potential(q: Tensor) -> Tensor:
+        drop = 2.0 * torch.sin(0.5 * q) ** 2  # 1 − cos q, without its cancellation
+        return g * (2.0 * drop[..., 0] + drop[..., 1])
+
+    def kinetic(q: Tensor, v: Tensor) -> Tensor:
+        v1, v2 = v.unbind(-1)
+        return v1**2 + 0.5 * v2**2 + v1 * v2 * torch.cos(q[..., 0] - q[..., 1])
+
+    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        return kinetic(q, v) - potential(q) - gamma * s
+
+    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        (v1, v2), C = v.unbind(-1), torch.cos(q[..., 0] - q[..., 1])
+        return torch.stack([2 * v1 + C * v2, C * v1 + v2], -1)
+
+    def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        (p1, p2), C = p.unbind(-1), torch.cos(q[..., 0] - q[..., 1])
+        return torch.stack([p1 - C * p2, 2 * p2 - C * p1], -1) / (2 - C * C)[..., None]
+
+    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        return 0.5 * (p * velocity(q, p, s)).sum(-1) + potential(q) + gamma * s
+
+    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        twist = torch.sin(q[..., 0] - q[..., 1]) * v[..., 0] * v[..., 1]
+        weight = g * torch.sin(q)
+        return torch.stack([-twist - 2 * weight[..., 0], twist - weight[..., 1]], -1)
+
+    return scene_without_closed_form(
+        name="double_pendulum",
+        description="damped double pendulum, m = ℓ = 1; no closed form, reference flow to about 1e-13",
+        dof=2,
+        coordinates=("theta1", "theta2"),
+        units=("rad", "rad"),
+        time_unit="s",
+        angles=(True, True),
+        parameters={"g": g, "gamma": gamma},
+        hamiltonian=hamiltonian,
+        lagrangian=lagrangian,
+        momentum=momentum,
+        velocity=velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        q_range=(-1.2, 1.2),
+        v_range=(-1.5, 1.5),
+        h=0.05,
+        examples=({"g": 4.0, "gamma": 0.4},),
+    )

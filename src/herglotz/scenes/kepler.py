@@ -1,0 +1,66 @@
+"""The planar Kepler problem with linear drag: L = m|v|²/2 + k/|q| − γs, no closed form.
+
+A body on a slowly shrinking ellipse. The default ranges start near |q| = 1 with a speed near the circular one
+(√(k/m) = 1), 0.8 ≤ v_y ≤ 1.2 and |v_x| ≤ 0.2, so that |q| stays above 0.15 over the first revolutions; q = 0 is
+singular and no step across or near it is exact to any order.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.natural import Natural, scene_without_closed_form
+from herglotz.scenes.rules import strang
+from herglotz.scenes.scene import Scene
+
+
+def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
+    """A planet in the plane with linear drag, m q̈ = −k q/|q|³ − mγq̇.
+
+    Parameters
+    ----------
+    m
+        Mass, kg.
+    k
+        Strength of the attraction, N·m²; negative repels.
+    gamma
+        Damping rate γ, 1/s.
+
+    Raises
+    ------
+    InputError
+        If m ≤ 0.
+    """
+    if not m > 0:
+        raise InputError(f"kepler: mass m must be > 0, got {m}")
+
+    def potential(q: Tensor) -> Tensor:
+        return -k / (q * q).sum(-1).sqrt()
+
+    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return -k * q * (q * q).sum(-1, keepdim=True) ** -1.5
+
+    system = Natural(potential, gamma, m)
+    return scene_without_closed_form(
+        name="kepler",
+        description="planar Kepler problem with linear drag; no closed form, reference flow to about 1e-13",
+        dof=2,
+        coordinates=("x", "y"),
+        units=("m", "m"),
+        time_unit="s",
+        angles=(False, False),
+        parameters={"m": m, "k": k, "gamma": gamma},
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        rules={"strang": strang(potential, m, gamma)},
+        q_range=((0.8, -0.3), (1.2, 0.3)),
+        v_range=((-0.2, 0.8), (0.2, 1.2)),
+        h=0.1,
+        examples=({"m": 1.3, "k": 0.9, "gamma": 0.2},),
+    )

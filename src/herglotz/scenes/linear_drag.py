@@ -1,0 +1,121 @@
+"""Linear drag, q̈ = −γq̇: L = m|v|²/2 − γs, in closed form, analytic through γ = 0.
+
+With φ(x) = (eˣ − 1)/x and Δ = q1 − q0, every formula divides by h φ(±γh) only.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import Partials
+from herglotz.scenes.rules import all_rules
+from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.special import as_step, expm1w
+
+
+@dataclass(frozen=True)
+class ExactLinearDrag:
+    """L_d = (E−1)s0 + m|Δ|²/(2hφ(γh)), E = e^{−γh}, in any dimension, with closed-form derivatives.
+
+    Source: section 3 of `docs/mathematics.md`, where γ/(e^{γh} − 1) is 1/(hφ(γh)).
+    """
+
+    m: float
+    gamma: float
+
+    def stiffness(self, h: Tensor) -> Tensor:
+        """∂²L_d/∂Δ² = m/(hφ(γh))."""
+        return self.m / (h * expm1w(self.gamma * h))
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """Return L_d, shape (...)."""
+        h = as_step(h, q0)
+        delta = q1 - q0
+        return torch.expm1(-self.gamma * h) * s0 + 0.5 * self.stiffness(h) * (delta * delta).sum(-1)
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """Value, gradient and Hessian blocks; the blocks are constants, for L_d is quadratic."""
+        h = as_step(h, q0)
+        L = self(q0, q1, s0, h)
+        k = self.stiffness(h)[..., None]
+        D2 = (k * (q1 - q0)).expand(*L.shape, q0.shape[-1])
+        first = (L, -D2, D2, torch.expm1(-self.gamma * h).expand_as(L))
+        if order == 1:
+            return Partials(*first)
+        block, zero = torch.diag_embed(k.expand_as(D2)), torch.zeros_like(D2)
+        return Partials(*first, block, -block, block, D13=zero, D23=zero, D33=torch.zeros_like(L))
+
+
+def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
+    """A body in a viscous medium, q̈ = −γq̇.
+
+    Parameters
+    ----------
+    m
+        Mass, kg.
+    gamma
+        Damping rate γ, 1/s, of either sign or 0.
+
+    Raises
+    ------
+    InputError
+        If m ≤ 0.
+
+    Source: section 3 of `docs/mathematics.md`.
+    """
+    if not m > 0:
+        raise InputError(f"linear_drag: mass m must be > 0, got {m}")
+    L_d = ExactLinearDrag(m, gamma)
+
+    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return 0.5 * m * (v * v).sum(-1) - gamma * s
+
+    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return (p * p).sum(-1) / (2 * m) + gamma * s
+
+    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""
+        h = as_step(h, q)
+        span, E = h * expm1w(-gamma * h), torch.exp(-gamma * h)
+        return q + p / m * span[..., None], p * E[..., None], E * (s + (p * p).sum(-1) / (2 * m) * span)
+
+    def H_plus(q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
+        """H⁺ = p1·q0 + |p1|² hφ(γh)/2m + (1−E)s0."""
+        h = as_step(h, q0)
+        kinetic = (p1 * p1).sum(-1) * h * expm1w(gamma * h) / (2 * m)
+        return (p1 * q0).sum(-1) + kinetic - torch.expm1(-gamma * h) * s0
+
+    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = −p0·q1 + |p0|² hφ(−γh)/2m + (1/E − 1)s1."""
+        h = as_step(h, q1)
+        kinetic = (p0 * p0).sum(-1) * h * expm1w(-gamma * h) / (2 * m)
+        return -(p0 * q1).sum(-1) + kinetic + torch.expm1(gamma * h) * s1
+
+    return Scene(
+        name="linear_drag",
+        description="linear drag, q̈ = −γq̇, in closed form",
+        dof=1,
+        coordinates=("q",),
+        units=("m",),
+        time_unit="s",
+        angles=(False,),
+        parameters={"m": m, "gamma": gamma},
+        hamiltonian=hamiltonian,
+        lagrangian=lagrangian,
+        momentum=lambda q, v, s: m * v,  # noqa: ARG005
+        velocity=lambda q, p, s: p / m,  # noqa: ARG005
+        flow=flow,
+        L_d=L_d,
+        exact=True,
+        L_d_rules=all_rules(lagrangian),
+        q_range=(-1.0, 1.0),
+        v_range=(-1.0, 1.0),
+        h=0.1,
+        H_plus=H_plus,
+        H_minus=H_minus,
+        examples=({"m": 1.7, "gamma": 0.6}, {"m": 0.6, "gamma": 0.0}),
+    )

@@ -1,0 +1,94 @@
+"""A contact system as a vector field to integrate: from L written out, from any H, or from any L."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.scenes.scene import State, StateFunction
+from herglotz.theory.continuous import derivatives, herglotz_acceleration, jacobian
+
+Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """ẋ for x = (q, y, s), where y is the momentum p or the velocity v, differentiable in x.
+
+    Parameters
+    ----------
+    field
+        (q, y, s) → (q̇, ẏ, ṡ, L_s), where L_s is the rate at which the contact form is scaled, ċ = c L_s.
+    start
+        (q, v, s) → y: where a velocity is known.
+    momentum
+        (q, y, s) → p.
+    """
+
+    field: Field
+    start: StateFunction
+    momentum: StateFunction
+
+    def vector_field(self, q: Tensor, y: Tensor, s: Tensor) -> State:
+        """(q̇, ẏ, ṡ)."""
+        return self.field(q, y, s)[:3]
+
+
+def herglotz_motion(
+    lagrangian: StateFunction,
+    momentum: StateFunction,
+    velocity: StateFunction,
+    force: StateFunction,  # (q, v, s) → L_q, (..., n)
+    rate: StateFunction,  # (q, v, s) → L_s, (...)
+) -> Motion:
+    """Everything written out, the fastest: q̇ = v(q, p, s), ṗ = L_q + L_s p, ṡ = L."""
+
+    def field(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        v = velocity(q, p, s)
+        L_s = rate(q, v, s)
+        return v, force(q, v, s) + L_s[..., None] * p, lagrangian(q, v, s), L_s
+
+    return Motion(field, momentum, lambda q, p, s: p)  # noqa: ARG005
+
+
+def constant_rate(L_s: float) -> StateFunction:
+    """The rate of a contact term linear in s, L = … + L_s s."""
+    return lambda q, v, s: torch.full_like(s, L_s)  # noqa: ARG005
+
+
+def hamiltonian_motion(hamiltonian: StateFunction, momentum: StateFunction) -> Motion:
+    """From H(q, p, s), differentiated: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H, L_s = −H_s."""
+
+    def field(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        H = derivatives(hamiltonian, q, p, s)
+        return H.D2, -(H.D1 + p * H.D3[..., None]), (p * H.D2).sum(-1) - H.L, -H.D3
+
+    return Motion(field, momentum, lambda q, p, s: p)  # noqa: ARG005
+
+
+def lagrangian_motion(lagrangian: StateFunction) -> Motion:
+    """From L(q, v, s) alone, differentiated, in the velocity: q̇ = v, v̇ by Herglotz's equations, ṡ = L."""
+
+    def field(q: Tensor, v: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        L = derivatives(lagrangian, q, v, s)
+        return v, herglotz_acceleration(lagrangian, q, v, s), L.L, L.D3
+
+    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        return derivatives(lagrangian, q, v, s).D2
+
+    return Motion(field, lambda q, v, s: v, momentum)  # noqa: ARG005
+
+
+def state_change(motion: Motion, q: Tensor, y: Tensor, s: Tensor) -> Tensor:
+    """The derivative of (q, y, s) ↦ (q, p, s), (..., 2n+1, 2n+1)."""
+    n = q.shape[-1]
+    x = torch.cat([q, y, s[..., None]], -1)
+
+    def change(x: Tensor) -> Tensor:
+        q, y, s = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
+        return torch.cat([q, motion.momentum(q, y, s), s[..., None]], -1)
+
+    return jacobian(change, x)[1]

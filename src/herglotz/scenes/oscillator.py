@@ -1,0 +1,154 @@
+"""The damped harmonic oscillator, q̈ = −Ω²q − γq̇: everything in closed form, at any damping.
+
+L = mv²/2 − mΩ²q²/2 − γs. With ω² = Ω² − γ²/4 (of either sign), E = e^{−γh}, S = sin(ωh)/ω, C = cos(ωh).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import Partials
+from herglotz.scenes.natural import Natural
+from herglotz.scenes.rules import all_rules, strang
+from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.special import as_step, cosw, sincw, versw
+
+
+@dataclass(frozen=True)
+class ExactOscillator:
+    """The exact discrete Lagrangian of the damped oscillator, with closed-form derivatives.
+
+    L_d = (E−1)s0 + (m/2S)[(E q0² + q1²) C − 2√E q0·q1] − (mγ/4)(q1² − E q0²)
+
+    evaluated in increments, (√E q0 − q1)² − (1 − C)(E q0² + q1²) for the bracket, so that small steps do not cancel.
+    Isotropic in any dimension. Singular at the conjugate points ωh = π, 2π, …
+
+    Source: section 3 of `docs/mathematics.md`.
+    """
+
+    m: float
+    omega0: float
+    gamma: float
+
+    def coefficients(self, h: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """√E − 1, m/S, 1 − C and C, each of the shape of h."""
+        x = (self.omega0**2 - self.gamma**2 / 4) * h**2
+        return torch.expm1(-0.5 * self.gamma * h), self.m / (h * sincw(x)), versw(x), cosw(x)
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """Return L_d, shape (...)."""
+        h = as_step(h, q0)
+        decay, k, versine, _ = self.coefficients(h)
+        E = (1.0 + decay) ** 2
+        u = decay[..., None] * q0 - (q1 - q0)  # √E q0 − q1
+        r0, r1 = E * (q0 * q0).sum(-1), (q1 * q1).sum(-1)
+        quadratic = 0.5 * k * ((u * u).sum(-1) - versine * (r0 + r1)) - 0.25 * self.m * self.gamma * (r1 - r0)
+        return torch.expm1(-self.gamma * h) * s0 + quadratic
+
+    def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
+        """Value, gradient and Hessian blocks; the blocks are constants, for L_d is quadratic."""
+        h = as_step(h, q0)
+        q0, q1 = torch.broadcast_tensors(q0, q1)
+        L = self(q0, q1, s0, h)
+        q0, q1 = (q.expand(*L.shape, q.shape[-1]) for q in (q0, q1))
+        decay, k, versine, C = (x[..., None] for x in self.coefficients(h))
+        root = 1.0 + decay
+        E = root**2
+        u = decay * q0 - (q1 - q0)
+        drag = 0.5 * self.m * self.gamma
+        D1 = k * (root * u - versine * E * q0) + drag * E * q0
+        D2 = -k * (u + versine * q1) - drag * q1
+        D3 = torch.expm1(-self.gamma * h).expand_as(L)
+        if order == 1:
+            return Partials(L, D1, D2, D3)
+        zero = torch.zeros_like(D1)
+        blocks = (E * (k * C + drag), -root * k, k * C - drag)
+        D11, D12, D22 = (torch.diag_embed(b.expand_as(D1)) for b in blocks)
+        return Partials(L, D1, D2, D3, D11, D12, D22, D13=zero, D23=zero, D33=torch.zeros_like(L))
+
+
+def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -> Scene:
+    """The damped harmonic oscillator q̈ = −ω₀²q − γq̇.
+
+    Parameters
+    ----------
+    m
+        Mass, kg.
+    omega0
+        Undamped angular frequency Ω, rad/s.
+    gamma
+        Damping rate γ, 1/s; γ = 2Ω is critical.
+
+    Raises
+    ------
+    InputError
+        If m ≤ 0.
+
+    Source: section 3 of `docs/mathematics.md`.
+    """
+    if not m > 0:
+        raise InputError(f"damped_oscillator: mass m must be > 0, got {m}")
+    L_d = ExactOscillator(m, omega0, gamma)
+    stiffness = m * omega0**2
+
+    def potential(q: Tensor) -> Tensor:
+        return 0.5 * stiffness * (q * q).sum(-1)
+
+    system = Natural(potential, gamma, m)
+
+    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
+        h = as_step(h, q)
+        x = (omega0**2 - gamma**2 / 4) * h**2
+        C, S, root = (y[..., None] for y in (cosw(x), h * sincw(x), torch.exp(-0.5 * gamma * h)))
+        q1 = root * (q * C + (p / m + 0.5 * gamma * q) * S)
+        p1 = root * (p * C - (stiffness * q + 0.5 * gamma * p) * S)
+        s1 = 0.5 * (p1 * q1).sum(-1) + torch.exp(-gamma * h) * (s - 0.5 * (p * q).sum(-1))
+        return q1, p1, s1
+
+    def H_plus(q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
+        """H⁺ = p1²/2a + (b/a)p1·q0 + E m²Ω²q0²/2a + (1−E)s0, a = m(C/S − γ/2), b = m√E/S."""
+        h = as_step(h, q0)
+        decay, k, _, C = L_d.coefficients(h)
+        a, root = k * C - 0.5 * m * gamma, 1.0 + decay
+        quadratic = 0.5 * (p1 * p1).sum(-1) + root * k * (p1 * q0).sum(-1)
+        quadratic = quadratic + 0.5 * m * stiffness * root**2 * (q0 * q0).sum(-1)
+        return quadratic / a - torch.expm1(-gamma * h) * s0
+
+    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = p0²/2a − (b/a)p0·q1 + m²Ω²q1²/(2Ea) + (1/E − 1)s1, a = m(C/S + γ/2), b = m/(√E S)."""
+        h = as_step(h, q1)
+        decay, k, _, C = L_d.coefficients(h)
+        a, root = k * C + 0.5 * m * gamma, 1.0 + decay
+        quadratic = 0.5 * (p0 * p0).sum(-1) - k / root * (p0 * q1).sum(-1)
+        quadratic = quadratic + 0.5 * m * stiffness / root**2 * (q1 * q1).sum(-1)
+        return quadratic / a + torch.expm1(gamma * h) * s1
+
+    return Scene(
+        name="damped_oscillator",
+        description="damped harmonic oscillator, q̈ = −ω₀²q − γq̇, in closed form at any damping",
+        dof=1,
+        coordinates=("q",),
+        units=("m",),
+        time_unit="s",
+        angles=(False,),
+        parameters={"m": m, "omega0": omega0, "gamma": gamma},
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
+        flow=flow,
+        L_d=L_d,
+        exact=True,
+        L_d_rules={**all_rules(system.lagrangian), "strang": strang(potential, m, gamma)},
+        q_range=(-1.5, 1.5),
+        v_range=(-1.5, 1.5),
+        h=0.1,
+        H_plus=H_plus,
+        H_minus=H_minus,
+        examples=({"m": 1.7, "omega0": 1.3, "gamma": 0.6}, {"m": 0.6, "omega0": 0.7, "gamma": 3.1}),
+    )

@@ -1,0 +1,62 @@
+"""Scenes by name."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable
+
+from herglotz.errors import InputError
+from herglotz.scenes.chain import chain
+from herglotz.scenes.double_pendulum import double_pendulum
+from herglotz.scenes.driven_pendulum import driven_pendulum
+from herglotz.scenes.kepler import kepler
+from herglotz.scenes.linear_drag import linear_drag
+from herglotz.scenes.nonlinear_action import nonlinear_action
+from herglotz.scenes.oscillator import damped_oscillator
+from herglotz.scenes.parachute import parachute
+from herglotz.scenes.pendulum import damped_pendulum
+from herglotz.scenes.quadratic_drag import quadratic_drag
+from herglotz.scenes.rigid_body import rigid_body
+from herglotz.scenes.scene import Scene
+
+SCENES: dict[str, Callable[..., Scene]] = {
+    make.__name__: make
+    for make in (
+        chain,
+        damped_oscillator,
+        damped_pendulum,
+        double_pendulum,
+        driven_pendulum,
+        kepler,
+        linear_drag,
+        nonlinear_action,
+        parachute,
+        quadratic_drag,
+        rigid_body,
+    )
+}
+
+
+def scene_names() -> tuple[str, ...]:
+    """The names that `scene` knows, sorted."""
+    return tuple(sorted(SCENES))
+
+
+def scene(name: str, **parameters: float) -> Scene:
+    """The scene called `name`, with its default parameters overridden by `parameters`.
+
+    Raises
+    ------
+    InputError
+        If there is no such scene or parameter, or a value is not a finite number.
+    """
+    if name not in SCENES:
+        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(scene_names())}")
+    known = tuple(inspect.signature(SCENES[name]).parameters)
+    for key, value in parameters.items():
+        if key not in known:
+            raise InputError(f"scene {name!r} has no parameter {key!r}; it takes {', '.join(known)}")
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise InputError(f"parameter {key!r} of scene {name!r} must be a finite number, got {value!r}")
+    return SCENES[name](**parameters)

@@ -1,0 +1,192 @@
+"""Quadrature rules: a continuous Lagrangian L(q, v, s) becomes a discrete one, L_d(q0, q1, s0, h).
+
+With v = (q1 − q0)/h and q̄ = (q0 + q1)/2. Once there is damping the order depends on *where s is taken* (trap 1 of
+`docs/mathematics.md`); ORDERS says what each rule reaches, and a test measures it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.scenes.galerkin import lobatto4, lobatto6
+from herglotz.scenes.implicit import fixed_point
+from herglotz.scenes.special import as_step
+from herglotz.theory.continuous import Lagrangian
+
+Rule = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
+
+
+def left(L: Lagrangian) -> Rule:
+    """L_d = h L(q0, v, s0): order 1, c = 1 + h L_s, which vanishes at h = 1/γ for the linear damping L_s = −γ."""
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        return h * L(q0, _velocity(q0, q1, h), s0)
+
+    return L_d
+
+
+def right(L: Lagrangian) -> Rule:
+    """L_d = h L(q1, v, s1) with s1 = s0 + L_d, implicit in one scalar: order 1, the adjoint of `left`.
+
+    c = 1/(1 − hL_s) for linear damping.
+    """
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        v = _velocity(q0, q1, h)
+        return _implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
+
+    return L_d
+
+
+def midpoint(L: Lagrangian) -> Rule:
+    """L_d = h L(q̄, v, s0 + L_d/2), implicit in one scalar: order 2, c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
+
+    Its own adjoint. Where Newton's method for the scalar does not converge the value is NaN.
+    """
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        q, v = 0.5 * (q0 + q1), _velocity(q0, q1, h)
+        return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
+
+    return L_d
+
+
+def midpoint_heun(L: Lagrangian) -> Rule:
+    """L_d = h L(q̄, v, s0 + (h/2) L(q̄, v, s0)): order 2, explicit."""
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        q, v = 0.5 * (q0 + q1), _velocity(q0, q1, h)
+        return h * L(q, v, s0 + 0.5 * h * L(q, v, s0))
+
+    return L_d
+
+
+def midpoint_plain(L: Lagrangian) -> Rule:
+    """L_d = h L(q̄, v, s0): order 1 with damping, 2 without. The trap, kept to be measured; use `midpoint_heun`."""
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        return h * L(0.5 * (q0 + q1), _velocity(q0, q1, h), s0)
+
+    return L_d
+
+
+def trapezoid(L: Lagrangian) -> Rule:
+    """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0 + L_d)], implicit in one scalar: order 2, its own adjoint.
+
+    c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
+    """
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        v = _velocity(q0, q1, h)
+        start = L(q0, v, s0)
+        return _implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
+
+    return L_d
+
+
+def trapezoid_heun(L: Lagrangian) -> Rule:
+    """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0 + h L(q0, v, s0))]: order 2, explicit.
+
+    The second stage has the Euler value of s1; its O(h²) error enters L_d at O(h³), which order 2 allows.
+    """
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        v = _velocity(q0, q1, h)
+        start = L(q0, v, s0)
+        return 0.5 * h * (start + L(q1, v, s0 + h * start))
+
+    return L_d
+
+
+def trapezoid_plain(L: Lagrangian) -> Rule:
+    """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0)]: order 1 with damping, 2 without. The trap, kept to be measured."""
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        v = _velocity(q0, q1, h)
+        return 0.5 * h * (L(q0, v, s0) + L(q1, v, s0))
+
+    return L_d
+
+
+def adjoint(L_d: DiscreteLagrangian) -> Rule:
+    """L_d* of the adjoint method (Φ̃_{−h})⁻¹: L_d* = −L_d(q1, q0, s0 + L_d*, −h), implicit in one scalar.
+
+    `right` is the adjoint of `left`; a method followed by its adjoint, each over h/2, has even order.
+    """
+
+    def reversed_step(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        return _implicit(lambda x: -L_d(q1, q0, s0 + x, -h), q0, q1, s0, h)
+
+    return reversed_step
+
+
+def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rule:
+    """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, explicit to step.
+
+    It generates the splitting damp(h/2) ∘ kick(h/2) ∘ drift(h) ∘ kick(h/2) ∘ damp(h/2) of H = |p|²/2m + V(q) + γs into
+    γs, V and |p|²/2m; `herglotz.theory.ContactSplitting` steps it without a solve. c = E, exactly.
+    """
+
+    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        h = as_step(h, q0)
+        delta = q1 - q0
+        action = 0.5 * m / h * (delta * delta).sum(-1) - 0.5 * h * (potential(q0) + potential(q1))
+        return torch.expm1(-gamma * h) * s0 + torch.exp(-0.5 * gamma * h) * action
+
+    return L_d
+
+
+RULES: dict[str, Callable[[Lagrangian], DiscreteLagrangian]] = {
+    "left": left,
+    "right": right,
+    "midpoint": midpoint,
+    "midpoint_heun": midpoint_heun,
+    "midpoint_plain": midpoint_plain,
+    "trapezoid": trapezoid,
+    "trapezoid_heun": trapezoid_heun,
+    "trapezoid_plain": trapezoid_plain,
+    "lobatto4": lobatto4,
+    "lobatto6": lobatto6,
+}
+
+# Order on a damped problem, measured in tests/unit/scenes/test_rules.py.
+ORDERS = {
+    "left": 1,
+    "right": 1,
+    "midpoint": 2,
+    "midpoint_heun": 2,
+    "midpoint_plain": 1,
+    "trapezoid": 2,
+    "trapezoid_heun": 2,
+    "trapezoid_plain": 1,
+    "lobatto4": 4,
+    "lobatto6": 6,
+}
+
+
+def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:
+    """Every rule applied to L, by name."""
+    return {name: rule(L) for name, rule in RULES.items()}
+
+
+def _velocity(q0: Tensor, q1: Tensor, h: Tensor) -> Tensor:
+    return (q1 - q0) / h[..., None]
+
+
+def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+    """The scalar x = action(x) of each sample, from 0."""
+    shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
+    return fixed_point(lambda x: action(x[..., 0])[..., None], s0.new_zeros(*shape, 1))[..., 0]

@@ -1,0 +1,80 @@
+"""A scene: a mechanical system with a known answer, as data and functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from herglotz.mechanics import DiscreteLagrangian
+
+StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
+State = tuple[Tensor, Tensor, Tensor]
+Step = Tensor | float
+Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), a number or one a coordinate
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One contact system with its continuous and discrete descriptions.
+
+    Everything is batched over leading dimensions: positions, velocities and momenta are (..., n), the action variable
+    s is (...), the step h is a number or a tensor (...). Units follow `units` and `time_unit`.
+
+    Parameters
+    ----------
+    hamiltonian, lagrangian
+        H(q, p, s) and L(q, v, s), shape (...), with ṡ = L and H = v·L_v − L.
+    momentum, velocity
+        p = L_v(q, v, s) and v = H_p(q, p, s), shape (..., n), inverse to each other.
+    flow
+        (q, p, s, h) → (q1, p1, s1): closed form where there is one, else the high-accuracy reference flow.
+    L_d
+        The principal discrete Lagrangian L_d(q0, q1, s0, h). `exact` says whether it generates `flow` exactly.
+    L_d_rules
+        The discretisations offered for this scene, by name; `exact` never among them.
+    H_plus, H_minus
+        Right and left discrete Hamiltonians of `L_d`, H⁺(q0, p1, s0, h) and H⁻(p0, q1, s1, h) with the conventions of
+        errata E5 and E9; None where no closed form is known.
+    q_range, v_range, h
+        Typical initial positions, initial velocities and step: where examples and generated data start. A range is
+        (low, high), each a number or a tuple of `dof` numbers.
+    numerical
+        The exact L_d computed by shooting (`herglotz.scenes.exact`), for a scene without a closed form.
+    examples
+        Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
+    at, drive
+        Of a scene with inputs: the scene at the inputs u, (..., m), held constant, and the given inputs, t (...) ↦ u.
+    """
+
+    name: str
+    description: str
+    dof: int
+    coordinates: tuple[str, ...]
+    units: tuple[str, ...]
+    time_unit: str
+    angles: tuple[bool, ...]
+    parameters: Mapping[str, float]
+    hamiltonian: StateFunction
+    lagrangian: StateFunction
+    momentum: StateFunction
+    velocity: StateFunction
+    flow: Callable[[Tensor, Tensor, Tensor, Step], State]
+    L_d: DiscreteLagrangian
+    exact: bool
+    L_d_rules: Mapping[str, DiscreteLagrangian]
+    q_range: Range
+    v_range: Range
+    h: float
+    H_plus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
+    H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
+    numerical: DiscreteLagrangian | None = None
+    examples: tuple[Mapping[str, float], ...] = ()
+    at: Callable[[Tensor], Scene] | None = None
+    drive: Callable[[Tensor], Tensor] | None = None
+
+    @property
+    def L_d_exact(self) -> DiscreteLagrangian | None:
+        """The exact discrete Lagrangian: `L_d` where it is one, else the numerical one, else None."""
+        return self.L_d if self.exact else self.numerical

@@ -1,0 +1,167 @@
+"""The derivative of one step, by the implicit-function theorem on the solved step equation.
+
+A step solves F(Δ; q0, p0, s0, h, u) = 0 and hands on q1 = q0 + Δ, p1 and s1 = s0 + L, all functions of Δ and of what
+the step starts from, w = (q0, p0, s0, h, u). Hence
+
+    dΔ/dw = −F_Δ⁻¹ F_w,    dp1/dw = p1_w + p1_Δ dΔ/dw,    ds1/dw = ds0/dw + L_w + L_Δ dΔ/dw.
+
+The partial derivatives of F, p1 and L are automatic derivatives of the first-order step equation, forward-mode for a
+model: no model has a line of its own.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import DiscreteLagrangian
+from herglotz.models import ContactLagrangian
+from herglotz.stepping.engine import driven_by
+from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.state import State, Step
+
+# (q0, p0, s0, h, Δ, u) → F (..., n), p1 (..., n), L (...)
+StepFunctions = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor | None], tuple[Tensor, Tensor, Tensor]]
+Slopes = Callable[[Callable[[Tensor], Tensor], Tensor], Tensor]
+
+
+class Linearised(NamedTuple):
+    """A step and its derivatives; rows are (q, p, s) after the step. NaN where the step failed."""
+
+    step: Step
+    by_state: Tensor  # (..., 2n+1, 2n+1) d(q, p, s)′ / d(q, p, s)
+    by_h: Tensor  # (..., 2n+1)
+    by_input: Tensor | None  # (..., 2n+1, m), where the step has an input
+
+
+def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, step: Step) -> Linearised:
+    """The derivatives of a solved step of L_d.
+
+    Parameters
+    ----------
+    L_d
+        Any discrete Lagrangian.
+    state, h, u
+        What the step started from; h is a scalar or (...), u is (m,) or (..., m).
+    step
+        The solved step.
+    """
+    q, p, s = (x.detach() for x in state)
+    h = h.detach().expand(s.shape)
+    u = None if u is None else u.detach().expand(*s.shape, u.shape[-1])
+    delta = step.state.q.detach() - q
+    slopes = forward_slopes if isinstance(L_d, ContactLagrangian) else backward_slopes
+    with torch.no_grad():
+        J = step_jacobian(step_functions(L_d), q, p, s, h, delta, u, slopes)
+    size = 2 * q.shape[-1] + 1
+    return Linearised(step, J[..., :size], J[..., size], None if u is None else J[..., size + 1 :])
+
+
+def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
+    """F, p1 and L of L_d as one pure function of tensors: by terms where the model's terms are known, else by jets."""
+
+    def functions(
+        q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, u: Tensor | None
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        maker = model_equation(L_d, fold=False)
+        if maker is not None:
+            form = maker.at(q, p, s, h, u, True)
+            x = delta
+        else:
+            increments = hasattr(L_d, "partials_increment")
+            form = PartialsEquation(driven_by(L_d, u), q, p, s, h, 1, increments)
+            x = delta if increments else q + delta
+        point = form(x, False)
+        end = form.end(x, point)
+        return point.F, end.p1, end.L
+
+    return functions
+
+
+def step_jacobian(
+    functions: StepFunctions,
+    q: Tensor,  # (..., n)
+    p: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+    h: Tensor,  # (...)
+    delta: Tensor,  # (..., n) the solution of F = 0
+    u: Tensor | None,  # (..., m)
+    slopes: Slopes | None = None,  # how to differentiate; default `forward_slopes`
+) -> Tensor:
+    """d(q, p, s)′ / d(q, p, s, h, u) at a solved step, (..., 2n+1, 2n+2+m): a pure function of tensors."""
+    n = q.shape[-1]
+    sizes = [n, n, 1, 1, *(() if u is None else (u.shape[-1],)), n]
+    point = torch.cat([q, p, s[..., None], h[..., None], *(() if u is None else (u,)), delta], -1)
+
+    def values(z: Tensor) -> Tensor:
+        q, p, s, h, *u, delta = z.split(sizes, -1)
+        F, p1, L = functions(q, p, s[..., 0], h[..., 0], delta, u[0] if u else None)
+        return torch.cat([F, p1, L[..., None]], -1)
+
+    rows = (slopes or forward_slopes)(values, point)  # (..., 2n+1, 3n+2+m) of F, p1 and L
+    by_start, by_delta = rows[..., :-n], rows[..., -n:]
+    ddelta = -eliminate(by_delta[..., :n, :], by_start[..., :n, :])
+    ends = by_start[..., n:, :] + by_delta[..., n:, :] @ ddelta
+    start = torch.eye(2 * n + 1, by_start.shape[-1], dtype=q.dtype, device=q.device)  # of (q, p, s) itself
+    return torch.cat([ddelta + start[:n], ends[..., :n, :], ends[..., n:, :] + start[2 * n :]], -2)
+
+
+def forward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
+    """The Jacobian (..., m, k) of `values` (..., k) → (..., m) in forward mode, sample by sample."""
+    directions = torch.eye(point.shape[-1], dtype=point.dtype, device=point.device)
+    along = lambda tangent: torch.func.jvp(values, (point,), (tangent.expand_as(point),))[1]  # noqa: E731
+    with warnings.catch_warnings():  # torch's own use of torch.jit, when it first loads forward-mode derivatives
+        warnings.filterwarnings("ignore", "`torch.jit.script` is", DeprecationWarning)
+        return torch.func.vmap(along)(directions).movedim(0, -1)
+
+
+def backward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
+    """The same row by row in reverse mode, which goes through derivatives that are made by autograd themselves."""
+    with torch.enable_grad():
+        point = point.detach().requires_grad_()
+        out = values(point)
+        rows = [
+            torch.autograd.grad(out[..., i].sum(), point, retain_graph=True, materialize_grads=True)[0]
+            for i in range(out.shape[-1])
+        ]
+    return torch.stack(rows, -2)
+
+
+def eliminate(A: Tensor, b: Tensor) -> Tensor:
+    """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, AOTInductor calls it slowly.
+
+    Parameters
+    ----------
+    A, b
+        (..., n, n) and (..., n, k); n is small.
+
+    Returns
+    -------
+    Tensor
+        (..., n, k); inf or nan where A is singular.
+    """
+    n = b.shape[-2]
+    if n == 1:
+        return b / A
+    if n == 2:  # Cramer's rule: half of the operations
+        (a, c), (d, e) = ((A[..., i, :1], A[..., i, 1:]) for i in range(2))
+        (f, g), rate = b.unbind(-2), 1 / (a * e - c * d)
+        return torch.stack([(e * f - c * g) * rate, (a * g - d * f) * rate], -2)
+    rows = [torch.cat([A[..., i, :], b[..., i, :]], -1) for i in range(n)]
+    for k in range(n):
+        for i in range(k + 1, n):
+            swap = (rows[i][..., k].abs() > rows[k][..., k].abs())[..., None]
+            rows[k], rows[i] = torch.where(swap, rows[i], rows[k]), torch.where(swap, rows[k], rows[i])
+        for i in range(k + 1, n):
+            rows[i] = rows[i] - (rows[i][..., k] / rows[k][..., k])[..., None] * rows[k]
+    x: list[Tensor] = []
+    for i in reversed(range(n)):
+        value = rows[i][..., n:]
+        for j, known in zip(range(n - 1, i, -1), x, strict=True):
+            value = value - rows[i][..., j : j + 1] * known
+        x.append(value / rows[i][..., i : i + 1])
+    return torch.stack(x[::-1], -2)

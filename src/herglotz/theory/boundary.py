@@ -1,0 +1,272 @@
+"""Discrete curves as critical points of the Herglotz action: fixed ends, or an initial function S and a fixed end.
+
+Newton's method on all interior points at once. The second variation couples neighbours only, once the change of s is
+kept as an unknown beside that of q: block tridiagonal, blocks of size n + 1. Its elimination is the Riccati recursion
+of the Hamilton–Jacobi equation, and a vanishing pivot is a caustic.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
+from herglotz.mechanics.root import find_root
+from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
+from herglotz.stepping.newton import Status
+from herglotz.stepping.state import Rollout, State, Step, StepError, step_sizes
+from herglotz.stepping.stepper import Stepper
+from herglotz.theory.action import curve_action, curve_partials
+from herglotz.theory.caustics import Opening, opening
+from herglotz.theory.function_germ import Function, FunctionGerm, germ
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Critical points of the action, one per sample; NaN where the status is not CONVERGED."""
+
+    q: Tensor  # (..., N+1, n)
+    p: Tensor  # (..., N+1, n)
+    s: Tensor  # (..., N+1)
+    sigma: Tensor  # (..., N+1)
+    status: Tensor  # (...) Status values
+    residual: Tensor  # (...) last Newton step over the size of the positions
+    opening: Opening  # how far every sample is from a caustic
+    iterations: int
+
+    @property
+    def ok(self) -> Tensor:
+        """(...) whether the sample converged."""
+        return self.status == Status.CONVERGED
+
+    def failures(self) -> list[str]:
+        """One line for every sample that failed: which condition, where."""
+        lines = []
+        for index in (~self.ok).nonzero().tolist():
+            at = tuple(index)
+            name = Status(int(self.status[at])).name
+            why = f"residual {float(self.residual[at]):.3g}; start from a better guess"
+            if name == "SINGULAR":
+                why = f"caustic: ∂q_N has opened by {float(self.opening.final[at]):.2g} only, or c = 0"
+                if int(self.opening.crossed[at]) >= 0:
+                    why = f"caustic crossed in step {int(self.opening.crossed[at])}"
+            lines.append(f"sample {at}: {name}: {why}")
+        return lines
+
+
+def boundary_value(
+    L_d: DiscreteLagrangian,
+    q_start: Tensor,  # (..., n)
+    q_end: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    *,
+    h: Tensor | float,
+    steps: int | None = None,
+    guess: Tensor | None = None,
+    throw: bool = False,
+) -> Curve:
+    """The discrete curve from q_start to q_end on which s_N is stationary: R_1 = … = R_{N−1} = 0.
+
+    Parameters
+    ----------
+    L_d
+        The discrete Lagrangian.
+    q_start, q_end
+        (..., n) fixed ends.
+    s0
+        (...) initial action.
+    h, steps
+        A scalar h with a count N, or (N,) or (..., N) steps.
+    guess
+        (..., N+1, n) a curve to start from, of which the interior is used; default the straight line.
+    throw
+        Raise `StepError` if a sample fails.
+
+    Returns
+    -------
+    Curve
+        Status SINGULAR where the ends are conjugate: infinitely many solutions, or none. A curve may have *crossed* a
+        caustic (`opening.crossed`): then it is stationary, not minimal.
+
+    Raises
+    ------
+    InputError
+        If a setting does not fit or L_d comes with forces.
+    StepError
+        With `throw`, naming the samples.
+
+    Source: discrete Herglotz action and equations of the paper.
+    """
+    h_all = step_sizes(torch.as_tensor(h, dtype=q_start.dtype, device=q_start.device), steps)
+    batch = torch.broadcast_shapes(q_start.shape[:-1], q_end.shape[:-1], s0.shape, h_all.shape[:-1])
+    first, last = (q.detach().expand(*batch, q.shape[-1]) for q in (q_start, q_end))
+    s = s0.detach().expand(batch)
+    line = straight_line(first, last, h_all) if guess is None else guess
+    if line.shape != (*batch, h_all.shape[-1] + 1, q_end.shape[-1]):
+        raise InputError(f"guess needs shape (..., N+1, n) with N = {h_all.shape[-1]}, got {tuple(line.shape)}")
+    return _critical(L_d, line[..., 1:-1, :], [first, last], s, h_all, lambda _: None, throw, beyond=True)
+
+
+def family_value(
+    L_d: DiscreteLagrangian,
+    S: Function,
+    y: Tensor,  # (..., n) q_N
+    h: Tensor,  # (N,) or (..., N)
+    guess: Tensor,  # (..., N, n) q_0 … q_{N−1}
+    beyond: bool,
+    throw: bool,
+) -> Curve:
+    """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0)."""
+    return _critical(L_d, guess, [y], None, h, lambda q0: germ(S, q0), throw, beyond)
+
+
+def initial_value(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    *,
+    h: Tensor | float,
+    steps: int | None = None,
+) -> Rollout:
+    """The discrete Cauchy problem: the solution with given q_0, q_1 and s_0.
+
+    Returns
+    -------
+    Rollout
+        N+1 states, the first of them (q_0, p_0, s_0) = FL⁻(q_0, q_1, s_0).
+    """
+    h_all = step_sizes(torch.as_tensor(h, dtype=q0.dtype, device=q0.device), steps)
+    P = partials(L_d, q0, q1, s0, h_all[..., 0])
+    ok = torch.zeros_like(P.L, dtype=torch.uint8)
+    states = [State(q0.expand(P.D1.shape), momentum_minus(P), s0.expand(P.L.shape))]
+    states.append(State(q1.expand(P.D1.shape), momentum_plus(P), s0 + P.L))
+    results = [Step(states[-1], P.c, ok, torch.zeros_like(P.L), 0)]
+    stepper = Stepper(L_d)
+    for k in range(1, h_all.shape[-1]):
+        guess = 2 * states[-1].q - states[-2].q
+        results.append(stepper.step(states[-1], h_all[..., k], guess))
+        states.append(results[-1].state)
+    return Rollout.of(states, results)
+
+
+def straight_line(q_start: Tensor, q_end: Tensor, h: Tensor) -> Tensor:
+    """Uniform motion between the ends at the times of h, (..., N+1, n)."""
+    t = torch.cat([torch.zeros_like(h[..., :1]), h.cumsum(-1)], -1)
+    t = (t / t[..., -1:])[..., None]
+    return (1 - t) * q_start[..., None, :] + t * q_end[..., None, :]
+
+
+def _critical(
+    L_d: DiscreteLagrangian,
+    guess: Tensor,  # (..., K, n) the unknown points
+    ends: list[Tensor],  # [q_N], or [q_0, q_N]
+    s0: Tensor | None,  # None: S(q_0)
+    h: Tensor,
+    start: Callable[[Tensor], FunctionGerm | None],
+    throw: bool,
+    beyond: bool,
+) -> Curve:
+    n, fixed = ends[-1].shape[-1], len(ends) == 2
+
+    def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, FunctionGerm | None]:
+        interior = x.unflatten(-1, guess.shape[-2:]) if x.shape[-1] else guess
+        q = torch.cat([*(e[..., None, :] for e in ends[:-1]), interior, ends[-1][..., None, :]], -2)
+        S = start(q[..., 0, :])
+        s = curve_action(L_d, q, S.S if s0 is None and S is not None else _given(s0), h)
+        return q, s, curve_partials(L_d, q, s, h, order=2), S
+
+    def equations(x: Tensor) -> tuple[Tensor, Blocks]:
+        _, _, P, S = curve(x)
+        F, blocks = _system(P, S)
+        return F.flatten(-2), blocks
+
+    def solver(blocks: tuple[Tensor, ...], F: Tensor) -> Tensor:
+        rhs = F.unflatten(-1, guess.shape[-2:])
+        rhs = torch.cat([rhs, torch.zeros_like(rhs[..., :1])], -1)
+        return solve_blocks(blocks, rhs)[..., :n].flatten(-2)  # type: ignore[arg-type]
+
+    with torch.no_grad():
+        x = guess.detach().flatten(-2)
+        size = torch.cat([e.abs() for e in ends] + [x.abs()], -1).amax(-1, keepdim=True)
+        if x.shape[-1]:
+            root = find_root(equations, x, size.expand(x.shape), solver)
+            x, converged, error, iterations = root.x, root.converged, root.error, root.iterations
+        else:
+            converged, error, iterations = torch.ones_like(size[..., 0], dtype=torch.bool), 0 * size[..., 0], 0
+        q, s, P, S = curve(x)
+        p0 = momentum_minus(P)[..., 0, :] if S is None else S.dS
+        p = torch.cat([p0[..., None, :], momentum_plus(P)], -2)
+        family = opening(P, p[..., :-1, :], _parameters(q[..., 0, :], None if fixed else S))
+        finite = torch.isfinite(s).all(-1) & torch.isfinite(q).all(-1).all(-1)
+        singular = (family.final < 1e3 * torch.finfo(q.dtype).eps) | (P.c == 0).any(-1) | ~torch.isfinite(error)
+        if not beyond:
+            singular = singular | (family.crossed >= 0)
+        status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+        status = torch.where(singular, int(Status.SINGULAR), status)
+        status = torch.where(finite, status, int(Status.DIVERGED)).to(torch.uint8)
+        nan = torch.where(status == Status.CONVERGED, 0.0, torch.nan).to(q)
+        sigma = torch.cat([torch.ones_like(s[..., :1]), P.c.cumprod(-1)], -1)
+        out = Curve(
+            q + nan[..., None, None],
+            p + nan[..., None, None],
+            s + nan[..., None],
+            sigma + nan[..., None],
+            status,
+            error,
+            family,
+            iterations,
+        )
+    if throw and not bool(out.ok.all()):
+        raise StepError(f"no discrete curve at {'; '.join(out.failures()[:3])}")
+    return out
+
+
+def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
+    """The equations R_k = 0 at the unknown points and their blocks for (δq_k, δs_k)."""
+    batch = (slice(None),) * (P.L.ndim - 1)
+    later, earlier = (*batch, slice(1, None)), (*batch, slice(None, -1))
+    p, slope = P.D2, P.D22  # incoming momentum and its derivative by q_k
+    if S is None:
+        here, p, slope = P.map(lambda x: x[later]), p[..., :-1, :], slope[..., :-1, :, :]
+        before = P.map(lambda x: x[earlier])
+    else:
+        here = P
+        p = torch.cat([S.dS[..., None, :], p[..., :-1, :]], -2)
+        slope = torch.cat([S.d2S[..., None, :, :], slope[..., :-1, :, :]], -3)
+        before = P.map(lambda x: torch.roll(x, 1, P.L.ndim - 1))  # its first entry, the lower block of row 0, is unused
+    c = here.c[..., None]
+    F = here.D1 + c * p
+    diagonal = _block(
+        here.D11 + p[..., :, None] * here.D13[..., None, :] + c[..., None] * slope,
+        here.D13 + p * here.D33[..., None],
+        -p,
+        torch.ones_like(here.L),
+    )
+    zero = torch.zeros_like(p)
+    upper = _block(here.D12 + p[..., :, None] * here.D23[..., None, :], zero, zero, torch.zeros_like(here.L))
+    lower = _block(c[..., None] * before.D12.mT, c * before.D23, -before.D1, -before.c)
+    return F, (diagonal, upper, lower)
+
+
+def _block(qq: Tensor, qs: Tensor, sq: Tensor, ss: Tensor) -> Tensor:
+    """[[qq, qs], [sq, ss]], shape (..., n+1, n+1)."""
+    bottom = torch.cat([sq, ss[..., None]], -1)
+    return torch.cat([torch.cat([qq, qs[..., None]], -1), bottom[..., None, :]], -2)
+
+
+def _parameters(q0: Tensor, S: FunctionGerm | None) -> Tensor:
+    """Derivative of (q_0, p_0, s_0) by the family's parameter: p_0 at fixed q_0 and s_0, or q_0 along dS."""
+    eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device).expand(*q0.shape, q0.shape[-1])
+    if S is None:
+        return torch.cat([torch.zeros_like(eye), eye, torch.zeros_like(eye[..., :1, :])], -2)
+    return torch.cat([eye, S.d2S, S.dS[..., None, :]], -2)
+
+
+def _given(s0: Tensor | None) -> Tensor:
+    assert s0 is not None
+    return s0

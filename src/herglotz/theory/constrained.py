@@ -1,0 +1,210 @@
+"""Holonomic constraints g(q) = 0 on the steps of any discrete Lagrangian (RATTLE with the conformal factor).
+
+    c p_k + D1 L_d(q_k, q_{k+1}, s_k) = Dg(q_k)ᵀλ,    g(q_{k+1}) = 0        solved for (q_{k+1}, λ)
+    p_{k+1} = D2 L_d + Dg(q_{k+1})ᵀμ,                 Dg · v(q_{k+1}, p_{k+1}, s_{k+1}) = 0
+
+with v = H_p the velocity. The projection by μ changes the next λ and nothing else: the positions do not feel it. Of a
+symmetry of L_d and g the momentum J obeys J_{k+1} = c_k J_k, as without constraints.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    Partials,
+    momentum_jacobian,
+    momentum_plus,
+    momentum_residual,
+    partials,
+)
+from herglotz.mechanics.root import Root, find_root
+from herglotz.stepping.newton import Status
+from herglotz.stepping.rollout import Plan, roll_out
+from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
+from herglotz.theory.continuous import jacobian
+
+Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
+Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)
+
+PROJECTIONS = 8  # Newton steps for μ at most; where v is linear in p the first is exact
+
+
+class ConstrainedStepper:
+    """Φ̃ on the constraint manifold {g = 0, Dg·v = 0}.
+
+    Parameters
+    ----------
+    L_d
+        Discrete Lagrangian in the ambient coordinates.
+    constraint
+        g(q), (..., n) → (..., m), differentiable by autograd; its rows Dg must be independent where it vanishes.
+    velocity
+        v = H_p(q, p, s), (..., n), e.g. a scene's; for a constant mass p / m.
+    max_iterations
+        Bound on Newton iterations.
+    throw
+        Raise `StepError` at the first sample that fails.
+
+    Source: section 6 of `docs/mathematics.md`.
+    """
+
+    def __init__(
+        self,
+        L_d: DiscreteLagrangian,
+        constraint: Constraint,
+        velocity: Velocity,
+        *,
+        max_iterations: int = 30,
+        throw: bool = False,
+    ):
+        self.L_d, self.constraint, self.velocity = L_d, constraint, velocity
+        self.max_iterations, self.throw = max_iterations, throw
+
+    def project(self, state: State) -> State:
+        """The same position and action with the momentum nearest in the constraint forces: p + Dgᵀμ, Dg·v = 0."""
+        q, p, s = check_state(state)
+        return State(q, self._projected(q, p, s, self._rows(q)[1]), s)
+
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
+        """One step: solve for (q1, λ) → momentum → projection → action.
+
+        Differentiable with respect to the state, h and the parameters of L_d (once).
+
+        Parameters
+        ----------
+        state
+            (q, p, s) with g(q) = 0; a p off the tangent space is as good as its projection.
+        h
+            Time step > 0, scalar or (...).
+        guess
+            (..., n) near q1; default q + h v.
+
+        Returns
+        -------
+        Step
+            `residual` is the last Newton step relative to the size of q. NaN where the status is not
+            `Status.CONVERGED`.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit or h is not positive.
+        """
+        state = check_state(state)
+        h = check_h(h, state.q)
+        q1, _, root = self._solve(state, h, guess)
+        P = partials(self.L_d, state.q, q1, state.s, h)
+        s1 = state.s + P.L
+        p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])
+        new, c = State(q1, p1, s1), P.c
+        status = self._status(root, new, c)
+        failed = status != Status.CONVERGED
+        if bool(failed.any()):
+            nan = torch.where(failed, torch.nan, torch.zeros_like(s1))
+            new, c = State(q1 + nan[..., None], p1 + nan[..., None], s1 + nan), c + nan
+        if self.throw:
+            throw_failure(status, root.error)
+        return Step(new, c, status, root.error, root.iterations)
+
+    def multiplier(self, state: State, h: Tensor | float) -> Tensor:
+        """λ of one step, (..., m); 2λ/h tends to the constraint's force (half of each impulse acts at each end)."""
+        state = check_state(state)
+        return self._solve(state, check_h(h, state.q), None)[1]
+
+    def rollout(
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        every: int = 1,
+    ) -> Rollout:
+        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
+        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        h_all = step_sizes(check_h(h, q), steps)
+        plan = Plan(h_all.shape[-1], every)
+        return roll_out(
+            start,
+            h_all,
+            lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess if k else None), None),
+            plan,
+            None,
+        )
+
+    def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """G(q) and Dg(q), (..., m) and (..., m, n)."""
+        g, Dg = jacobian(self.constraint, q)
+        if g.shape[:-1] != q.shape[:-1] or not 0 < g.shape[-1] < q.shape[-1]:
+            raise InputError(
+                f"constraint must map (..., {q.shape[-1]}) to (..., m) with 0 < m < {q.shape[-1]}; "
+                f"it gave {tuple(g.shape)} for {tuple(q.shape)}"
+            )
+        return g, Dg
+
+    def _solve(self, state: State, h: Tensor, guess: Tensor | None) -> tuple[Tensor, Tensor, Root]:
+        """q1 and λ, with their derivatives where gradients are on."""
+        q0, p0, s0 = state
+        n = q0.shape[-1]
+        Dg0 = self._rows(q0)[1]
+        m = Dg0.shape[-2]
+
+        def balance(x: Tensor, order: int) -> tuple[Tensor, Tensor, Partials]:
+            P = partials(self.L_d, q0, x[..., :n], s0, h, order)
+            g1, Dg1 = self._rows(x[..., :n])
+            F = torch.cat([momentum_residual(P, p0) - (Dg0.mT @ x[..., n:, None])[..., 0], g1], -1)
+            return F, Dg1, P
+
+        def equations(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+            F, Dg1, P = balance(x, 2)
+            upper = torch.cat([momentum_jacobian(P, p0), -Dg0.mT], -1)
+            lower = torch.cat([Dg1, Dg1.new_zeros(*Dg1.shape[:-1], m)], -1)
+            return F, (torch.cat([upper, lower], -2),)
+
+        with torch.no_grad():
+            if guess is None:
+                guess = q0 + h[..., None] * self.velocity(q0, p0, s0)
+            start = torch.cat([guess, Dg0.new_zeros(*q0.shape[:-1], m)], -1)
+            # λ is a momentum over a slope of g: its size is that of the terms it balances, gravity's impulse at rest.
+            size = torch.maximum(q0.abs().amax(-1, keepdim=True), (guess - q0).abs().amax(-1, keepdim=True))
+            slope = Dg0.abs().amax((-2, -1))[..., None]
+            P = partials(self.L_d, q0, guess, s0, h)
+            impulse = (P.c[..., None] * p0).abs() + P.D1.abs()
+            impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
+            scale = torch.cat([size.expand(q0.shape), impulse], -1)
+            root = find_root(equations, start, scale, iterations=self.max_iterations)
+            x = root.x
+            (K,) = equations(x)[1]
+        if torch.is_grad_enabled():
+            F, _, _ = balance(x, 1)
+            if F.requires_grad:
+                x = x - torch.linalg.solve_ex(K, (F - F.detach())[..., None])[0][..., 0]
+        return x[..., :n], x[..., n:], root
+
+    def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
+        """The momentum p + Dgᵀμ with Dg·v = 0, by Newton on μ."""
+        rounding = 16 * torch.finfo(p.dtype).eps
+        for _ in range(PROJECTIONS):
+            v, v_p = jacobian(lambda p: self.velocity(q, p, s), p)
+            along = Dg @ v[..., None]
+            p = p - (Dg.mT @ torch.linalg.solve_ex(Dg @ v_p @ Dg.mT, along)[0])[..., 0]
+            left = (Dg @ self.velocity(q, p, s)[..., None]).detach().abs().amax((-2, -1))
+            if not bool((left > rounding * Dg.detach().abs().amax((-2, -1)) * v.detach().abs().amax(-1)).any()):
+                break
+        return p
+
+    def _status(self, root: Root, new: State, c: Tensor) -> Tensor:
+        status = torch.where(root.converged, Status.CONVERGED, Status.MAX_ITERATIONS)
+        finite = torch.isfinite(root.x).all(-1)
+        end = torch.isfinite(new.p).all(-1) & torch.isfinite(new.s)
+        # A rank-deficient Dg leaves the saddle-point matrix, or the projection, without an inverse.
+        singular = ~torch.isfinite(root.error) | (c == 0) | (root.converged & ~end)
+        status = torch.where(singular, Status.SINGULAR, status)
+        return torch.where(finite, status, Status.DIVERGED).to(torch.uint8)

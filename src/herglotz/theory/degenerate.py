@@ -1,0 +1,222 @@
+"""Degenerate discrete Lagrangians: the step as a Legendrian relation that need not be a map.
+
+    c p0 = −D1 L_d(q0, q1, s0),    p1 = D2 L_d(q0, q1, s0),    s1 = s0 + L_d        (parametrised by (q0, q1, s0))
+
+is Legendrian in the contact product whatever the rank of M: η1 = c η0 holds on its tangent vectors. Where M is singular
+FL⁻ cannot be inverted: not every (q0, p0, s0) starts a step (primary constraint), and q1 is not determined by one step
+alone. What is left open is fixed by asking that the *next* steps exist. `LegendrianStepper` solves for q1 together with
+the positions of `ahead` further steps, by Gauss–Newton with the pseudo-inverse.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    momentum_jacobian,
+    momentum_minus,
+    momentum_plus,
+    momentum_residual,
+    partials,
+)
+from herglotz.stepping.newton import Status
+from herglotz.stepping.rollout import Plan, roll_out
+from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
+from herglotz.theory.continuous import jacobian
+from herglotz.theory.jacobi import Triple
+from herglotz.theory.legendrian import contact_product_point
+
+System = Callable[[Tensor], tuple[Tensor, Tensor]]  # x → equations and the size of their terms, both (..., m)
+
+
+def legendrian_relation(
+    L_d: DiscreteLagrangian,
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    h: Tensor | float,
+) -> Triple:
+    """The point of the relation over (q0, q1, s0), in Darboux coordinates of the contact product with τ = c.
+
+    Source: section 6 of `docs/mathematics.md`, erratum E1 for the coordinates.
+    """
+    P = partials(L_d, q0, q1, s0, h)
+    return contact_product_point((q0, momentum_minus(P), s0), (q1, momentum_plus(P), s0 + P.L), P.c)
+
+
+class LegendrianStepper:
+    """Steps along the Legendrian relation of a discrete Lagrangian whose M may be singular.
+
+    Parameters
+    ----------
+    L_d
+        Any discrete Lagrangian. With a regular M this is the flow of `Stepper`, only slower.
+    ahead
+        How many further steps must exist after this one: 0 for a regular M, 1 where M is singular and the next step
+        fixes what this one leaves open, more for a longer chain of constraints.
+    rank_tol
+        Singular values below this times the largest count as zero, rows and columns scaled first; default eps^(1/2).
+    max_iterations
+        Bound on Gauss–Newton iterations.
+    throw
+        Raise `StepError` at the first sample that fails.
+
+    Source: section 6 of `docs/mathematics.md`; the paper treats regular L_d only.
+    """
+
+    def __init__(
+        self,
+        L_d: DiscreteLagrangian,
+        *,
+        ahead: int = 1,
+        rank_tol: float | None = None,
+        max_iterations: int = 30,
+        throw: bool = False,
+    ):
+        if ahead < 0:
+            raise InputError(f"ahead must be >= 0, got {ahead}")
+        self.L_d, self.ahead, self.rank_tol = L_d, ahead, rank_tol
+        self.max_iterations, self.throw = max_iterations, throw
+
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
+        """One step; `residual` is the relation's |c p0 + D1 L_d|, of this step and those ahead, relative to its terms.
+
+        Directions of q1 that no equation fixes stay where the guess has them (the move has least norm). The result
+        carries no graph.
+
+        Parameters
+        ----------
+        state
+            (q, p, s), on the primary constraint; `consistent` puts it there.
+        h
+            Time step > 0, scalar or (...); steps ahead are as long.
+        guess
+            (..., n) near q1; default q.
+
+        Returns
+        -------
+        Step
+            `Status.SINGULAR` where least squares ended with a residual that is not zero: the state starts no step.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit or h is not positive.
+        """
+        state = State(*(x.detach() for x in check_state(state)))
+        h = check_h(h, state.q).detach()
+        q0, _, s0 = state
+        chain = self.ahead + 1
+        start = torch.cat([q0 if guess is None else guess.detach()] * chain, -1)
+        x, status, residual, iterations = self._least_squares(lambda x: self._chain(state, h, x), start)
+        q1 = x[..., : q0.shape[-1]]
+        P = partials(self.L_d, q0, q1, s0, h)
+        failed = (status != Status.CONVERGED) | (P.c == 0)
+        status = torch.where(failed & (status == Status.CONVERGED), Status.SINGULAR, status).to(torch.uint8)
+        nan = torch.where(failed, torch.nan, torch.zeros_like(s0))
+        new = State(q1 + nan[..., None], momentum_plus(P) + nan[..., None], s0 + P.L + nan)
+        if self.throw:
+            throw_failure(status, residual)
+        return Step(State(*(x.detach() for x in new)), (P.c + nan).detach(), status, residual, iterations)
+
+    def consistent(self, state: State, h: Tensor | float) -> State:
+        """The state moved to where a step exists, in the directions of q that FL⁺ does not see (the kernel of M).
+
+        p, s and all other directions of q are kept: a stage or multiplier in q gets the value that belongs to p. NaN
+        where there is none.
+        """
+        state = State(*(x.detach() for x in check_state(state)))
+        h = check_h(h, state.q).detach()
+        q0, p0, s0 = state
+        n = q0.shape[-1]
+        J = momentum_jacobian(partials(self.L_d, q0, q0, s0, h, order=2), p0)
+        _, sizes, V = torch.linalg.svd(J)
+        small = sizes <= self._tolerance(q0) * sizes.amax(-1, keepdim=True)
+        kernel = V.mT * small[..., None, :].to(V.dtype)  # columns: a basis of ker J beside zeros
+
+        def moved(y: Tensor) -> State:
+            return State(q0 + (kernel @ y[..., :n, None])[..., 0], p0, s0)
+
+        start = torch.cat([torch.zeros_like(q0), *[q0] * (self.ahead + 1)], -1)
+        y, status, _, _ = self._least_squares(lambda y: self._chain(moved(y), h, y[..., n:]), start)
+        nan = torch.where(status == Status.CONVERGED, torch.zeros_like(s0), torch.nan)
+        return State(moved(y).q + nan[..., None], p0, s0)
+
+    def rollout(
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        every: int = 1,
+    ) -> Rollout:
+        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
+        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        h_all = step_sizes(check_h(h, q), steps)
+        plan = Plan(h_all.shape[-1], every)
+        with torch.no_grad():
+            return roll_out(
+                start,
+                h_all,
+                lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess), None),
+                plan,
+                None,
+            )
+
+    def _chain(self, state: State, h: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+        """All c_j p_j + D1 L_d(q_j, q_{j+1}, s_j) for x = (q1, q2, …), and the size of their terms."""
+        q, p, s = state
+        equations, sizes = [], []
+        for q1 in x.split(q.shape[-1], -1):
+            P = partials(self.L_d, q, q1, s, h)
+            F = momentum_residual(P, p)
+            pull = (P.c[..., None] * p).abs()
+            equations.append(F)
+            sizes.append((pull + (F - P.c[..., None] * p).abs()).amax(-1, keepdim=True).expand_as(F))
+            q, p, s = q1, momentum_plus(P), s + P.L
+        return torch.cat(equations, -1), torch.cat(sizes, -1).detach()
+
+    def _least_squares(self, system: System, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
+        """Gauss–Newton from `start`, moves of least norm; x, status, residual relative to its terms, iterations."""
+        eps = torch.finfo(start.dtype).eps
+        x, best = start, torch.full_like(start[..., 0], torch.inf)
+        kept, iterations = start, 0
+        for iterations in range(self.max_iterations + 1):
+            (F, sizes), J = self._linearised(system, x)
+            residual = (F.abs() / torch.where(sizes > 0, sizes, 1.0)).amax(-1)
+            better = residual < best
+            kept, best = torch.where(better[..., None], x, kept), torch.where(better, residual, best)
+            # Two iterations past the square root of rounding reach rounding; a sample that gets no better is over.
+            if bool(((best <= 4 * eps) | ~better).all()) or iterations == self.max_iterations:
+                break
+            x = x - (self._pseudo_inverse(J) @ F[..., None])[..., 0]
+        finite = torch.isfinite(best)
+        done = best <= eps**0.75  # 1.8e-12 in float64, 6e-6 in float32: rounding of several steps
+        status = torch.where(done, Status.CONVERGED, Status.SINGULAR)
+        return kept, torch.where(finite, status, Status.DIVERGED), best, iterations
+
+    def _linearised(self, system: System, x: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        sizes: list[Tensor] = []
+
+        def F(x: Tensor) -> Tensor:
+            value, size = system(x)
+            sizes.append(size)
+            return value
+
+        value, J = jacobian(F, x)
+        return (value.detach(), sizes[-1]), J.detach()
+
+    def _pseudo_inverse(self, J: Tensor) -> Tensor:
+        """J⁺ with the rank decided at `rank_tol`; zeros where J is not finite."""
+        J = torch.where(torch.isfinite(J).all(-1).all(-1)[..., None, None], J, 0.0)
+        return torch.linalg.pinv(J, rtol=self._tolerance(J))
+
+    def _tolerance(self, like: Tensor) -> float:
+        return torch.finfo(like.dtype).eps ** 0.5 if self.rank_tol is None else self.rank_tol

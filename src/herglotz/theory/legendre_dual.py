@@ -1,0 +1,85 @@
+"""The continuous Legendre transform, both ways: p = L_v, H = v·L_v − L, and back v = H_p, L = p·H_p − H.
+
+The transform is an involution, so one function serves both: the dual of f(q, x, s) is f*(q, y, s) = x·y − f(q, x, s)
+where f_x(q, x, s) = y. The dual of a Lagrangian is its Hamiltonian and the dual of that is the Lagrangian.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics.root import find_root
+from herglotz.theory.continuous import ScalarField, derivatives
+
+
+def fiber_derivative(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    x: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+) -> Tensor:
+    """f_x(q, x, s), shape (..., n): the momentum p = L_v of a Lagrangian, the velocity v = H_p of a Hamiltonian."""
+    return derivatives(f, q, x, s).D2
+
+
+def fiber_inverse(
+    f: ScalarField,
+    q: Tensor,  # (..., n)
+    y: Tensor,  # (..., n)
+    s: Tensor,  # (...)
+    guess: Tensor | None = None,  # (..., n); default y
+) -> Tensor:
+    """The x with f_x(q, x, s) = y, by Newton: the velocity of a momentum (f = L), the momentum of a velocity (f = H).
+
+    Differentiable once with respect to q, y and s, by the implicit-function theorem.
+
+    Returns
+    -------
+    Tensor
+        Shape (..., n).
+
+    Raises
+    ------
+    InputError
+        If a sample does not converge; the message names it.
+    """
+    q, y = torch.broadcast_tensors(q, y)
+
+    def equation(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        P = derivatives(f, q, x, s, order=2)
+        return P.D2 - y, (P.D22,)
+
+    root = find_root(equation, y if guess is None else guess)
+    if not bool(root.converged.all()):
+        sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
+        raise InputError(
+            f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
+            f"{root.iterations} Newton steps); give a nearer guess, and check that f_xx is not singular"
+        )
+    if not torch.is_grad_enabled():
+        return root.x
+    # Zero in value, and dx = −J⁻¹ dF in slope.
+    F = fiber_derivative(f, q, root.x, s) - y
+    with torch.no_grad():
+        J = derivatives(f, q, root.x, s, order=2).D22
+    return root.x - torch.linalg.solve(J, (F - F.detach())[..., None])[..., 0]
+
+
+def legendre_dual(f: ScalarField) -> ScalarField:
+    """The Legendre transform f*(q, y, s) = x·y − f(q, x, s) with f_x = y: L ↦ H and H ↦ L.
+
+    The value is stationary in x, so a slope of x that is right to first order makes f* right up to third derivatives.
+
+    Returns
+    -------
+    Callable
+        (q, y, s) → (...); it raises `InputError` where `fiber_inverse` does.
+    """
+
+    def dual(q: Tensor, y: Tensor, s: Tensor) -> Tensor:
+        x = fiber_inverse(f, q, y, s)
+        return (x * y).sum(-1) - f(q, x, s)
+
+    return dual

@@ -1,0 +1,108 @@
+"""Legendrian submanifolds, and the graph of a contact map as one (erratum E1).
+
+A submanifold of T*Q × R is Legendrian if it has the dimension n of Q and η = ds − p·dq vanishes on it. The first
+prolongation of a function, j¹F: q ↦ (q, dF, F), is one. So is the graph of a contact map in the contact product
+T*Q̂×R × T*Q×R × R with the form τη̂ − η, whose Darboux coordinates over (q̂, q, ŝ) are
+
+    momenta (τp̂, −p, −τ),    last coordinate z = −s.
+
+The graph of Φ̃ with τ = σ is therefore j¹W of W = −(ŝ + S), and not of +(ŝ + S) as printed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics.contact import contact_form
+from herglotz.theory.continuous import jacobian
+from herglotz.theory.function_germ import Function
+from herglotz.theory.jacobi import Triple, join, sharp_bivector, split
+
+
+@dataclass(frozen=True)
+class LegendrianDefect:
+    """How far a parametrised set is from a Legendrian submanifold."""
+
+    pullback: Tensor  # (..., n) η on the tangent vectors ∂/∂u_i; zero if Legendrian
+    spread: Tensor  # (...) smallest singular value of the parametrisation; zero where it is no submanifold
+
+
+def legendrian_defect(submanifold: Callable[[Tensor], Triple], u: Tensor) -> LegendrianDefect:
+    """η pulled back along u ↦ (q, p, s), at parameters u of shape (..., n).
+
+    Raises
+    ------
+    InputError
+        If u has not as many parameters as q has components.
+    """
+    x, T = jacobian(lambda u: join(*submanifold(u)), u)
+    _, p, _ = split(x)
+    if u.shape[-1] != p.shape[-1]:
+        raise InputError(
+            f"a Legendrian submanifold has dimension n = {p.shape[-1]}, got {u.shape[-1]} parameters; give n of them"
+        )
+    pullback = (contact_form(p)[..., None, :] @ T)[..., 0, :]
+    return LegendrianDefect(pullback, torch.linalg.svdvals(T)[..., -1])
+
+
+def contact_complement(p: Tensor, tangent: Tensor) -> Tensor:
+    """Ξ^⊥ = ♯_Λ(Ξ°) of the span Ξ of `tangent`, (..., 2n+1, m) vectors in columns; columns that span it come back.
+
+    N is Legendrian exactly where TN^⊥ = TN.
+
+    Source: contact complement in the paper.
+    """
+    m = tangent.shape[-1]
+    annihilator = torch.linalg.svd(tangent, full_matrices=True)[0][..., m:]
+    return sharp_bivector(p[..., None, :], annihilator.mT).mT
+
+
+def contact_product_point(start: Triple, end: Triple, tau: Tensor) -> Triple:
+    """A point (x̂, x, τ) of the contact product in the Darboux coordinates of T*(Q̂×Q×R) × R.
+
+    Parameters
+    ----------
+    start, end
+        (q̂, p̂, ŝ) and (q, p, s).
+    tau
+        (...) the coordinate τ of the extra R; σ on the graph of a map with conformal factor σ.
+
+    Returns
+    -------
+    tuple of Tensor
+        Base (q̂, q, ŝ), momenta (τp̂, −p, −τ), both (..., 2n+1), and z = −s, (...).
+    """
+    (q0, p0, s0), (q1, p1, s1) = start, end
+    base = torch.cat([q0, q1, s0[..., None]], -1)
+    return base, torch.cat([tau[..., None] * p0, -p1, -tau[..., None]], -1), -s1
+
+
+def contact_product_states(base: Tensor, momenta: Tensor, z: Tensor) -> tuple[Triple, Triple, Tensor]:
+    """Inverse of `contact_product_point`: ((q̂, p̂, ŝ), (q, p, s), τ)."""
+    n = base.shape[-1] // 2
+    tau = -momenta[..., -1]
+    start = base[..., :n], momenta[..., :n] / tau[..., None], base[..., -1]
+    return start, (base[..., n : 2 * n], -momenta[..., n : 2 * n], -z), tau
+
+
+def product_potential(S: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Function:
+    """W(q̂, q, ŝ) = −(ŝ + S(q̂, q, ŝ)), whose prolongation is the graph of the map that S generates.
+
+    Returns
+    -------
+    Callable
+        A function of the joint base point, (..., 2n+1) → (...).
+
+    Source: generating functions of the paper with the sign of erratum E1.
+    """
+
+    def W(base: Tensor) -> Tensor:
+        q0, q1, s0 = split(base)
+        return -(s0 + S(q0, q1, s0))
+
+    return W

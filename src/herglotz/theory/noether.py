@@ -1,0 +1,80 @@
+"""Contact Noether: a symmetry of L_d gives a momentum that shrinks exactly as the contact form does, J_{k+1} = c_k J_k.
+
+A one-parameter group acts on Q by g(ε, q), with generator ξ(q) = ∂g/∂ε at ε = 0. It may also shift the action variable,
+s ↦ s + χ(ε, q) with χ(0, q) = 0; its lift to T*Q × R keeps η. If
+
+    L_d(g q0, g q1, s0 + χ(q0)) + χ(q0) − χ(q1) = L_d(q0, q1, s0)
+
+then J = p·ξ(q) − χ′(q), χ′ = ∂χ/∂ε at 0, obeys J_{k+1} = c_k J_k along discrete motions, by the ε-derivative of the
+line above with −D1 L_d = c p_k and D2 L_d = p_{k+1}. For the continuous motion {H, J} = 0, that is J̇ = −H_s J.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics.partials import DiscreteLagrangian
+from herglotz.theory.continuous import Hamiltonian, ScalarField, gradient, jacobian
+from herglotz.theory.jacobi import Triple, jacobi_bracket
+
+Action = Callable[[Tensor, Tensor], Tensor]  # g(ε, q): (...) and (..., n) → (..., n), g(0, q) = q
+Shift = Callable[[Tensor, Tensor], Tensor]  # χ(ε, q): (...) and (..., n) → (...), χ(0, q) = 0
+
+
+def infinitesimal_generator(action: Action, q: Tensor) -> Tensor:
+    """ξ(q) = ∂g(ε, q)/∂ε at ε = 0, shape (..., n)."""
+    return jacobian(lambda e: action(e[..., 0], q), torch.zeros_like(q[..., :1]))[1][..., 0]
+
+
+def momentum_map(action: Action, shift: Shift | None = None) -> ScalarField:
+    """J(q, p, s) = p·ξ(q) − χ′(q), in units of action per unit of ε.
+
+    Returns
+    -------
+    Callable
+        (q, p, s) → (...), differentiable, so that it has a bracket with H.
+    """
+
+    def J(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001  one signature for all functions on T*Q × R
+        def moved(e: Tensor) -> Tensor:
+            value = (p * action(e[..., 0], q)).sum(-1)
+            return value if shift is None else value - shift(e[..., 0], q)
+
+        return gradient(moved, torch.zeros_like(q[..., :1]))[1][..., 0]
+
+    return J
+
+
+def invariance_defect(
+    L_d: DiscreteLagrangian,
+    action: Action,
+    epsilon: Tensor | float,  # () or (...) group parameter, not small
+    q0: Tensor,  # (..., n)
+    q1: Tensor,  # (..., n)
+    s0: Tensor,  # (...)
+    h: Tensor | float,
+    shift: Shift | None = None,
+) -> Tensor:
+    """L_d(g q0, g q1, s0 + χ(q0)) + χ(q0) − χ(q1) − L_d(q0, q1, s0), shape (...): zero for a symmetry."""
+    h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    e = torch.as_tensor(epsilon, dtype=q0.dtype, device=q0.device).expand(s0.shape)
+    chi0, chi1 = (torch.zeros_like(s0) if shift is None else shift(e, q) for q in (q0, q1))
+    return L_d(action(e, q0), action(e, q1), s0 + chi0, h) + chi0 - chi1 - L_d(q0, q1, s0, h)
+
+
+def noether_defect(
+    f: ScalarField,  # a quantity f(q, p, s) claimed to be dissipated, such as a momentum map
+    start: Triple,  # (q, p, s)
+    end: Triple,  # the same after a step, or k of them
+    c: Tensor,  # (...) conformal factor of the step, or σ of k steps
+) -> Tensor:
+    """f(x1) − c f(x0), shape (...): zero along the motion for the momentum of a symmetry."""
+    return f(*end) - c * f(*start)
+
+
+def dissipation_defect(H: Hamiltonian, f: ScalarField, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """ḟ + H_s f along X_H, which is {H, f}; shape (...). Zero for H itself and for the momentum of a symmetry of H."""
+    return jacobi_bracket(H, f)(q, p, s)

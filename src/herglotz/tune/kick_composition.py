@@ -1,0 +1,218 @@
+"""A large explicit step of a few kicks and drifts, each kick with its own learned potential.
+
+One degree of freedom, constant c = e^{−γh}. A step is half of the damping, then
+
+    q ← q + d_0 p,  and for i = 1 … K:  p ← p − V_i′(q),  q ← q + d_i p,
+
+and the other half. Every stage is the flow of a separable discrete Lagrangian with p = Δq/d and V_i at
+its end. The step is therefore a contact map for all values of its numbers: Φ̃*η = c η with c = e^{−γh}, and each stage
+adds one term to s. The V_i are trigonometric polynomials of an angle, or polynomials of a length. The d_i and V_i are
+fitted to the map over h alone; the stages need not follow the motion inside the step. Compositions of Hénon-like maps
+can approximate any symplectic map.
+
+Source: D. Turaev, Nonlinearity 16 (2003) 123 (Hénon-like maps); S. Blanes, F. Casas and A. Murua, Acta Numerica 33
+(2024) 1 (compositions with modified potentials).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Rollout, State, Status, Step
+from herglotz.training import levenberg_marquardt
+
+LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
+EXACT = 1e-8  # σ of the residuals relative to the motion's size, as in `distil`
+WEAK = 10.0  # σ of the prior on each number's distance from its start, relative to the size of the start
+
+
+@dataclass(frozen=True)
+class KickStepper:
+    """A stepper of kicks and drifts, with `step` and `rollout` as `Stepper` has them, at its own h only.
+
+    Parameters
+    ----------
+    h, rate
+        The step and γ, so that c = e^{−γh}.
+    angle, middle, half
+        Whether q is an angle; a length enters the polynomials as (q − middle)/half.
+    drifts
+        (K + 1,) d_0 … d_K, in time over mass.
+    cosines, sines
+        (K, N) coefficients: V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, for a length.
+    """
+
+    h: float
+    rate: float
+    angle: bool
+    middle: float
+    half: float
+    drifts: Tensor
+    cosines: Tensor
+    sines: Tensor
+    offset: float = 0.0  # added to s after a step: the sum of the constants of the V_i, which do not move q or p
+    error: float = 0.0  # RMS error of q after one step, in units of q; the sines of the C form are made as accurate
+
+    dof = 1
+
+    @property
+    def kicks(self) -> int:
+        """Return K, the number of kicks."""
+        return len(self.cosines)
+
+    @property
+    def parameters(self) -> int:
+        """Return how many numbers were fitted."""
+        return self.drifts.numel() + self.cosines.numel() + self.sines.numel()
+
+    def to(self, dtype: torch.dtype) -> KickStepper:
+        """Return the stepper in another dtype."""
+        numbers = {name: getattr(self, name).to(dtype) for name in ("drifts", "cosines", "sines")}
+        return replace(self, **numbers)
+
+    def kick(self, i: int, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return V_i(q) and V_i′(q), of the shape of q."""
+        a, b = self.cosines[i], self.sines[i]
+        n = torch.arange(1, len(a) + 1, dtype=q.dtype, device=q.device)
+        if not self.angle:
+            x = (q[..., None] - self.middle) / self.half
+            return (a * x**n).sum(-1), (n * a * x ** (n - 1)).sum(-1) / self.half
+        cos, sin = torch.cos(n * q[..., None]), torch.sin(n * q[..., None])
+        return (a * cos + b * sin).sum(-1), (n * (b * cos - a * sin)).sum(-1)
+
+    def map(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return (q, p, s) after one step; q, p and s have shape (...)."""
+        root = torch.exp(torch.tensor(-0.5 * self.rate * self.h, dtype=q.dtype, device=q.device))
+        p, s = root * p, root * s
+        q, s = q + self.drifts[0] * p, s + 0.5 * self.drifts[0] * p * p
+        for i in range(self.kicks):
+            V, slope = self.kick(i, q)
+            p, s = p - slope, s - V
+            q, s = q + self.drifts[i + 1] * p, s + 0.5 * self.drifts[i + 1] * p * p
+        return q, root * p, root * s + self.offset
+
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """Take one step; NaN and `Status.DIVERGED` where the result is not finite.
+
+        Raises
+        ------
+        InputError
+            If h is not the stepper's own, or there is more than one coordinate.
+        """
+        h = torch.as_tensor(h, dtype=state.q.dtype)
+        if not bool(((h - self.h).abs() <= 1e-6 * self.h).all()):
+            raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(h.reshape(-1)[0]):g}")
+        if state.q.shape[-1] != 1:
+            raise InputError(f"kicks step one coordinate, got {state.q.shape[-1]}")
+        q, p, s = self.map(state.q[..., 0], state.p[..., 0], state.s)
+        bad = ~(torch.isfinite(q) & torch.isfinite(p) & torch.isfinite(s))
+        nan = torch.where(bad, torch.nan, torch.zeros_like(s))
+        c = torch.exp(-self.rate * self.h + nan)
+        status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
+        return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
+
+    def rollout(self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int) -> Rollout:
+        """Take `steps` equal steps from (q, p, s); s defaults to 0."""
+        states, taken = [State(q, p, torch.zeros_like(q[..., 0]) if s is None else s)], []
+        for _ in range(steps):
+            taken.append(self.step(states[-1], h))
+            states.append(taken[-1].state)
+        return Rollout.of(states, taken)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return plain numbers for JSON."""
+        return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(self).items()}
+
+
+def can_kick(model: ContactLagrangian) -> bool:
+    """Return whether kicks can replace the model's step: one coordinate, a constant c and no forces."""
+    return model.config.dof == 1 and model.config.level in LEVELS
+
+
+def fit_kicks(
+    model: ContactLagrangian,
+    before: State,
+    after: State,
+    h: float,
+    *,
+    kicks: int,
+    degree: int = 4,
+    iterations: int = 150,
+) -> KickStepper:
+    """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
+
+    Parameters
+    ----------
+    model
+        Source of γ, of whether q is an angle, and of the start: leapfrog with the stiffness of its potential.
+    before, after
+        Pairs of states a time h apart, (T, 1), (T, 1), (T) each.
+
+    Raises
+    ------
+    InputError
+        If the model has several coordinates, a c that varies, or forces.
+    """
+    if not can_kick(model):
+        raise InputError(f"kicks need one coordinate at the {' or '.join(LEVELS)} level")
+    start = _leapfrog(model, before, h, kicks, degree)
+    sizes = [start.drifts.numel(), start.cosines.numel(), start.sines.numel()]
+    first = torch.cat([start.drifts, start.cosines.flatten(), start.sines.flatten()])
+
+    def unpacked(x: Tensor) -> KickStepper:
+        d, a, b = x.split(sizes)
+        return replace(start, drifts=d, cosines=a.reshape(start.cosines.shape), sines=b.reshape(start.sines.shape))
+
+    size = float(max(model.config.scale))
+    weights = torch.tensor([1.0, size / float(before.p.square().mean().sqrt().clamp(min=1e-12))], dtype=torch.float64)
+    weights = weights / (EXACT * size)
+    data = [y.double().reshape(-1) for y in (*before, *after)]
+
+    def local(theta: Tensor, q0: Tensor, p0: Tensor, q1: Tensor, p1: Tensor) -> Tensor:
+        q, p, _ = unpacked(theta).map(q0, p0, torch.zeros_like(q0))
+        return torch.stack([q - q1, p - p1], -1) * weights
+
+    pairs = (data[0], data[1], data[3], data[4])
+    spread = WEAK * torch.cat([y.abs().amax().expand(n) for y, n in zip(first.split(sizes), sizes, strict=True) if n])
+    spread = spread.clamp(min=float(spread.max()) * 1e-2)
+
+    class Problem:
+        def cost(self, x: Tensor) -> Tensor:
+            prior = ((x - first) / spread).square().sum()
+            return (local(x, *pairs).square().sum() + prior) / 2
+
+        def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            r = local(x, *pairs).reshape(-1)
+            J = vmap(jacrev(local), (None, 0, 0, 0, 0))(x, *pairs).reshape(-1, len(x))
+            A, b = torch.diag(spread**-2), (x - first) / spread**2
+            return self.cost(x), A + J.T @ J, b + J.T @ r
+
+    found = unpacked(levenberg_marquardt(Problem(), first, max_iterations=iterations, rtol=1e-5).x.detach())
+    q, _, s = found.map(*data[:3])
+    return replace(found, offset=float((data[5] - s).mean()), error=float((q - data[3]).square().mean().sqrt()))
+
+
+def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int, degree: int) -> KickStepper:
+    """Return K steps of leapfrog with the model's stiffness: drifts h/K over the mass, kicks h/K times the force."""
+    config = model.config
+    low, high = float(before.q.min()), float(before.q.max())
+    middle, half = (0.0, 1.0) if config.angles[0] else ((low + high) / 2, (high - low) / 2)
+    drifts = torch.full((kicks + 1,), h / kicks, dtype=torch.float64)
+    drifts[0] = drifts[-1] = h / kicks / 2
+    # A length needs a linear term too: the force is not zero at the middle of the data.
+    a = torch.zeros(kicks, degree if config.angles[0] else degree + 1, dtype=torch.float64)
+    b = torch.zeros(kicks, degree if config.angles[0] else 0, dtype=torch.float64)
+    k = float(config.stiffness[0])
+    if config.angles[0]:
+        a[:, 0] = -k * h / kicks
+    else:
+        a[:, 1] = 0.5 * k * half**2 * h / kicks
+    rate = 0.0 if model.damping is None else float(model.damping.rate.detach())
+    return KickStepper(h, rate, config.angles[0], middle, half, drifts, a, b)

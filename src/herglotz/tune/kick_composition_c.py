@@ -1,0 +1,234 @@
+"""The C form of a `KickStepper`: one short header of straight-line code without dependencies.
+
+sin and cos are polynomials on (−π/2, π/2) after the nearest multiple of π is subtracted; their error is a thirtieth of
+the step's own. Library functions would take longer than the rest of the step. Inside a step an angle is counted in half
+turns, which saves one product a kick. The potentials are polynomials in cos q, and sin q times polynomials in cos q,
+summed by Estrin's scheme, whose operations a processor can overlap.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import subprocess
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.polynomial import chebyshev
+from numpy.polynomial import polynomial as power
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
+from herglotz.export.c_wrapper import FLAGS, compiler
+from herglotz.stepping import Rollout, State, Status
+from herglotz.tune.kick_composition import KickStepper
+
+FINEST, COARSEST = {"float64": 1e-13, "float32": 3e-8}, 1e-4  # bounds of the error that sin and cos may have
+TYPES = {"float64": "double", "float32": "float"}
+
+HEADER = """/* One step of h = {h}: {kicks} kicks and drifts. Written by herglotz; C99, no dependency but <tgmath.h>.
+   The state is (q, p, s); c = {c} is the conformal factor of every step. */
+#ifndef HERGLOTZ_KICKS_H
+#define HERGLOTZ_KICKS_H
+#include <tgmath.h>
+typedef {real} herglotz_real;
+typedef struct {{ herglotz_real q, p, s; }} herglotz_kicks_state;
+#define HERGLOTZ_KICKS_H_STEP {h}
+
+static inline void herglotz_kicks_step(herglotz_kicks_state *x) {{
+  herglotz_real q = x->q * {inverse}, p = {root} * x->p, s = {root} * x->s;
+{body}
+  x->q = q * {unit};
+  x->p = {root} * p;
+  x->s = {root} * s + {offset};
+}}
+
+/* `steps` steps; entry k of each output, which may be null, is the state after k steps, entry 0 the start. Returns 0,
+   or 3 where the state is not finite at the end: the entries from the first such one on are then NaN. */
+static inline int herglotz_kicks_rollout(herglotz_kicks_state *x, long steps, herglotz_real *q, herglotz_real *p,
+    herglotz_real *s) {{
+  long k;
+  for (k = 0; k <= steps; k++) {{
+    if (k > 0) herglotz_kicks_step(x);
+    if (!(x->q - x->q == 0 && x->p - x->p == 0 && x->s - x->s == 0)) x->q = x->p = x->s = (herglotz_real)NAN;
+    if (q) q[k] = x->q;
+    if (p) p[k] = x->p;
+    if (s) s[k] = x->s;
+  }}
+  return x->q - x->q == 0 ? 0 : 3;
+}}
+#endif
+"""
+
+LOOPS = """#include "kicks.h"
+typedef herglotz_real real;
+/* Outputs are (batch, steps + 1). Each motion waits for the one before, as in a loop of control. */
+int herglotz_kicks_rollouts(long batch, long steps, double wait, const real *q0, const real *p0, const real *s0,
+    real *q, real *p, real *s) {
+  long b;
+  int failed = 0;
+  herglotz_kicks_state x = {0, 0, 0};
+  for (b = 0; b < batch; b++) {
+    const long at = b * (steps + 1);
+    const real last = isfinite(x.q) ? (real)wait * x.q : 0;
+    x.q = q0[b] + last;
+    x.p = p0[b] + last;
+    x.s = s0[b];
+    failed |= herglotz_kicks_rollout(&x, steps, q + at, p ? p + at : 0, s ? s + at : 0);
+  }
+  return failed;
+}
+"""
+
+
+def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
+    """The header, for numbers of this dtype.
+
+    Raises
+    ------
+    InputError
+        If the dtype has no C form.
+    """
+    if dtype not in TYPES:
+        raise InputError(f"dtype must be float64 or float32, got {dtype}")
+    number = _number(dtype)
+    root = math.exp(-0.5 * stepper.rate * stepper.h)
+    unit = math.pi if stepper.angle else 1.0
+    drifts = [_drift(float(d), unit, number) for d in stepper.drifts]
+    body = [drifts[0], *(_kick(stepper, i, dtype) + drifts[i + 1] for i in range(stepper.kicks))]
+    return HEADER.format(
+        h=number(stepper.h), kicks=stepper.kicks, c=number(root * root), root=number(root), real=TYPES[dtype],
+        body="\n".join(body), unit=number(unit), inverse=number(1 / unit), offset=number(stepper.offset),
+    )  # fmt: skip
+
+
+def export_kicks_c(stepper: KickStepper, path: PathLike, dtype: str = "float64") -> Path:
+    """Write the header."""
+    path = Path(path)
+    write_atomically(path, kicks_c(stepper, dtype).encode())
+    return path
+
+
+class CompiledKicks:
+    """A `KickStepper` compiled: `rollout` as there."""
+
+    def __init__(self, stepper: KickStepper, dtype: str = "float64"):
+        self.h, self.rate, self.dtype = stepper.h, stepper.rate, getattr(torch, dtype)
+        with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+            here = Path(folder)
+            (here / "kicks.h").write_text(kicks_c(stepper, dtype))
+            (here / "kicks.c").write_text(LOOPS)
+            command = [
+                *compiler(),
+                *FLAGS,
+                "-shared",
+                "-fPIC",
+                str(here / "kicks.c"),
+                "-o",
+                str(here / "kicks.so"),
+                "-lm",
+            ]
+            done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+            if done.returncode:
+                raise InputError(f"{command[0]}: does not compile the kicks ({done.stderr[:200]})")
+            self.library = ctypes.CDLL(str(here / "kicks.so"))
+
+    def rollout(
+        self, q: torch.Tensor, p: torch.Tensor, s: torch.Tensor | None = None, *, h: torch.Tensor | float, steps: int
+    ) -> Rollout:
+        """K equal steps from (q, p, s) with shapes (B, 1), (B, 1), (B)."""
+        if not abs(float(h) - self.h) <= 1e-6 * self.h:
+            raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(h):g}")
+        start = State(q, p, torch.zeros_like(q[..., 0]) if s is None else s)
+        outputs = [torch.empty(len(q), steps + 1, dtype=self.dtype) for _ in range(3)]
+        self.call(start, steps, outputs)()
+        finite = torch.isfinite(outputs[0])
+        sigma = torch.exp(-self.rate * self.h * torch.arange(steps + 1, dtype=self.dtype)).expand(finite.shape)
+        status = torch.where(finite[:, 1:], Status.CONVERGED, Status.DIVERGED).to(torch.uint8)
+        q, p, s = outputs
+        return Rollout(q[..., None], p[..., None], s, sigma + 0 * q, status, torch.zeros_like(q[:, 1:]))
+
+    def call(self, start: State, steps: int, outputs: list[torch.Tensor]) -> Any:
+        """The call of the loop in C, with its arguments made beforehand."""
+        arrays = [x.to(self.dtype).reshape(-1).contiguous() for x in start]
+        pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*arrays, *outputs)]
+        function, sizes = self.library.herglotz_kicks_rollouts, (ctypes.c_long(len(arrays[0])), ctypes.c_long(steps))
+
+        def run(keep: Any = (arrays, outputs)) -> None:  # noqa: ARG001
+            function(*sizes, ctypes.c_double(0.0), *pointers)
+
+        return run
+
+
+def _number(dtype: str) -> Any:
+    return (lambda x: f"{float(np.float32(x))!r}f") if dtype == "float32" else (lambda x: repr(float(x)))
+
+
+def _drift(d: float, unit: float, number: Any) -> str:
+    return f"  s += {number(0.5 * d)} * p * p;\n  q += {number(d / unit)} * p;"
+
+
+def _kick(stepper: KickStepper, i: int, dtype: str) -> str:
+    number, a, b = _number(dtype), stepper.cosines[i].double().numpy(), stepper.sines[i].double().numpy()
+    n = np.arange(1, len(a) + 1)
+    if stepper.angle:
+        even, odd = chebyshev.cheb2poly(np.r_[0.0, a]), _second_kind(b)  # V = even(c) + sin q · odd(c)
+        slope, turn = chebyshev.cheb2poly(np.r_[0.0, n * b]), _second_kind(n * a)  # V′ = slope(c) − sin q · turn(c)
+        error = min(max(stepper.error / 30, FINEST[dtype]), COARSEST)
+        lines = [_sine_and_cosine(error, number)]
+        lines += [f"    s -= {_sum(even, 'c', number)} + sine * {_sum(odd, 'c', number)};"]
+        lines += [f"    p = (p - {_sum(slope, 'c', number)}) + sine * {_sum(turn, 'c', number)};"]
+    else:
+        V = np.r_[0.0, a]
+        shift = f"(q - {number(stepper.middle)}) * {number(1 / stepper.half)}"
+        lines = [f"    const herglotz_real c = {shift};", f"    s -= {_sum(V, 'c', number)};"]
+        lines += [f"    p -= {_sum(power.polyder(V) / stepper.half, 'c', number)};"]
+    return "\n".join(["  {", *lines, "  }", ""])
+
+
+def _second_kind(b: np.ndarray) -> np.ndarray:
+    """Coefficients in c of Σ_n b_n U_{n−1}(c): sin nq = sin q · U_{n−1}(cos q)."""
+    total, before, now = np.zeros(max(1, len(b))), np.zeros(1), np.ones(1)
+    for weight in b:
+        total[: len(now)] += weight * now
+        before, now = now, power.polysub(power.polymul([0.0, 2.0], now), before)
+    return total
+
+
+def _sum(coefficients: np.ndarray, x: str, number: Any) -> str:
+    """Estrin's scheme for Σ c_k x^k, as an expression; high zero coefficients are left out."""
+    terms = [number(c) for c in np.trim_zeros(coefficients, "b")] or [number(0.0)]
+    while len(terms) > 1:
+        pairs = [f"({a} + {x} * {b})" for a, b in zip(terms[::2], terms[1::2], strict=False)]
+        terms = pairs + ([terms[-1]] if len(terms) % 2 else [])
+        x = f"({x} * {x})"
+    return terms[0]
+
+
+def _sine_and_cosine(error: float, number: Any) -> str:
+    """C for `sine` and `c` of πq: polynomials of r, q less the nearest whole number, with the sign of its parity."""
+    odd, even = (_fitted(kind, error) for kind in ("sin", "cos"))
+    return "\n".join(
+        [
+            "    const herglotz_real turns = rint(q), r = q - turns, r2 = r * r;",
+            f"    const herglotz_real sign = 1 - 2 * (turns - 2 * floor({number(0.5)} * turns));",
+            f"    const herglotz_real sine = sign * r * {_sum(odd, 'r2', number)};",
+            f"    const herglotz_real c = sign * {_sum(even, 'r2', number)};",
+        ]
+    )
+
+
+def _fitted(kind: str, error: float) -> np.ndarray:
+    """Coefficients in r² of sin(πr)/r or cos πr on |r| ≤ 1/2, as few as the error allows."""
+    nodes = 0.125 * (1 - np.cos(np.pi * (np.arange(400) + 0.5) / 400))
+    root = np.sqrt(nodes)
+    wanted = np.cos(np.pi * root) if kind == "cos" else np.pi * np.sinc(root)
+    for degree in range(2, 12):
+        fit = chebyshev.Chebyshev.fit(nodes, wanted, degree, domain=[0.0, 0.25])
+        found = np.asarray(fit.convert(kind=np.polynomial.Polynomial).coef)
+        if np.abs(power.polyval(nodes, found) - wanted).max() < error:
+            return found
+    raise AssertionError(f"no polynomial for {kind}")

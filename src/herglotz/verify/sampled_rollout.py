@@ -1,0 +1,105 @@
+"""Rollouts with the derivative of every step, and the checks of single steps on them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import Forces, contact_defect, contact_form, flow_derivative
+from herglotz.stepping import State, Status
+from herglotz.verify.report import Check
+from herglotz.verify.subject import Subject
+
+
+@dataclass(frozen=True)
+class SampledRollout:
+    """B rollouts of K steps with the derivative of every step, measured on the map itself."""
+
+    q: Tensor  # (B, K+1, n)
+    p: Tensor  # (B, K+1, n)
+    s: Tensor  # (B, K+1)
+    c: Tensor  # (B, K) as the stepper reports it
+    status: Tensor  # (B, K)
+    derivative: Tensor  # (B, K, 2n+1, 2n+1) DΦ̃ at entry k
+
+    @property
+    def ok(self) -> Tensor:
+        """Return whether each step converged with finite c and derivative, (B, K)."""
+        finite = torch.isfinite(self.derivative).all(-1).all(-1) & torch.isfinite(self.c)
+        return (self.status == Status.CONVERGED) & finite
+
+    @property
+    def steps(self) -> int:
+        """Number of steps K."""
+        return self.c.shape[-1]
+
+
+def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
+    """Roll out from the subject's states and differentiate every step by autograd."""
+    states, c, status = [subject.states], [], []
+    with torch.no_grad():
+        for _ in range(steps):
+            step = subject.step(states[-1], subject.h)
+            # A failed sample keeps its last state: its status counts it, and a batch needs finite inputs.
+            bad = ~(torch.isfinite(step.state.q).all(-1) & torch.isfinite(step.state.p).all(-1))
+            bad = bad | ~torch.isfinite(step.state.s)
+            old = states[-1]
+            states.append(
+                State(
+                    torch.where(bad[:, None], old.q, step.state.q),
+                    torch.where(bad[:, None], old.p, step.state.p),
+                    torch.where(bad, old.s, step.state.s),
+                )
+            )
+            c.append(step.c)
+            status.append(torch.where(bad & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status))
+    q, p = (torch.stack([getattr(x, name) for x in states], 1) for name in ("q", "p"))
+    s = torch.stack([x.s for x in states], 1)
+    start = (x[:, :-1].flatten(0, 1) for x in (q, p, s))
+    _, D = flow_derivative(subject.flow(), *start)
+    return SampledRollout(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
+
+
+def worst(values: Tensor) -> float:
+    """Return the largest entry; NaN, which fails every bound, where `values` is empty or has a NaN."""
+    return float(values.max()) if values.numel() else float("nan")
+
+
+def convergence(w: SampledRollout) -> Check:
+    """Check that every step of every rollout converged."""
+    failed = w.status != Status.CONVERGED
+    counts = ", ".join(f"{int((w.status == k).sum())} {k.name}" for k in Status if k and bool((w.status == k).any()))
+    return Check.at_most("converged", "every step converges (share failed)", float(failed.double().mean()), 0.0, counts)
+
+
+def positive_factor(w: SampledRollout) -> Check:
+    """Check c > 0 at every step, so that FL⁻ exists and orientation is kept."""
+    c = w.c[w.ok]
+    return Check.more_than("positive_c", "conformal factor c > 0 (smallest)", -worst(-c), 0.0)
+
+
+def contact(w: SampledRollout, bound: float, force: Forces | None = None) -> Check:
+    """Check DΦ̃ᵀ η(x1) = c η(x0) − F⁻dq0 − F⁺dq1, relative to the terms that cancel.
+
+    Without forces this is the contact property. `force` holds the forces at the steps that are ok.
+    """
+    p0, p1 = w.p[:, :-1][w.ok], w.p[:, 1:][w.ok]
+    D, c = w.derivative[w.ok], w.c[w.ok]
+    defect, claim = contact_defect(D, p0, p1, c), "contact map: DΦ̃ᵀη(x1) = c η(x0)"
+    if force is not None:
+        n = p0.shape[-1]
+        defect = defect + (D[..., :n, :].mT @ force.plus[..., None])[..., 0]
+        defect = torch.cat([defect[..., :n] + force.minus, defect[..., n:]], -1)
+        claim = "forced contact map: DΦ̃ᵀη(x1) = c η(x0) − F⁻dq0 − F⁺dq1"
+    pulled = (D.abs().mT @ contact_form(p1).abs()[..., None])[..., 0]
+    size = (pulled + c.abs()[..., None] * contact_form(p0).abs()).amax(-1)
+    return Check.at_most("contact", claim, worst(defect.abs().amax(-1) / size), bound)
+
+
+def volume(w: SampledRollout, bound: float) -> Check:
+    """Check the volume factor det DΦ̃ = c^{n+1}, relative."""
+    n = w.q.shape[-1]
+    ratio = torch.linalg.det(w.derivative[w.ok]) / w.c[w.ok] ** (n + 1)
+    return Check.at_most("volume", "volume: det DΦ̃ = c^(n+1)", worst((ratio - 1).abs()), bound)

@@ -1,0 +1,40 @@
+"""The rounding shake: every fit of the suite from data disturbed in the last digit, on request.
+
+`HERGLOTZ_SHAKE=SEED` multiplies the positions and inputs that `fit` is given by 1 + 1e-14 ξ, ξ standard normal and
+decided by the seed and the data. An assertion on a trained quantity that holds with one rounding and fails with another
+is found so on one machine (`make test-anywhere`).
+"""
+
+import os
+import sys
+from dataclasses import replace
+
+import torch
+
+RELATIVE = 1e-14
+
+
+def shaken(data, seed):
+    """The data with every recorded number disturbed by `RELATIVE`; the same data are disturbed in the same way."""
+    make = torch.Generator().manual_seed(seed + int(data.digest()[:8], 16))
+
+    def disturbed(x):
+        return None if x is None else x * (1 + RELATIVE * torch.randn(x.shape, generator=make, dtype=x.dtype))
+
+    return replace(data, q=disturbed(data.q), u=disturbed(data.u))
+
+
+def pytest_configure():
+    seed = os.environ.get("HERGLOTZ_SHAKE")
+    if seed is None:
+        return
+    from herglotz import cli, training  # noqa: F401  their modules hold names of `fit`
+
+    fit = training.fit
+
+    def fit_shaken(data, *arguments, **options):
+        return fit(shaken(data, int(seed)), *arguments, **options)
+
+    for name, module in list(sys.modules.items()):
+        if name.startswith("herglotz") and getattr(module, "fit", None) is fit:
+            module.fit = fit_shaken

@@ -1,0 +1,42 @@
+"""Files are written whole or not at all, and through no link that somebody planted."""
+
+import os
+
+import pytest
+
+from herglotz.data import files
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+
+
+def test_a_planted_link_is_not_written_through(tmp_path):
+    # fails if the temporary name can be foretold and a link of that name is followed
+    victim = tmp_path / "victim"
+    victim.write_text("mine")
+    for name in (f".out.{os.getpid()}.tmp", ".out.tmp"):
+        (tmp_path / name).symlink_to(victim)
+    write_atomically(tmp_path / "out", b"content")
+    assert (tmp_path / "out").read_bytes() == b"content"
+    assert victim.read_text() == "mine"
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch):
+    # fails if a full disk loses the file that was there, or a temporary file stays
+    path = tmp_path / "out"
+    write_atomically(path, b"old")
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(files.os, "fsync", full)
+    with pytest.raises(InputError, match="cannot be written"):
+        write_atomically(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [x.name for x in tmp_path.iterdir()] == ["out"]
+
+
+def test_permissions_are_those_of_any_new_file(tmp_path):
+    # fails if a file is left private, as temporary files are
+    write_atomically(tmp_path / "out", b"content")
+    (tmp_path / "plain").write_bytes(b"content")
+    assert (tmp_path / "out").stat().st_mode == (tmp_path / "plain").stat().st_mode

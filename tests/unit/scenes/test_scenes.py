@@ -1,0 +1,222 @@
+"""What every scene must satisfy: consistency of its own parts, batching, dtypes."""
+
+from functools import partial
+
+import pytest
+import torch
+
+from herglotz.mechanics import (
+    autograd_partials,
+    contact_defect,
+    flow_derivative,
+    legendre_minus,
+    legendre_plus,
+    partials,
+)
+from herglotz.scenes import ORDERS, reference_flow, scene, scene_names
+from herglotz.theory import contact_vector_field, right_hamiltonian
+
+# at each scene's own examples, off the default parameters, where m = 1 and Ω = 1 would hide powers
+SCENES = [scene(name, **parameters) for name in scene_names() for parameters in scene(name).examples]
+EXACT = [s for s in SCENES if s.exact]
+
+
+def label(s):
+    return "-".join([s.name, *(f"{x:g}" for x in s.parameters.values())])
+
+
+def states(system, count, seed=0, dtype=torch.float64):
+    """Random (q, p, s) in the scene's ranges."""
+    rng = torch.Generator().manual_seed(seed)
+    draws = []
+    for limits in (system.q_range, system.v_range):
+        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
+        draws.append(low + (high - low) * torch.rand(count, system.dof, generator=rng, dtype=torch.float64))
+    q, v = draws
+    s = 2 * torch.rand(count, generator=rng, dtype=torch.float64) - 1
+    return tuple(x.to(dtype) for x in (q, system.momentum(q, v, s), s))
+
+
+def factor(system, q, p, s, h):
+    """The conformal factor of the flow, of an exact scene from L_d, else exp ∫ L_s dt by integration."""
+    if system.exact:
+        return partials(system.L_d, q, system.flow(q, p, s, h)[0], s, h).c
+    return system.numerical.shoot(q, system.flow(q, p, s, h)[0], s, h).P.c
+
+
+def relative(value, expected):
+    """Largest error of a batch relative to the batch's largest entry."""
+    value, expected = value.detach(), expected.detach()
+    return float((value - expected).abs().max() / expected.abs().max().clamp_min(1e-3))
+
+
+@pytest.mark.parametrize("system", SCENES, ids=label)
+def test_legendre_transform(system):
+    # fails if momentum is not L_v, velocity is not its inverse or not H_p, or H ≠ p·v − L
+    q, p, s = states(system, 20)
+    v = system.velocity(q, p, s)
+    v = v.detach().requires_grad_()
+    L = system.lagrangian(q, v, s)
+    (L_v,) = torch.autograd.grad(L.sum(), v)
+    assert relative(L_v, p) < 1e-14
+    assert relative(system.momentum(q, v.detach(), s), p) < 1e-14
+    assert relative(contact_vector_field(system.hamiltonian, q, p, s)[0], v.detach()) < 1e-14
+    assert relative((p * v).sum(-1).detach() - L.detach(), system.hamiltonian(q, p, s)) < 1e-13
+
+
+@pytest.mark.parametrize("factor_of_h", [3.0, -2.0])
+@pytest.mark.parametrize("system", SCENES, ids=label)
+def test_flow_is_the_contact_flow_of_its_hamiltonian(system, factor_of_h):
+    # fails if the closed-form flow (or the pendulum's written-out field) is not that of X_H, in any of q, p, s
+    q, p, s = states(system, 20, seed=1)
+    h = factor_of_h * system.h
+    expected = reference_flow(partial(contact_vector_field, system.hamiltonian), q, p, s, h)
+    for value, number in zip(system.flow(q, p, s, h), expected, strict=True):
+        assert relative(value, number) < 1e-11
+
+
+@pytest.mark.parametrize("system", SCENES, ids=label)
+def test_flow_is_a_contact_map(system):
+    # fails if the flow of s does not match that of (q, p)
+    q, p, s = states(system, 6, seed=2)
+    h = min(0.3, 3 * system.h)
+    (_, p1, _), D = flow_derivative(lambda q, p, s: system.flow(q, p, s, h), q, p, s)
+    c = factor(system, q, p, s, h)
+    defect = contact_defect(D, p, p1, c)
+    assert float(defect.abs().max() / p.abs().max().clamp_min(1.0)) < 1e-10
+    # fails if the check above cannot see a wrong c
+    assert float(contact_defect(D, p, p1, c * 1.001).abs().max()) > 1e-4
+
+
+@pytest.mark.parametrize("system", EXACT, ids=label)
+def test_exact_lagrangian_generates_the_flow(system):
+    # fails if FL⁻ or FL⁺ of L_d differs from the flow's momenta or action
+    q, p, s = states(system, 20, seed=3)
+    h = 0.3
+    q1, p1, s1 = system.flow(q, p, s, h)
+    assert relative(legendre_minus(system.L_d, q, q1, s, h)[1], p) < 1e-11
+    _, p_plus, s_plus = legendre_plus(system.L_d, q, q1, s, h)
+    assert relative(p_plus, p1) < 1e-11
+    assert relative(s_plus, s1) < 1e-12
+
+
+@pytest.mark.parametrize("system", EXACT, ids=label)
+def test_closed_form_partials(system):
+    # fails if a closed-form derivative is wrong, at pairs (q0, q1) off the flow and with a step per sample
+    q0, q1, s0 = states(system, 20, seed=4)
+    q1 = q0 + 0.1 * torch.sin(17 * q1)
+    h = torch.linspace(0.1, 0.7, 20, dtype=torch.float64)
+    P, A = partials(system.L_d, q0, q1, s0, h, order=2), autograd_partials(system.L_d, q0, q1, s0, h, order=2)
+    for name, expected in vars(A).items():
+        if expected is None:  # no forces
+            continue
+        value = getattr(P, name)
+        assert value.shape == expected.shape, name
+        assert relative(value, expected) < 1e-13, name
+    first = partials(system.L_d, q0, q1, s0, h)
+    assert first.D11 is None
+    assert torch.equal(first.D1, P.D1)
+
+
+@pytest.mark.parametrize("system", EXACT, ids=label)
+def test_right_hamiltonian(system):
+    # fails if H⁺ has a wrong branch, sign or coefficient: H⁺ = p1·q1 − L_d, ∂H⁺/∂p1 = q1, ∂H⁺/∂q0 = −D1, ∂H⁺/∂s0 = −D3
+    q, p, s = states(system, 20, seed=5)
+    h = 0.2
+    q1, p1, _ = system.flow(q, p, s, h)
+    P = partials(system.L_d, q, q1, s, h)
+    q, p1, s = (x.detach().requires_grad_() for x in (q, p1, s))
+    H = system.H_plus(q, p1, s, h)
+    H_q, H_p, H_s = torch.autograd.grad(H.sum(), (q, p1, s))
+    H = H.detach()
+    assert relative(H, (p1.detach() * q1).sum(-1) - P.L) < 1e-11
+    assert relative(H_p, q1) < 1e-11
+    assert relative(H_q, -P.D1) < 1e-10
+    assert relative(H_s, -P.D3) < 1e-10
+    numeric = right_hamiltonian(system.L_d, q.detach(), p1.detach(), s.detach(), h, guess=q1 + 0.01)
+    assert relative(H, numeric) < 1e-11
+
+
+@pytest.mark.parametrize("system", [s for s in EXACT if s.H_minus], ids=label)
+def test_left_hamiltonian(system):
+    # fails with the printed left equations (E5): q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻
+    h = 0.2
+    q, p, s = states(system, 20, seed=6)
+    q1, _, s1 = system.flow(q, p, s, h)
+    p, q1, s1 = (x.requires_grad_() for x in (p, q1, s1))
+    H = system.H_minus(p, q1, s1, h)
+    H_p, H_q, H_s = torch.autograd.grad(H.sum(), (p, q1, s1))
+    p, q1, s1, H = (x.detach() for x in (p, q1, s1, H))
+    q0, p1, s0 = -H_p, -H_q / (1 + H_s)[..., None], s1 + H - (p * H_p).sum(-1)
+    for value, expected in zip((*system.flow(q0, p, s0, h), q0, s0), (q1, p1, s1, q, s), strict=True):
+        assert relative(value, expected) < 1e-12
+
+
+@pytest.mark.parametrize("system", SCENES, ids=label)
+def test_batch_and_step_per_sample(system):
+    # fails if samples interact, if h (...) is not broadcast against (..., n), or if leading dims are not kept
+    q, p, s = states(system, 6, seed=7)
+    h = torch.linspace(0.05, 0.6, 6, dtype=torch.float64)
+    together = system.flow(*(x.reshape(2, 3, *x.shape[1:]) for x in (q, p, s)), h.reshape(2, 3))
+    assert together[0].shape == (2, 3, system.dof)
+    assert together[2].shape == (2, 3)
+    L_ds = {"principal": system.L_d, **system.L_d_rules}
+    q1 = q + 0.1
+    for i in (1, 4):
+        alone = system.flow(q[i], p[i], s[i], float(h[i]))
+        for a, b in zip(alone, together, strict=True):
+            torch.testing.assert_close(a, b.flatten(0, 1)[i], rtol=1e-14, atol=1e-14)
+        for name, L_d in L_ds.items():
+            torch.testing.assert_close(
+                L_d(q[i], q1[i], s[i], h[i]),
+                L_d(q, q1, s, h)[i],
+                rtol=1e-13,
+                atol=1e-13,
+                msg=lambda m, name=name: f"{name}: {m}",
+            )
+    if system.H_plus is not None:
+        torch.testing.assert_close(system.H_plus(q[2], p[2], s[2], h[2]), system.H_plus(q, p, s, h)[2])
+    if system.H_minus is not None:
+        torch.testing.assert_close(system.H_minus(p[2], q[2], s[2], h[2]), system.H_minus(p, q, s, h)[2])
+
+
+@pytest.mark.parametrize("system", SCENES, ids=label)
+def test_float32(system):
+    # fails if a constant promotes to float64, or if a formula overflows or cancels in single precision
+    q, p, s = states(system, 8, seed=8)
+    single = tuple(x.float() for x in (q, p, s))
+    for value, expected in zip(system.flow(*single, 0.2), system.flow(q, p, s, 0.2), strict=True):
+        assert value.dtype == torch.float32
+        assert relative(value, expected) < 2e-5
+    q1 = system.flow(q, p, s, 0.2)[0]
+    for name, L_d in {"principal": system.L_d, **system.L_d_rules}.items():
+        h = torch.tensor(0.2)
+        value = L_d(single[0], q1.float(), single[2], h)
+        assert value.dtype == torch.float32, name
+        assert relative(value, L_d(q, q1, s, h.double())) < 2e-4, name
+        P = partials(L_d, single[0], q1.float(), single[2], 0.2, order=2)
+        assert P.D12 is not None
+        assert P.D12.dtype == torch.float32, name
+        assert bool(torch.isfinite(P.D12).all()), name
+
+
+@pytest.mark.parametrize("name", scene_names())
+def test_description_is_complete(name):
+    # fails if a scene forgets a unit or an angle, or if exact disagrees with what its rules are for
+    system = scene(name)
+    assert system.name == name
+    assert len(system.coordinates) == len(system.units) == len(system.angles) == system.dof
+    assert "\n" not in system.description
+    for limits in (system.q_range, system.v_range):
+        low, high = (torch.as_tensor(x).expand(system.dof) for x in limits)
+        assert bool((low < high).all())
+    assert system.h > 0
+    assert set(ORDERS) <= set(system.L_d_rules)
+    assert system.examples
+    assert all(set(parameters) <= set(system.parameters) for parameters in system.examples)
+    assert (system.L_d_exact is system.L_d) is system.exact
+    # a negative control of `exact`: an exact L_d composes, S² = L_d(2h), and no rule does
+    q, p, s = states(system, 5, seed=9)
+    q1 = system.flow(q, p, s, 2 * system.h)[0]
+    gap = (legendre_minus(system.L_d, q, q1, s, 2 * system.h)[1] - p).detach()
+    assert (float(gap.abs().max() / p.abs().max()) < 1e-11) is system.exact

@@ -1,0 +1,215 @@
+"""L⁻, H⁺ and H⁻ of any L_d, and the right and left Hamilton equations (E5)."""
+
+import math
+
+import pytest
+import torch
+
+from herglotz.mechanics import autograd_partials, partials
+from herglotz.mechanics.regularity import left_hessian
+from herglotz.scenes import scene
+from herglotz.stepping import State, Stepper
+from herglotz.theory import (
+    LeftHamiltonian,
+    LeftLagrangian,
+    RightHamiltonian,
+    left_equations,
+    left_hamiltonian,
+    left_momenta,
+    left_step,
+    right_equations,
+    right_step,
+)
+
+
+def nonlinear(q0, q1, s0, h):
+    """Golden 2-dof system of section 4, nonlinear in s."""
+    d, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
+    kinetic = 0.5 * (1 + 0.3 * torch.sin(m[..., 0])) * d[..., 0] ** 2 + 0.6 * d[..., 1] ** 2 + 0.2 * d.prod(-1)
+    friction = 0.3 * s0 + 0.1 * torch.sin(s0) * (1 + 0.2 * m[..., 1]) + 0.05 * s0 * d[..., 0]
+    return h * (kinetic - torch.cos(m.prod(-1)) - 0.25 * (m * m).sum(-1) - friction)
+
+
+OSCILLATOR = scene("damped_oscillator", m=1.7, omega0=1.3, gamma=0.6)
+CASES = {
+    "nonlinear": (nonlinear, 2, 0.2),
+    "oscillator": (OSCILLATOR.L_d, 1, 0.1),
+    "parachute": (scene("parachute").L_d, 1, 0.1),
+    "pendulum midpoint": (scene("damped_pendulum").L_d_rules["midpoint"], 1, 0.5),
+}
+
+
+def solved(name, count=12, seed=0):
+    """States and one step from each by Newton on FL⁻."""
+    L_d, n, h = CASES[name]
+    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    start = State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+    step = Stepper(L_d).step(start, h)
+    return L_d, h, start, step.state, step.c
+
+
+def close(value, expected, tol):
+    scale = float(expected.abs().max())
+    assert float((value - expected).abs().max()) <= tol * scale, float((value - expected).abs().max()) / scale
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_left_lagrangian(name):
+    # fails if s0 does not solve s0 + L_d = s1, or D3L⁻, p0, p1 miss a factor c
+    L_d, h, (q0, p0, s0), (q1, p1, s1), c = solved(name)
+    P = LeftLagrangian(L_d).partials(q0, q1, s1, h)
+    close(P.L, s1 - s0, 1e-12)
+    close(1 - P.D3, 1 / c, 1e-12)
+    for value, expected in zip(left_momenta(P), (p0, p1, c), strict=True):
+        close(value, expected, 1e-12)
+
+
+@pytest.mark.parametrize("name", ["nonlinear", "parachute"])
+def test_left_second_derivatives_against_autograd(name):
+    # fails if a block of the implicit-function theorem has a wrong sign, index or power of c
+    L_d, h, start, end, _ = solved(name)
+    L = LeftLagrangian(L_d)
+    closed, auto = (f(L, start.q, end.q, end.s, h, 2) for f in (partials, autograd_partials))
+    for key, value in vars(auto).items():
+        if key != "force":
+            assert float(((getattr(closed, key) - value).abs() / (1 + value.abs().max())).max()) < 1e-12, key
+
+
+def test_the_hessian_that_decides_about_the_left_hamiltonian():
+    # fails if a cross term with D13 is dropped or not symmetric: c D1D1 L⁻ from the partials of L_d alone
+    L_d, h, start, end, c = solved("nonlinear")
+    P = partials(L_d, start.q, end.q, start.s, h, 2)
+    left = autograd_partials(LeftLagrangian(L_d), start.q, end.q, end.s, h, 2)
+    close(left_hessian(P), c[:, None, None] * left.D11, 1e-12)
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("name", ["nonlinear", "parachute"])
+def test_hamiltonian_derivatives(name, side):
+    # fails if the envelope theorem or a block of the Legendre transform is wrong: differences of H and of its gradient
+    L_d, h, (q0, p0, s0), (q1, p1, s1), _ = solved(name)
+    H, x = (RightHamiltonian(L_d, q1), (q0, p1, s0)) if side == "right" else (LeftHamiltonian(L_d, q0), (p0, q1, s1))
+    P = H.partials(*x, h, order=2)
+    n, eps = q0.shape[-1], 1e-5
+    flat = torch.cat([x[0], x[1], x[2][:, None]], -1)
+    rows = []
+    for i in range(2 * n + 1):
+        ends = []
+        for sign in (1, -1):
+            y = flat.clone()
+            y[:, i] += sign * eps
+            Q = H.partials(y[:, :n], y[:, n : 2 * n], y[:, -1], h)
+            ends.append(torch.cat([Q.L[:, None], Q.D1, Q.D2, Q.D3[:, None]], -1))
+        rows.append((ends[0] - ends[1]) / (2 * eps))
+    slope = torch.stack(rows, -1)  # [value and gradient, direction]
+    first = torch.cat([P.D1, P.D2, P.D3[:, None]], -1)
+    close(slope[:, 0], first, 1e-7)
+    second = torch.cat(
+        [
+            torch.cat([P.D11, P.D12, P.D13[..., None]], -1),
+            torch.cat([P.D12.mT, P.D22, P.D23[..., None]], -1),
+            torch.cat([P.D13, P.D23, P.D33[:, None]], -1)[:, None],
+        ],
+        -2,
+    )
+    close(slope[:, 1:], second, 1e-6)
+
+
+def test_hamiltonians_of_the_oscillator_in_closed_form():
+    # fails if either transform takes the wrong argument or sign; closed forms of section 3
+    L_d, h, (q0, p0, s0), (q1, p1, s1), _ = solved("oscillator")
+    assert OSCILLATOR.H_plus is not None
+    assert OSCILLATOR.H_minus is not None
+    close(RightHamiltonian(L_d)(q0, p1, s0, h), OSCILLATOR.H_plus(q0, p1, s0, h), 1e-12)
+    close(left_hamiltonian(L_d, p0, q1, s1, h, q1), OSCILLATOR.H_minus(p0, q1, s1, h), 1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_both_sets_of_equations_on_the_flow(name):
+    # fails if a left equation is the printed one (E5), or the right ones miss 1 − D3H⁺
+    L_d, h, (q0, p0, s0), (q1, p1, s1), _ = solved(name)
+    right = right_equations(RightHamiltonian(L_d, q1 + 0.01).partials(q0, p1, s0, h), p1, s0)
+    left = left_equations(LeftHamiltonian(L_d, q0 - 0.01).partials(p0, q1, s1, h), p0, s1)
+    for value, expected in zip((*right, *left), (q1, p0, s1, q0, p1, s0), strict=True):
+        close(value, expected, 1e-12)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_steps_by_right_and_by_left_equations(name):
+    # fails if three ways to the same map, Newton on FL⁻, right and left equations, differ
+    L_d, h, start, end, _ = solved(name)
+    near = start.q + h * start.p
+    by_right = right_step(RightHamiltonian(L_d, near), *start, h)
+    by_left = left_step(LeftHamiltonian(L_d, start.q), *start, h)
+    for value, expected in zip((*by_right, *by_left), (*end, *end), strict=True):
+        close(value, expected, 1e-12)
+
+
+def test_step_by_a_closed_form_hamiltonian():
+    # fails if only H built from an L_d can be stepped with
+    _, h, start, end, _ = solved("oscillator")
+    H_plus, H_minus = OSCILLATOR.H_plus, OSCILLATOR.H_minus
+    assert H_plus is not None
+    assert H_minus is not None
+    steps = (*right_step(H_plus, *start, h), *left_step(H_minus, *start, h))
+    for value, expected in zip(steps, (*end, *end), strict=True):
+        close(value, expected, 1e-12)
+
+
+def test_the_printed_left_equations_fail_by_the_quoted_size():
+    # null model: the printed p1 = D2H⁻ and the fix of its sign alone. Fails if either passes; sizes of E5, golden start
+    q0, p0 = (torch.tensor(x, dtype=torch.float64) for x in ((0.3, -0.5), (0.7, 0.2)))
+    s0, h = torch.tensor(0.4, dtype=torch.float64), 0.3
+    q1, p1, s1 = Stepper(nonlinear).step(State(q0, p0, s0), h).state
+    P = LeftHamiltonian(nonlinear, q0).partials(p0, q1, s1, h)
+    assert float((p1 - P.D2).abs().max()) == pytest.approx(1.28, abs=0.005)
+    assert float((p1 + P.D2).abs().max()) == pytest.approx(0.084, abs=0.0005)
+    assert float((p1 - left_equations(P, p0, s1)[1]).abs().max()) < 1e-13  # the step: 64 eps of q, over h
+
+
+def test_the_left_lagrangian_steps_backwards():
+    # fails if L⁻ is not the generating function of the inverse: L*(q1, q0, s1) = −L⁻(q0, q1, s1) leads back
+    L_d, h, start, end, _ = solved("nonlinear")
+    L = LeftLagrangian(L_d)
+
+    class Reversed:
+        def __call__(self, q1, q0, s1, h):
+            return -L(q0, q1, s1, h)
+
+    back = Stepper(Reversed()).step(end, h, guess=start.q).state
+    for value, expected in zip(back, start, strict=True):
+        close(value, expected, 1e-12)
+
+
+def test_where_c_vanishes_the_left_side_is_nan_and_the_right_is_not():
+    # fails if 1/c is hidden, or one bad sample spoils its neighbours: left rule at h = 1/γ
+    L_d = scene("damped_oscillator").L_d_rules["left"]
+    x = torch.tensor([[1.0], [0.5]], dtype=torch.float64)
+    s, h = torch.tensor([0.3, 0.1], dtype=torch.float64), torch.tensor([5.0, 0.1], dtype=torch.float64)
+    left = LeftLagrangian(L_d)(x, x + 0.1, s, h)
+    assert left.isnan().tolist() == [True, False]
+    assert LeftHamiltonian(L_d)(x, x, s, h).isnan().tolist() == [True, False]
+    assert RightHamiltonian(L_d)(x, x, s, h).isnan().tolist() == [False, False]
+
+
+def test_no_previous_action_is_nan():
+    # fails if Newton's last iterate is returned where s0 + L_d = s1 has no solution (c changes sign)
+    def fold(q0, q1, s0, h):
+        return s0**2 + (q0 * q1).sum(-1) + 0 * h
+
+    q, s1 = torch.zeros(2, 1, dtype=torch.float64), torch.tensor([-1.0, 2.0], dtype=torch.float64)
+    s0 = LeftLagrangian(fold).previous_action(q, q, s1, 1.0)
+    assert s0.isnan().tolist() == [True, False]
+    assert float(s0[1]) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_batch_and_precision(dtype):
+    # fails if leading dimensions are lost or float64 gets in
+    L_d, h, start, end, _ = solved("nonlinear")
+    p0, q1, s1, q0 = (x.to(dtype).reshape(3, 4, *x.shape[1:]) for x in (start.p, end.q, end.s, start.q))
+    H = LeftHamiltonian(L_d, q0)(p0, q1, s1, h)
+    assert H.shape == (3, 4)
+    assert H.dtype == dtype
+    alone = LeftHamiltonian(L_d, q0[1, 2])(p0[1, 2], q1[1, 2], s1[1, 2], h)
+    assert math.isclose(float(alone), float(H[1, 2]), rel_tol=1e3 * torch.finfo(dtype).eps)

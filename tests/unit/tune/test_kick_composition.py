@@ -1,0 +1,156 @@
+"""Large steps of learned kicks and drifts: contact maps whatever their numbers, fitted, and the same in C."""
+
+import math
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export.c_wrapper import compiler
+from herglotz.mechanics import contact_defect, flow_derivative
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
+from herglotz.stepping import State, Status
+from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
+from herglotz.tune.kick_composition_c import kicks_c
+
+try:
+    compiler()
+    HAS_C = True
+except InputError:
+    HAS_C = False
+needs_c = pytest.mark.skipif(not HAS_C, reason="no C compiler")
+H = 1.0
+
+
+def states(count, seed=0, dtype=torch.float64):
+    make = torch.Generator().manual_seed(seed)
+    q, p = 3 * torch.rand(2, count, 1, generator=make, dtype=torch.float64) - 1.5
+    s = torch.rand(count, generator=make, dtype=torch.float64)
+    return State(q.to(dtype), p.to(dtype), s.to(dtype))
+
+
+def random_kicks(angle, seed=0, error=0.0):
+    make = torch.Generator().manual_seed(seed)
+    d, a, b = (torch.randn(n, generator=make, dtype=torch.float64) for n in (4, 12, 12))
+    b = b.reshape(3, 4) if angle else torch.zeros(3, 0, dtype=torch.float64)
+    return KickStepper(H, 0.3, angle, 0.2, 1.7, 0.3 + 0.1 * d, 0.2 * a.reshape(3, 4), 0.2 * b, 0.07, error)
+
+
+@pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
+def test_any_numbers_make_a_contact_map(angle):
+    # fails if a kick's slope is not that of its potential, s misses a term, or c is not e^{−γh}
+    stepper, x = random_kicks(angle), states(6)
+
+    def flow(q, p, s):
+        return stepper.step(State(q, p, s), H).state
+
+    (_, p1, _), D = flow_derivative(flow, *x)
+    c = stepper.step(x, H).c
+    torch.testing.assert_close(c, torch.full_like(c, math.exp(-0.3)))
+    assert float(contact_defect(D, x.p, p1, c).abs().max()) < 1e-12
+    # fails if the check cannot see a wrong c
+    assert float(contact_defect(D, x.p, p1, 1.01 * c).abs().max()) > 1e-4
+
+
+def pairs(count, seed, h, system):
+    q, p, s = states(count, seed)
+    return State(q, p, s), State(*system.flow(q, p, s, h))
+
+
+@pytest.mark.parametrize(("kicks", "worst"), [(3, 1e-4), (4, 1e-5)])
+def test_a_few_kicks_reproduce_a_large_step_of_the_pendulum(kicks, worst):
+    # fails if the fit does not converge, γ is not the model's, or s is off by a constant
+    system = scene("damped_pendulum")
+    model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0))
+    found = fit_kicks(model, *pairs(300, 0, H, system), H, kicks=kicks, iterations=60)
+    start, end = pairs(200, 1, H, system)
+    out = found.step(start, H).state
+    assert float((out.q - end.q).square().mean().sqrt()) < worst
+    assert float((out.p - end.p).square().mean().sqrt()) < 2 * worst
+    assert float((out.s - end.s).square().mean().sqrt()) < 2 * worst
+    assert found.error < worst
+    # a null model: leapfrog with as many kicks of the true force is worse by orders
+    drifts, cosines = (
+        torch.full((kicks + 1,), H / kicks, dtype=torch.float64),
+        torch.zeros(kicks, 1, dtype=torch.float64),
+    )
+    drifts[0] = drifts[-1] = H / kicks / 2
+    plain = KickStepper(H, 0.2, True, 0.0, 1.0, drifts, cosines - H / kicks, cosines)
+    assert float((plain.step(start, H).state.q - end.q).square().mean().sqrt()) > 10 * worst
+
+
+@pytest.mark.parametrize("h", [1.0, 3.0])
+def test_two_kicks_are_the_oscillator_wherever_the_data_lie(h):
+    # fails if a kick vanishes at the middle of the data instead of where the force does: 1e-3 a step was left
+    system = scene("damped_oscillator")
+    model = ContactLagrangian(ModelConfig(angles=(False,), rate=0.2, potential_width=0))
+    start = State(torch.linspace(-0.4, 1.6, 40).double()[:, None], torch.cos(torch.arange(40.0)).double()[:, None],
+                  torch.zeros(40).double())  # fmt: skip
+    found = fit_kicks(model, start, State(*system.flow(*start, h)), h, kicks=2, iterations=60)
+    assert found.error < 1e-12
+    torch.testing.assert_close(found.step(start, h).state.p, system.flow(*start, h)[1], rtol=0, atol=1e-12)
+
+
+@needs_c
+@pytest.mark.parametrize(("dtype", "tolerance"), [("float64", 1e-11), ("float32", 1e-4)])
+@pytest.mark.parametrize("angle", [True, False], ids=["angle", "length"])
+def test_c_is_the_same_step(angle, dtype, tolerance):
+    # fails if a polynomial, a sign of a half turn or the order of kicks differs; angles of many turns among them
+    stepper, number = random_kicks(angle), getattr(torch, dtype)
+    x = states(50, dtype=number)
+    if angle:
+        turns = 2 * math.pi * (torch.arange(50) % 5 - 2)[:, None]
+        x = State((x.q + turns).to(number), x.p, x.s)
+    else:
+        x = State(x.q / 2, x.p / 2, x.s)
+    a = stepper.rollout(*(y.double() for y in x), h=H, steps=1)
+    b = CompiledKicks(stepper, dtype).rollout(*x, h=H, steps=1)
+    assert b.q.dtype == number
+    # A rounded angle of two turns, 1e-6 in float32, times the slopes of three random kicks, about 4 each.
+    good = a.q.abs().amax((1, 2)) < 20  # what a polynomial throws far out is rounding
+    assert int(good.sum()) > 20
+    for name in ("q", "p", "s"):
+        one, two = getattr(a, name)[good], getattr(b, name)[good].double()
+        assert float(((one - two).abs() / (1 + one.abs())).max()) < tolerance, name
+    torch.testing.assert_close(a.sigma.to(number), b.sigma)
+
+
+@needs_c
+def test_c_is_no_more_exact_than_the_fit():
+    # fails if the sine is not cut to the error of the fit, or cut below it
+    long, short = (kicks_c(random_kicks(True, error=e)) for e in (0.0, 1e-3))
+    assert len(short) < len(long)
+    x = states(20)
+    a = random_kicks(True).rollout(*x, h=H, steps=1).q
+    b = CompiledKicks(random_kicks(True, error=1e-3)).rollout(*x, h=H, steps=1).q
+    assert 1e-12 < float((a - b).abs().max()) < 1e-3
+
+
+@needs_c
+def test_what_is_not_finite_says_so():
+    # fails if a motion that overflows is reported as converged, or poisons the next one of its batch
+    d = torch.full((2,), 0.5, dtype=torch.float64)
+    wild = KickStepper(H, 0.0, False, 0.0, 1.0, d, torch.full((1, 4), 1.0, dtype=torch.float64), torch.zeros(1, 0))
+    x = State(*(torch.tensor(y, dtype=torch.float64) for y in ([[50.0], [1e-3]], [[0.0], [0.0]], [0.0, 0.0])))
+    for stepper in (wild, CompiledKicks(wild)):
+        out = stepper.rollout(*x, h=H, steps=8)
+        assert out.status[0, -1] == Status.DIVERGED
+        assert bool(out.q[0, -1].isnan().all())
+        assert bool(out.ok[1])
+
+
+def test_wrong_input(tmp_path):
+    # fails if another step than the fitted one, several coordinates, or a varying c are taken silently
+    stepper = random_kicks(True)
+    with pytest.raises(InputError, match=r"fitted to h = 1, got 0\.5"):
+        stepper.step(states(2), 0.5)
+    two: Any = State(*(x.expand(*x.shape[:-1], 2) if x.ndim > 1 else x for x in states(2)))
+    with pytest.raises(InputError, match="one coordinate, got 2"):
+        stepper.step(two, H)
+    affine = ContactLagrangian(ModelConfig(level="affine"))
+    with pytest.raises(InputError, match="one coordinate at the conservative or linear level"):
+        fit_kicks(affine, states(3), states(3), H, kicks=2)
+    with pytest.raises(InputError, match="float64 or float32"):
+        export_kicks_c(stepper, tmp_path / "a.h", "bfloat16")

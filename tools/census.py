@@ -1,0 +1,269 @@
+"""Count what the project is made of: `python tools/census.py [--json] [--list] [--against REV]`.
+
+Everything is counted in the source itself, by its syntax tree and its text; nothing is imported or run. `--against REV`
+counts another revision as well and prints before → after; `--list` names every finding.
+
+* Lines: `wc -l` of .py, .c and .h files of a room, which is a folder of src/herglotz, or train, benchmarks, tools.
+* Long functions: more than 40 lines without the docstring. Parameters: more than 6, `self` and `cls` not counted.
+* Complexity: 1, and 1 for each if, loop, except, case, conditional expression, comprehension, its conditions, and each
+  further operand of `and` and `or`.
+* Newton loops: functions with a `while`, or a `for` with a `break`, in which a linear problem is solved (there or in a
+  helper of the same file), or with a `while_loop` in a file that names Newton; in C functions NAME_…solve that take no
+  matrix. Least squares of training, which solve normal equations, are not counted.
+* Rollout drivers: functions with a loop in which a step is taken, or named rollout with a loop; in C NAME_…rollout.
+* Circles: files of src that import each other, directly or not, for types or inside functions too; a name imported from
+  a package counts as from the file that defines it.
+* Uncalled names: public functions and classes of a module that nothing names but their own file, re-exports and tests.
+* Bare constants: names in capitals with a number in their value and no comment beside or above.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import io
+import json
+import re
+import subprocess
+import tarfile
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+Files = dict[str, str]  # path from the root of the repository → text
+FUNCTIONS = (ast.FunctionDef, ast.AsyncFunctionDef)
+LOOPS = (ast.For, ast.While)
+LONG, WIDE = 40, 6  # lines of a function, its parameters
+# Rooms and the lines they may have (docs/architecture.md); `systems` is what `scenes` was called.
+BUDGETS = {
+    "errors, settings, version": (("src",), 150),
+    "mechanics, theory, stepping": (("mechanics", "theory", "stepping"), 5400),
+    "scenes": (("scenes", "systems"), 2000),
+    "models": (("models",), 1900),
+    "data": (("data",), 1500),
+    "training": (("training",), 3800),
+    "export": (("export",), 4000),
+    "tune, verify, plots, cli": (("tune", "verify", "plots", "cli"), 3700),
+    "train/": (("train/",), 650),
+    "benchmarks/": (("benchmarks/",), 4000),
+    "tools/, data/, examples/": (("tools/", "data/", "examples/"), 350),
+}
+GOALS = {"src": 21_000, "outside tests": 26_000, "complexity": 15, "Newton loops": 3, "rollout drivers": 2}
+GOALS["circles"] = 0
+BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.comprehension, ast.match_case)
+SOLVE = re.compile(r"(^|_)(solve|solver|solve_ex|inv_ex|pseudo_inverse)$")  # names that solve a linear problem
+STEP = re.compile(r"(^|\.)_?(step|take|advance)$")
+C_NEWTON = re.compile(r"^\s*(?:static |inline |int |void )+\w*_solve\((?!real)", re.M)
+C_ROLLOUT = re.compile(r"^\s*(?:static |inline |int |long |void )+\w*_rollout\(", re.M)
+
+
+def sources(revision: str | None) -> Files:
+    """Text of every Python, C and Markdown file, of the working tree or of a revision."""
+    kinds = (".py", ".c", ".h", ".md")
+    if revision is None:
+        listed = _git("ls-files", "--cached", "--others", "--exclude-standard").decode().splitlines()
+        return {p: (ROOT / p).read_text("utf-8") for p in listed if p.endswith(kinds) and (ROOT / p).is_file()}
+    with tarfile.open(fileobj=io.BytesIO(_git("archive", revision))) as archive:
+        members = [m for m in archive if m.isfile() and m.name.endswith(kinds)]
+        return {m.name: archive.extractfile(m).read().decode() for m in members}  # type: ignore[union-attr]
+
+
+def _git(*words: str) -> bytes:
+    return subprocess.run(["git", *words], cwd=ROOT, capture_output=True, check=True).stdout
+
+
+def room(path: str) -> str:
+    """Room of a file: "training" of src/herglotz/training/fit.py, "src" of src/herglotz/errors.py, or the folder."""
+    parts = path.split("/")
+    return f"{parts[0]}/" if parts[0] != "src" else parts[2] if len(parts) > 3 else "src"
+
+
+def complexity(function: ast.AST) -> int:
+    """Number of ways through a function, the functions inside it included."""
+    nodes = list(ast.walk(function))
+    more = sum(len(n.values) - 1 for n in nodes if isinstance(n, ast.BoolOp))
+    more += sum(len(n.ifs) for n in nodes if isinstance(n, ast.comprehension))
+    return 1 + more + sum(isinstance(n, BRANCHES) for n in nodes)
+
+
+def length(function: Any) -> int:
+    """Lines from `def` to the end, without the docstring."""
+    first = function.body[0]
+    documented = ast.get_docstring(function) is not None
+    return function.end_lineno - function.lineno + 1 - documented * (first.end_lineno - first.lineno + 1)
+
+
+def parameters(function: Any) -> int:
+    """Number of parameters without `self` and `cls`."""
+    a = function.args
+    return sum(x.arg not in ("self", "cls") for x in (*a.posonlyargs, *a.args, *a.kwonlyargs))
+
+
+def called(node: ast.AST) -> set[str]:
+    """Last parts of the names of all functions that are called below a node."""
+    found = [n.func for n in ast.walk(node) if isinstance(n, ast.Call)]
+    return {f.attr if isinstance(f, ast.Attribute) else f.id for f in found if isinstance(f, ast.Attribute | ast.Name)}
+
+
+def newton_loops(tree: ast.Module, text: str) -> Iterator[str]:
+    """Functions with a loop that ends early (`while`, or `break`) and solves a linear problem in every turn."""
+    functions = {f.name: f for f in ast.walk(tree) if isinstance(f, FUNCTIONS)}
+    solvers = {name for name, f in functions.items() if any(map(SOLVE.search, called(f)))}
+    for name, function in functions.items():
+        loops = [n for n in ast.walk(function) if isinstance(n, LOOPS)]
+        early = [n for n in loops if isinstance(n, ast.While) or any(isinstance(m, ast.Break) for m in ast.walk(n))]
+        solved = any(c in solvers or SOLVE.search(c) for loop in early for c in called(loop))
+        traced = "newton" in text.lower() and any("while_loop" in c for c in called(function))
+        if solved or traced:
+            yield f"{function.lineno} {name}"
+
+
+def drives(function: Any) -> bool:
+    """Whether a function itself holds a loop in which a step is taken: `for k in …: … step(state, …)`."""
+    inner = {m for n in ast.walk(function) if isinstance(n, FUNCTIONS) and n is not function for m in ast.walk(n)}
+    loops = [n for n in ast.walk(function) if isinstance(n, LOOPS) and n not in inner]
+    calls = [ast.unparse(n.func) for loop in loops for n in ast.walk(loop) if isinstance(n, ast.Call)]
+    return any(STEP.search(c) and "optim" not in c for c in calls) or ("rollout" in function.name and bool(loops))
+
+
+def imports(files: Files) -> dict[str, set[str]]:
+    """Which files of src each file of src imports; names that a package re-exports lead to where they are defined."""
+    paths = [p for p in files if p.startswith("src/") and p.endswith(".py")]
+    module = {p[4:-3].replace("/", ".").removesuffix(".__init__"): p for p in paths}
+    trees = {p: ast.parse(files[p]) for p in paths}
+
+    def origin(package: str, name: str) -> str | None:
+        """File that defines `name` of a module, or the submodule of that name."""
+        if f"{package}.{name}" in module:
+            return module[f"{package}.{name}"]
+        path = module.get(package)
+        if path is None or not path.endswith("__init__.py"):
+            return path
+        for node in trees[path].body:
+            if isinstance(node, ast.ImportFrom) and name in (a.asname or a.name for a in node.names):
+                return origin(node.module or "", name)
+        return path
+
+    found: dict[str, set[str]] = {}
+    for path, tree in trees.items():
+        used = [] if path.endswith("__init__.py") else list(ast.walk(tree))  # a package only passes names on
+        origins = {origin(n.module or "", a.name) for n in used if isinstance(n, ast.ImportFrom) for a in n.names}
+        origins |= {module.get(a.name) for n in used if isinstance(n, ast.Import) for a in n.names}
+        found[path] = {f for f in origins if f and f != path}
+    return found
+
+
+def circles(edges: dict[str, set[str]]) -> list[list[str]]:
+    """Groups of files each of which reaches every other one of its group by imports."""
+    reach = {path: set(files) for path, files in edges.items()}
+    for middle in reach:  # Warshall's transitive closure
+        for ends in reach.values():
+            if middle in ends:
+                ends |= reach[middle]
+    groups = {tuple(sorted(q for q in reach[p] if p in reach[q])) for p in reach if p in reach[p]}
+    return [list(group) for group in sorted(groups)]
+
+
+def uncalled(files: Files) -> list[str]:
+    """Public functions and classes of src that no other file but a test or a re-exporting `__init__` names."""
+    readers = {p: t for p, t in files.items() if not p.startswith("tests/") and not p.endswith("CHANGELOG.md")}
+    words = {p: Counter(re.findall(r"\w+", _without_imports(p, t))) for p, t in readers.items()}
+    everywhere = Counter(word for count in words.values() for word in count)
+    found = []
+    for path in (p for p in readers if p.startswith("src/") and p.endswith(".py")):
+        for node in ast.parse(files[path]).body:
+            name = getattr(node, "name", "_")  # of a function or a class
+            if not name.startswith("_") and everywhere[name] == words[path][name] == 1:
+                found.append(f"{path}:{node.lineno} {name}")
+    return found
+
+
+def _without_imports(path: str, text: str) -> str:
+    """The text of a file; of an `__init__` only what is no import and no `__all__`."""
+    if not path.endswith("__init__.py"):
+        return text
+    passed_on = (ast.Import, ast.ImportFrom, ast.Assign)
+    return "\n".join(ast.unparse(node) for node in ast.parse(text).body if not isinstance(node, passed_on))
+
+
+def bare_constants(tree: ast.Module, text: str) -> Iterator[str]:
+    """Constants of a module whose numbers nothing explains."""
+    lines = text.splitlines()
+    for node in tree.body:
+        target = node.targets[0] if isinstance(node, ast.Assign) else getattr(node, "target", None)
+        if not isinstance(target, ast.Name) or not target.id.isupper():
+            continue
+        numbers = [n for n in ast.walk(node) if isinstance(n, ast.Constant) and type(n.value) in (int, float)]
+        own = lines[node.lineno - 1 : node.end_lineno]
+        if numbers and not any("#" in x or "__file__" in x for x in own) and not lines[node.lineno - 2].startswith("#"):
+            yield target.id
+
+
+def census(files: Files) -> dict[str, Any]:
+    """Every count, and what was found."""
+    code = {p: t for p, t in files.items() if not p.startswith("tests/") and p.endswith((".py", ".c", ".h"))}
+    lines: Counter[str] = Counter()
+    kinds = ("long functions", "wide functions", "Newton loops", "rollout drivers", "bare constants")
+    found: dict[str, list[str]] = {kind: [] for kind in kinds}
+    most = (0, "")
+    for path, text in code.items():
+        lines[room(path)] += text.count("\n")
+        if path.startswith("src/"):
+            found["Newton loops"] += [f"{path} {m.group().strip()}" for m in C_NEWTON.finditer(text)]
+            found["rollout drivers"] += [f"{path} {m.group().strip()}" for m in C_ROLLOUT.finditer(text)]
+        if not path.endswith(".py"):
+            continue
+        tree = ast.parse(text)
+        for f in (n for n in ast.walk(tree) if isinstance(n, FUNCTIONS)):
+            place = f"{path}:{f.lineno} {f.name}"
+            most = max(most, (complexity(f), place))
+            found["long functions"] += [f"{place} {length(f)}"] * (length(f) > LONG)
+            found["wide functions"] += [f"{place} {parameters(f)}"] * (parameters(f) > WIDE)
+            found["rollout drivers"] += [place] * (path.startswith("src/") and drives(f))
+        found["bare constants"] += [f"{path} {name}" for name in bare_constants(tree, text)]
+        if path.startswith("src/") and room(path) != "training":
+            found["Newton loops"] += [f"{path}:{loop}" for loop in newton_loops(tree, text)]
+    found["circles"] = [" ↔ ".join(group) for group in circles(imports(code))]
+    found["uncalled names"] = uncalled(files)
+    budget = {name: sum(lines[r] for r in rooms) for name, (rooms, _) in BUDGETS.items()}
+    totals = {"src": sum(text.count("\n") for p, text in code.items() if p.startswith("src/"))}
+    totals["outside tests"] = sum(lines.values())
+    counts = {"complexity": most[0], **{kind: len(x) for kind, x in found.items()}}
+    return {"lines": budget | totals, "counts": counts, "most complex": most[1], "found": found}
+
+
+def table(now: dict[str, Any], before: dict[str, Any] | None) -> str:
+    """Counts as text, with those of another revision before them."""
+    goals = {name: goal for name, (_, goal) in BUDGETS.items()} | GOALS
+    rows = [f"{'':28}{'before' if before else '':>9}{'now':>8}{'goal':>9}"]
+    for part in ("lines", "counts"):
+        for name, value in now[part].items():
+            goal = f"{goals[name]:,}" if name in goals else ""
+            old = f"{before[part].get(name, 0):,} →" if before else ""
+            over = "over" if name in goals and value > goals[name] else ""
+            rows.append(f"{name:28}{old:>9}{value:>8,}{goal:>9}  {over}".rstrip())
+    return "\n".join(rows)
+
+
+def main(argv: list[str] | None = None) -> None:
+    """Count and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--against", metavar="REV", help="a revision to compare with, e.g. HEAD~20")
+    parser.add_argument("--json", action="store_true", help="everything that was found, as JSON")
+    parser.add_argument("--list", action="store_true", help="name every finding under the table")
+    arguments = parser.parse_args(argv)
+    now = census(sources(None))
+    before = census(sources(arguments.against)) if arguments.against else None
+    if arguments.json:
+        print(json.dumps({"now": now, "before": before}, indent=1, ensure_ascii=False))
+        return
+    print(table(now, before))
+    print(f"\nmost complex: {now['most complex']}")
+    for kind, found in now["found"].items() if arguments.list else ():
+        print("\n".join([f"\n{kind}:", *(f"  {one}" for one in found)]))
+
+
+if __name__ == "__main__":
+    main()
