@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from herglotz.export.box import Box
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json
 from herglotz.export.programs import quiet
-from herglotz.stepping import Rollout, State, Step, step_sizes
+from herglotz.stepping import Linearised, Rollout, State, Step, step_sizes
 
 Program = Callable[..., tuple[Tensor, ...]]
 
@@ -107,6 +107,11 @@ class ExportedStepper:
             out = self.programs["model"](*flat)
         else:
             out = tuple(x[0] for x in self.programs["rollout"](*flat[:3], *(x[None] for x in flat[3:])))
+        return self._step(out, state)
+
+    def _step(self, out: Sequence[Tensor], state: State) -> Step:
+        """The outputs of a program as a step of the shape of `state`."""
+        q, _, s = state
         q1, p1, s1, c, residual, status, *outside = out
         new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
         c, residual, status, *outside = (x.reshape(s.shape) for x in (c, residual, status, *outside))
@@ -164,6 +169,35 @@ class ExportedStepper:
         q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in ((q, q_all), (p, p_all), (s, s_all)))
         found = Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual, outside=outside)
         return decimated(found, every)
+
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`; autograd does not go through the result.
+
+        Returns
+        -------
+        Linearised
+            The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du.
+
+        Raises
+        ------
+        InputError
+            As `step`, and where the format holds no derivative.
+        """
+        if "linearise" not in self.programs:
+            raise InputError(f"{self.path}: an {self.kind} file holds no derivative; use a .pt2, ONNX or C file")
+        state = State(*(x.detach() for x in state))
+        self._check(*state)
+        h = spread_h(self._checked_h(h), state.s)
+        with torch.no_grad():
+            *out, J = self.programs["linearise"](*self._flat(state, h, u))
+        J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1
+        by_input = J[..., size + 1 :] if self.inputs else None
+        return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input)
 
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.

@@ -12,8 +12,9 @@ from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations, dense
-from herglotz.export.newton import ITERATIONS, Values, unfinished
+from herglotz.export.newton import CONVERGED, ITERATIONS, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
+from herglotz.export.trace import Graph
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.linearise import eliminate
 
@@ -158,6 +159,36 @@ class StepModule(nn.Module):
         delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]  # the same value
         _, *values = self.first_order(*problem, delta, *more)
         return (*found[:2], delta, *found[3:7], *values)
+
+
+class LinearisedModule(nn.Module):
+    """(q, p, s, h[, u]) → the outputs of a step, then d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m).
+
+    Parameters
+    ----------
+    graphs
+        The functions of a step.
+    jacobian
+        The derivative of a solved step, traced.
+    iterations
+        Bound on the Newton iterations.
+    """
+
+    def __init__(self, graphs: StepGraphs, jacobian: Graph, iterations: int = ITERATIONS):
+        super().__init__()
+        self.graphs, self.jacobian, self.iterations = graphs, jacobian, iterations
+
+    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
+        """One step and its derivative; NaN in the samples whose status is not `Status.CONVERGED`."""
+        graphs = self.graphs
+        carry, found = graphs.start(q, p, s), ()
+        if graphs.layout.iterates:
+            constants = graphs.begin.constants, graphs.iterate.constants
+            found = solved(graphs, self.iterations, h, u, carry, constants)
+        new = graphs.finish(h, *u, *carry, *found)
+        said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)
+        return *said, torch.where((said[5] == CONVERGED)[:, None, None], J, torch.nan)
 
 
 class InitModule(nn.Module):

@@ -14,7 +14,7 @@ from torch.export import Dim, ExportedProgram
 
 from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
-from herglotz.export.module import InitModule, RolloutModule, StepModule
+from herglotz.export.module import InitModule, LinearisedModule, RolloutModule, StepModule
 from herglotz.export.step import StepGraphs
 from herglotz.models import ContactLagrangian
 
@@ -24,9 +24,9 @@ EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
 def programs_of(
     model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str]
 ) -> dict[str, ExportedProgram]:
-    """Those programs of `model` (a differentiable step), `rollout` and `init` that are named, for any batch size.
+    """Those programs of `model` (a differentiable step), `rollout`, `linearise` and `init` that are named.
 
-    `entries` is the file's metadata.
+    Each holds for any batch size; `entries` is the file's metadata.
     """
     equations = Equations.of(model)
     graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
@@ -36,6 +36,7 @@ def programs_of(
     make = {
         "model": lambda: _program(StepModule(equations, iterations, graphs=graphs), (q, p, s, *more)),
         "rollout": lambda: _program(RolloutModule(graphs, iterations), (q, p, s, *stacked), stacked=3),
+        "linearise": lambda: _program(LinearisedModule(graphs, equations.jacobian, iterations), (q, p, s, *more)),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
     }
     return {name: make[name]() for name in names}

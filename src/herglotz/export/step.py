@@ -26,8 +26,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
 
-# The guess of Δ/h continues the parabola through the last velocities of equally long steps. Its error (ω h)³ leaves
-# three evaluations a step in float64; a longer memory saves none at ω h = 0.1 and amplifies steps that are not equal.
+# The guess of Δ/h continues the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear, affine
+# and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six; where steps differ tenfold, 3.0 to
+# 3.6 with three and 3.2 to 3.9 with six, which amplify the difference.
 CONTINUE = (3.0, -3.0, 1.0)
 STATE = 3  # q, p, s
 

@@ -22,7 +22,10 @@ from herglotz.models import ContactLagrangian
 
 OPSET = 20
 OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
-SECOND = {"init": (("q0", "q1", "s0", "h"), ("p", "s"))}  # inputs and outputs of the further models
+SECOND = {  # inputs and outputs of the further models
+    "init": (("q0", "q1", "s0", "h"), ("p", "s")),
+    "linearise": (("q", "p", "s", "h"), (*OUTPUTS[:6], "jacobian")),
+}
 
 
 def export_onnx(

@@ -17,7 +17,8 @@ aten = torch.ops.aten
 SIMPLE = {
     aten.abs.default: "Abs", aten.neg.default: "Neg", aten.sin.default: "Sin", aten.cos.default: "Cos",
     aten.exp.default: "Exp", aten.tanh.default: "Tanh", aten.sqrt.default: "Sqrt", aten.sigmoid.default: "Sigmoid",
-    aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not", aten.isnan.default: "IsNaN",
+    aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not",
+    aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul", aten.bmm.default: "MatMul",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
     aten.maximum.default: "Max", aten.minimum.default: "Min",
     aten.__and__.Tensor: "And", aten.__or__.Tensor: "Or", aten.eq.Scalar: "Equal", aten.eq.Tensor: "Equal",
@@ -346,6 +347,12 @@ def _nan_to_num(w: Writer, node: Any) -> str:
     return w.emit("Where", w.finite(x), w.name(x), w.name(nan, described(node).dtype))
 
 
+def _tanh_backward(w: Writer, node: Any) -> str:
+    """g (1 − t²)."""
+    g, t = (w.name(x) for x in node.args)
+    return w.emit("Mul", g, w.emit("Sub", w.name(1.0, described(node).dtype), w.emit("Mul", t, t)))
+
+
 def _diagonal(w: Writer, node: Any) -> str:
     x: Any = node.args[0]
     eye = w.constant(np.eye(described(x).shape[-1]), NUMPY[described(x).dtype])
@@ -365,6 +372,12 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.stack.default: _stack,
     aten.linear.default: _linear,
     aten.matmul.default: _matmul,
+    aten.mm.default: _matmul,
+    aten.mv.default: _matmul,
+    aten.tanh_backward.default: _tanh_backward,
+    aten.permute.default: lambda w, n: w.emit("Transpose", w.name(n.args[0]), perm=n.args[1]),
+    aten._to_copy.default: lambda w, n: w.emit("Cast", w.name(n.args[0]), to_=kind_of(described(n).dtype)),
+    aten.empty_like.default: lambda w, n: w.like(n, 0),
     aten.movedim.int: _moved,
     aten.movedim.intlist: _moved,
     aten.unflatten.int: _unflatten,
