@@ -64,7 +64,7 @@ class Box(nn.Module):
 
 
 class Report(nn.Module):
-    """What steps say of themselves, for any number of them at once: status, NaN where they failed, and the box."""
+    """What a step says of itself: its status, NaN where it failed, and the box."""
 
     def __init__(self, box: Box | None):
         super().__init__()

@@ -32,7 +32,8 @@ def solved(
         return graphs.iterate.call(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
 
     # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
-    return while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, first, fixed)
+    carried: Any = first
+    return while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
 
 
 class RolloutModule(nn.Module):
@@ -68,7 +69,7 @@ class RolloutModule(nn.Module):
         """
         graphs = self.graphs
         carry = [dense(x) for x in graphs.start(q, p, s)]
-        used = (*((graphs.begin, graphs.iterate) if graphs.layout.iterates else ()), graphs.finish)
+        used = (*((graphs.begin, graphs.iterate) if graphs.layout.iterates else ()), graphs.finish, graphs.report)
         counts = [len(graph.constants) for graph in used]
         ends = len(carry), len(carry) + 1 + len(u)
 
@@ -78,14 +79,13 @@ class RolloutModule(nn.Module):
             h = h + torch.zeros(size, dtype=h.dtype, device=h.device)
             constants = [tuple(fixed[sum(counts[:i]) : sum(counts[: i + 1])]) for i in range(len(counts))]
             found = solved(graphs, self.iterations, h, tuple(u), carry, constants) if graphs.layout.iterates else ()
-            new = graphs.finish.call(h, *u, *carry, *found, *constants[-1])
-            return [dense(y) for y in (*new[: len(carry)], *new[:STATE], *new[len(carry) :])]
+            new = graphs.finish.call(h, *u, *carry, *found, *constants[-2])
+            said = graphs.report.call(h, *carry[:STATE], *new[:STATE], *new[len(carry) :], *constants[-1])
+            return [dense(y) for y in (*new[: len(carry)], *said)]
 
         fixed = (s.shape[0], *(x for graph in used for x in graph.constants))
-        rows = scan_op(step, carry, [h, *u], fixed)[len(carry) :]
-        before = (torch.cat([a[None], b[:-1]]) for a, b in zip((q, p, s), rows, strict=False))
-        said = graphs.report(*(x.flatten(0, 1) for x in (h, *before, *rows)))
-        return tuple(x.unflatten(0, h.shape) for x in said)
+        # Nothing may follow the scan: inductor of torch 2.13 gives the names of its buffers twice then.
+        return tuple(scan_op(step, carry, [h, *u], fixed)[len(carry) :])
 
 
 class StepModule(nn.Module):

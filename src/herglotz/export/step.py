@@ -4,7 +4,7 @@
     begin    (h, carry) → Newton's first carry           only where a step iterates
     iterate  (q, p, s, h, Newton's carry, …) → Newton's carry
     finish   (h, u, carry[, Newton's last carry]) → carry, then c[, residual, status]
-    report   (h, q, p, s, q1, p1, s1, c[, residual, status]) → the file's outputs, for any number of steps at once
+    report   (h, q, p, s, q1, p1, s1, c[, residual, status]) → the file's outputs
 
 The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where a step
 iterates; then, in float32, what rounding took from q and s (Kahan's sum; without it a digit is lost every ten steps).
@@ -26,9 +26,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
 
-# The guess of Δ/h continues the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear, affine
-# and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six; where steps differ tenfold, 3.0 to
-# 3.6 with three and 3.2 to 3.9 with six, which amplify the difference.
+# The guess of Δ/h continues the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
+# affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six; where steps differ
+# tenfold, 3.0 to 3.6 with three and 3.2 to 3.9 with six, which amplify the difference.
 CONTINUE = (3.0, -3.0, 1.0)
 STATE = 3  # q, p, s
 

@@ -118,7 +118,7 @@ def _placeholders(program: ExportedProgram, inputs: Sequence[str]) -> tuple[list
             named[name] = node
             values.append(name)
         else:
-            values.append(known[spec.target])
+            values.append(known[str(spec.target)])
     return values, named
 
 
