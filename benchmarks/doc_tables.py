@@ -5,17 +5,14 @@ A table stands between `<!-- NAME -->` and `<!-- /NAME -->`.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-from work_precision_report import terms
-
-from extremes import terms_table
-
-ROOT = Path(__file__).resolve().parents[1]
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.extremes import terms_table
+from benchmarks.work_precision import terms
 
 
 def filled(text: str, name: str, lines: Sequence[str]) -> str:
@@ -27,9 +24,9 @@ def filled(text: str, name: str, lines: Sequence[str]) -> str:
 
 def documents() -> dict[Path, str]:
     """Each page with its table as the stored results have it."""
-    results, docs = ROOT / "benchmarks" / "results", ROOT / "docs"
-    levels = terms_table(json.loads((results / "extremes.json").read_text())["parts"]["terms"])
-    scenes = terms(json.loads((results / "work_precision.json").read_text())["scenes"])[3:]
+    docs, stored = harness.ROOT / "docs", (harness.RESULTS / f"{name}.json" for name in ("extremes", "work_precision"))
+    extremes, work_precision = (harness.load(path, {}) for path in stored)
+    levels, scenes = terms_table(extremes["parts"]["terms"]), terms(work_precision["scenes"])[3:]
     tables = {docs / "extremes.md": ("levels", levels), docs / "work_precision.md": ("terms", scenes)}
     return {page: filled(page.read_text(), *table) for page, table in tables.items()}
 

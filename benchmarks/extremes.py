@@ -1,19 +1,17 @@
 """Where each setting breaks, measured: `python benchmarks/extremes.py [--quick] [--only PART …] [--out FOLDER]`.
 
 The sweeps behind docs/extremes.md: h, γ, magnitude, precision, length (1e8 steps in C), size, and what each scene's
-terms cost. One thread, processor time. Writes extremes.json and extremes.png.
+terms cost. One thread, processor time. Writes extremes.json and extremes.png, by
+default into benchmarks/results.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
-import os
-import platform
 import resource
 import statistics
 import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,17 +19,20 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import herglotz
+from benchmarks import harness
 from herglotz.errors import InputError
 from herglotz.export import export_c
 from herglotz.export.c_wrapper import FLAGS, compiler
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.plots.style import new_figure
 from herglotz.scenes import Scene, scene
 from herglotz.stepping import Rollout, State, Stepper
 
-ROOT = Path(__file__).resolve().parents[1]
 Row = dict[str, Any]
 DOUBLE = torch.float64
 FORMS: dict[str, dict[str, Any]] = {"explicit": {}, "Newton": {"correction_width": 8}}
@@ -59,10 +60,6 @@ def timed(run: Callable[[], Any]) -> tuple[float, Any]:
     return time.process_time() - begin, out
 
 
-def long_run(model: ContactLagrangian, x: State, h: float) -> Rollout:
-    return Stepper(model).rollout(*cast(x, DOUBLE), h=h, steps=10)
-
-
 def cast(x: State, dtype: torch.dtype) -> State:
     return State(*(y.to(dtype) for y in x))
 
@@ -82,28 +79,24 @@ def silent(out: Rollout) -> int:
 def step_size(_quick: bool) -> list[Row]:
     """Error of p after 10 steps, exact L_d of the oscillator; and of float32 models against their float64 twins."""
     oscillator, rows = scene("damped_oscillator"), []
-    for exponent in range(-8, 3):
-        h = 10.0**exponent
+
+    def add(what: str, L_d: Any, x: State, h: float, exact: Tensor, good: Tensor | bool = True) -> None:
+        out = timed(lambda: Stepper(L_d).rollout(*x, h=h, steps=10))[1]
+        errors = (out.final.p.double() - exact)[out.ok & good].abs()
+        rows.append({"what": what, "h": h, "error_p": float(errors.max()) if len(errors) else math.nan, **outcome(out)})
+
+    for h in (10.0**k for k in range(-8, 3)):
         for dtype in (torch.float32, DOUBLE):
-            x = starts(20, dtype=dtype)
-            h_used = float(torch.tensor(h, dtype=dtype))
-            _, out = timed(lambda h=h, x=x: Stepper(oscillator.L_d).rollout(*x, h=h, steps=10))
-            exact = oscillator.flow(*cast(x, DOUBLE), 10 * h_used)
-            ok = out.ok
-            error = float((out.final.p.double() - exact[1])[ok].abs().max()) if bool(ok.any()) else math.nan
-            rows.append({"what": f"exact L_d, {str(dtype)[6:]}", "h": h, "error_p": error, **outcome(out)})
+            x, h_used = starts(20, dtype=dtype), float(torch.tensor(h, dtype=dtype))
+            add(f"exact L_d, {str(dtype)[6:]}", oscillator.L_d, x, h, oscillator.flow(*cast(x, DOUBLE), 10 * h_used)[1])
+        x, h_used = starts(20, dtype=torch.float32), float(torch.tensor(h, dtype=torch.float32))
         for name, settings in FORMS.items():
             single, twin = build(0.1, torch.float32, **settings), build(0.1, **settings).float().double()
-            x, h_used = starts(20, dtype=torch.float32), float(torch.tensor(h, dtype=torch.float32))
-            _, exact = timed(lambda t=twin, x=x, h=h_used: long_run(t, x, h))
-            forms: dict[str, Any] = {"increments": single}
-            if name == "Newton":
-                forms["by position"] = ByPosition(single)
+            with torch.no_grad():
+                exact = Stepper(twin).rollout(*cast(x, DOUBLE), h=h_used, steps=10)
+            forms: dict[str, Any] = {"increments": single} | ({"by position": ByPosition(single)} if settings else {})
             for form, L_d in forms.items():
-                _, out = timed(lambda L=L_d, x=x, h=h: Stepper(L).rollout(*x, h=h, steps=10))
-                ok = out.ok & exact.ok
-                error = float((out.final.p.double() - exact.final.p)[ok].abs().max()) if bool(ok.any()) else math.nan
-                rows.append({"what": f"{name}, float32, {form}", "h": h, "error_p": error, **outcome(out)})
+                add(f"{name}, float32, {form}", L_d, x, h, exact.final.p, exact.ok)
     return rows
 
 
@@ -347,21 +340,9 @@ def costs(config: Row) -> Row:
     return row
 
 
-def conditions() -> Row:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    processor = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
-    return {"commit": commit.strip(), "processor": processor, "cores": os.cpu_count(), "threads": 1,
-            "load": os.getloadavg(), "torch": torch.__version__, "python": platform.python_version()}  # fmt: skip
-
-
 def plot(found: dict[str, list[Row]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
+    figure = new_figure(13, 4.2, "Where each setting breaks")
+    axes = figure.subplots(1, 3)
     for what in dict.fromkeys(r["what"] for r in found.get("step_size", [])):
         mine = [r for r in found["step_size"] if r["what"] == what]
         axes[0].loglog([r["h"] for r in mine], [r["error_p"] for r in mine], "o-", ms=3, label=what)
@@ -377,38 +358,28 @@ def plot(found: dict[str, list[Row]], path: Path) -> None:
     for ax in axes:
         if ax.get_legend_handles_labels()[0]:
             ax.legend(fontsize=7)
-    figure.savefig(path, dpi=130)
+    harness.picture(figure, path)
 
 
 PARTS = (step_size, damping, magnitude, precision, length, size, terms)
 
 
-def main() -> None:
-    torch.set_num_threads(1)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a test run: shorter, fewer sizes")
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__, quick=True)
     parser.add_argument("--only", nargs="*", choices=[p.__name__ for p in PARTS], help="parts to run")
-    parser.add_argument("--out", type=Path, help="folder for extremes.json and extremes.png, e.g. benchmarks/results")
-    arguments = parser.parse_args()
-    chosen = [p for p in PARTS if not arguments.only or p.__name__ in arguments.only]
-    found: dict[str, list[Row]] = {}
-    for part in (bar := tqdm(chosen)):
+    arguments = parser.parse_args(argv)
+    path = harness.json_file(arguments, "extremes")
+    found = harness.load(path, {"parts": {}})["parts"]  # parts that are not run are kept
+    for part in (bar := tqdm([p for p in PARTS if not arguments.only or p.__name__ in arguments.only])):
         bar.set_description(part.__name__)
         begin = time.perf_counter()
         found[part.__name__] = part(arguments.quick)
         for row in found[part.__name__]:
             tqdm.write(str({k: f"{v:.3g}" if isinstance(v, float) else v for k, v in row.items() if k != "fit"}))
         tqdm.write(f"{part.__name__}: {time.perf_counter() - begin:.1f} s")
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        file = arguments.out / "extremes.json"
-        before: dict[str, list[Row]] = {}
-        if file.exists() and arguments.only:
-            before = json.loads(file.read_text())["parts"]
-        parts = {p.__name__: found.get(p.__name__) or before.get(p.__name__) or [] for p in PARTS}
-        text = json.dumps({"conditions": conditions(), "quick": arguments.quick, "parts": parts}, indent=1)
-        file.write_text(text.replace("NaN", "null").replace("Infinity", "null") + "\n")
-        plot(parts, arguments.out / "extremes.png")
+        parts = {p.__name__: found.get(p.__name__, []) for p in PARTS}
+        harness.store(path, {"conditions": harness.conditions(), "quick": arguments.quick, "parts": parts})
+        plot(parts, path.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -7,11 +7,7 @@ Positions with a little noise; the levels, the seeds and every setting are the d
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
-import subprocess
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,13 +16,13 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
 from herglotz.data import Trajectories, simulate
-from herglotz.data.files import write_atomically
 from herglotz.scenes import scene
 from herglotz.training import select
 from herglotz.training.selection import CANDIDATES
 
-ROOT = Path(__file__).resolve().parents[1]
 NOISE = 1e-3  # of the motion's size
 
 
@@ -93,47 +89,35 @@ def sampled(case: Case) -> Trajectories:
 def table(rows: list[dict]) -> str:
     """One line a scene: held-out RMS of every level in units of q, and what was chosen."""
     levels = list(dict.fromkeys(c["level"] for row in rows for c in row["levels"]))
-    head = ["scene", "needs", "chosen", *levels, "seeds"]
-    lines = ["# Does `select` choose right?", "", "Held-out RMS of each level, median of the seeds.", "",
-             f"| {' | '.join(head)} |", "|---" * len(head) + "|"]  # fmt: skip
+    cells = []
     for row in rows:
         errors = {c["level"]: c["held_out_rms"] for c in row["levels"]}
         shown = ["failed" if errors.get(level) is None else f"{errors[level]:.3g}" for level in levels]
         chosen = row["chosen"] if row["right"] else f"**{row['chosen']}**"
-        lines.append(f"| {row['scene']} | {row['needs']} | {chosen} | {' | '.join(shown)} | {row['seeds']} |")
-    return "\n".join([*lines, "", f"Right on {sum(row['right'] for row in rows)} of {len(rows)} scenes."]) + "\n"
+        cells.append([row["scene"], row["needs"], chosen, *shown, row["seeds"]])
+    lines = ["# Does `select` choose right?", "", "Held-out RMS of each level, median of the seeds.", ""]
+    lines += harness.table(["scene", "needs", "chosen", *levels, "seeds"], cells)
+    return "\n".join([*lines, "", f"Right on {sum(row['right'] for row in rows)} of {len(rows)} scenes."])
 
 
-def main() -> None:
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", default=",".join(CASES), help="with commas; default all: %(default)s")
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
+    parser.add_argument("--scenes", help=f"with commas; default all: {','.join(CASES)}")
     parser.add_argument("--seeds", type=int, default=5, help="fits a level (default %(default)s)")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "ladder.json")
-    arguments = parser.parse_args()
-    names = [name.strip() for name in arguments.scenes.split(",")]
-    unknown = [name for name in names if name not in CASES]
-    if unknown:
-        parser.error(f"unknown scene {unknown[0]!r}; choose some of {', '.join(CASES)}")
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    old = json.loads(arguments.out.read_text())["scenes"] if arguments.out.exists() else []
-    rows = {row["scene"]: row for row in old}  # what other runs measured is kept
-    for name in tqdm(names, desc="scenes", disable=None):
+    arguments = parser.parse_args(argv)
+    path = harness.json_file(arguments, "ladder")
+    rows = {row["scene"]: row for row in harness.load(path, {"scenes": []})["scenes"]}
+    for name in tqdm(harness.chosen(parser, arguments.scenes, CASES, "scene"), desc="scenes", disable=None):
         case, began = CASES[name], time.process_time()
         found = select(sampled(case), CANDIDATES, seeds=arguments.seeds, progress=False)
-        right = found.chosen.level == case.level
-        rows[name] = {"scene": name, "needs": case.level, "chosen": found.chosen.level, "right": right,
-                      "seeds": arguments.seeds, "commit": commit.strip(),
-                      "cpu_seconds": round(time.process_time() - began, 1),
-                      "levels": [c.to_dict() for c in found.candidates]}  # fmt: skip
-        print(f"\n{name}: needs {case.level}, chosen {found.chosen.level}{'' if right else '  (WRONG)'}")
-        print(found.table(), flush=True)
-        machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+        rows[name] = {
+            "scene": name, "needs": case.level, "chosen": found.chosen.level,
+            "right": found.chosen.level == case.level, "seeds": arguments.seeds, "commit": harness.commit(),
+            "cpu_seconds": round(time.process_time() - began, 1), "levels": [c.to_dict() for c in found.candidates],
+        }  # fmt: skip
+        print(f"\n{name}: needs {case.level}, chosen {found.chosen.level}\n{found.table()}", flush=True)
         ordered = [rows[key] for key in CASES if key in rows]
-        result = {"machine": machine, "noise": NOISE, "scenes": ordered}
-        write_atomically(arguments.out, (json.dumps(result, indent=1, allow_nan=False) + "\n").encode())
-        write_atomically(arguments.out.with_suffix(".md"), table(ordered).encode())
-    print(f"\nright on {sum(row['right'] for row in rows.values())} of {len(rows)} scenes")
+        harness.store(path, {**harness.conditions(), "noise": NOISE, "scenes": ordered}, table(ordered))
 
 
 if __name__ == "__main__":

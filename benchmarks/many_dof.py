@@ -2,30 +2,27 @@
 
 Positions only, simulated to about 1e-13, float64. Each row names what the fit was told (`features`, `alike`, …);
 the rest is the default of `fit`. Errors are of free runs from unseen starts, each given by its first two exact
-positions; a relative RMS is over the RMS of the motion itself. Results are added to `results/many_dof.json` row by row.
+positions; a relative RMS is over the RMS of the motion itself. A row is stored as soon as it is measured.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
 import statistics
-import subprocess
+import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
 from herglotz.data import simulate
-from herglotz.data.files import write_atomically
 from herglotz.models import ContactLagrangian
-from herglotz.plots.style import new_figure, save_figure, styled
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
@@ -33,10 +30,7 @@ from herglotz.stepping import Event, State, Stepper
 from herglotz.theory import boundary_value
 from herglotz.training import FitConfig, fit
 
-RESULTS = Path(__file__).resolve().parent / "results"
-HINGES = torch.tensor(
-    [[0.2, -0.1], [-0.1, 0.1]], dtype=torch.float64
-)  # two viscous hinges 0.1, angles from the vertical
+HINGES = torch.tensor([[0.2, -0.1], [-0.1, 0.1]]).double()  # two viscous hinges 0.1, angles from the vertical
 
 
 def hinged() -> Scene:
@@ -188,65 +182,38 @@ FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),
 
 def table(results: dict) -> str:
     """One line a figure: median, range over the seeds, target."""
-    lines = [
-        "| case | h | figure | median | min … max | seeds | parameters | fit, CPU s | target | met | commit |",
-        "|---" * 11 + "|",
-    ]
+    head = ("case", "h", "figure", "median", "min … max", "seeds", "parameters", "fit, CPU s")
+    rows = []
     for name, row in results.items():
-        for figure_, target in row["figures"].items():
-            values = [x[figure_] for x in row["seeds"]]
-            middle = statistics.median(values)
-            cpu = statistics.median(x["cpu_s"] for x in row["seeds"])
-            spread = f"{min(values):.1e} … {max(values):.1e}"
+        cpu, parameters = statistics.median(x["cpu_s"] for x in row["seeds"]), row["seeds"][0]["parameters"]
+        for figure, target in row["figures"].items():
+            values = [x[figure] for x in row["seeds"]]
+            middle, span = statistics.median(values), f"{min(values):.1e} … {max(values):.1e}"
             met = "yes" if middle <= target else "**no**"
-            cells = [name, row["h"], figure_, f"{middle:.1e}", spread, len(values), row["seeds"][0]["parameters"],
-                     f"{cpu:.0f}", f"{target:g}", met, row["commit"]]  # fmt: skip
-            lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join(lines) + "\n"
+            rows.append([name, row["h"], figure, f"{middle:.1e}", span, len(values), parameters, f"{cpu:.0f}",
+                         f"{target:g}", met, row["commit"]])  # fmt: skip
+    return "\n".join(harness.table((*head, "target", "met", "commit"), rows))
 
 
-def draw(results: dict, path: Path) -> None:
-    """Every seed's figure beside its target."""
-    names = [(name, f, t) for name, row in results.items() for f, t in row["figures"].items()]
-    with styled():
-        figure = new_figure(9.0, 0.38 * len(names) + 1.4, "free runs from unseen starts")
-        axes = figure.add_subplot()
-        for y, (name, f, target) in enumerate(reversed(names)):
-            values = [x[f] for x in results[name]["seeds"]]
-            axes.plot(values, [y] * len(values), "o", color="C0", alpha=0.7)
-            axes.plot([target] * 2, [y - 0.35, y + 0.35], color="C3")
-        axes.set_yticks(range(len(names)), [f"{name}: {f}" for name, f, _ in reversed(names)])
-        axes.set_xscale("log")
-        axes.set_xlabel("error, one point a seed; red: target")
-        save_figure(figure, path)
-
-
-def main() -> None:
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds (default 5)")
-    parser.add_argument("--only", nargs="*", default=[], help="rows whose names contain one of these words")
-    arguments = parser.parse_args()
-    path = RESULTS / "many_dof.json"
-    stored: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {"rows": {}}
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=RESULTS).stdout
-    stored = {"rows": stored["rows"], "torch": torch.__version__, "processor": platform.machine()}
-    wanted = lambda name: not arguments.only or any(word in name for word in arguments.only)  # noqa: E731
-    jobs: list[tuple[str, float, int, dict[str, float], Callable[[int], dict]]] = []
-    for row in ROWS:
-        own = lambda seed, row=row: motion(row, seed)  # noqa: E731
-        jobs.append((row.name, row.h, arguments.seeds, {"rms": row.target}, own))
-    jobs += [(name, 0.05, arguments.seeds, dict.fromkeys(f, t), run) for name, (run, f, t) in FALLS.items()]
-    for name, h, seeds, figures, run in jobs:
-        if wanted(name):
-            found = [run(seed) for seed in range(seeds)]
-            stored["rows"][name] = {"h": h, "figures": figures, "seeds": found, "commit": commit.strip()}
-            order = [j[0] for j in jobs]
-            stored["rows"] = dict(sorted(stored["rows"].items(), key=lambda item: order.index(item[0])))
-            write_atomically(path, json.dumps(stored, indent=1).encode() + b"\n")
-            write_atomically(RESULTS / "many_dof.md", table(stored["rows"]).encode())
-            draw(stored["rows"], RESULTS / "many_dof.png")
-            print(name, {f: [f"{x[f]:.1e}" for x in found] for f in figures}, flush=True)
+    parser.add_argument("--only", nargs="*", default=[""], help="rows whose names contain one of these words")
+    arguments = parser.parse_args(argv)
+    path = harness.json_file(arguments, "many_dof")
+    stored = harness.load(path, {"rows": {}})["rows"]
+    jobs: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]]
+    jobs = {row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS}
+    for name, (run, figures, target) in FALLS.items():
+        jobs[name] = (0.05, {figure: target for figure in figures}, run)
+    for name, (h, figures, run) in jobs.items():
+        if not any(word in name for word in arguments.only):
+            continue
+        found = [run(seed) for seed in range(arguments.seeds)]
+        stored[name] = {"h": h, "figures": figures, "seeds": found, "commit": harness.commit()}
+        rows = {key: stored[key] for key in jobs if key in stored}
+        harness.store(path, {**harness.conditions(), "rows": rows}, table(rows))
+        print(name, {f: [f"{x[f]:.1e}" for x in found] for f in figures}, flush=True)
 
 
 if __name__ == "__main__":

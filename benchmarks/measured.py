@@ -1,7 +1,7 @@
 """Noise, outliers, motors, bands and measured data, seed by seed: `python benchmarks/measured.py [--seeds 5]`.
 
-Writes results/measured.json, .md and .png, and coverage.png. Settings are the defaults unless a set says otherwise
-(measured_free.py, measured_windows.py, measured_coverage.py say what each is). Sets that are absent are skipped
+Writes results/measured.json and .md, and coverage.png. Settings are the defaults unless a set says otherwise
+(measured_sets.py says what each is). Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
 run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20,
 air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90; `cpu_seconds` in the table says what
@@ -10,27 +10,38 @@ it took.
 
 from __future__ import annotations
 
-import argparse
 import json
-import os
-import platform
 import statistics
-import subprocess
+import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-import measured_coverage
 import torch
-from measured_free import AIR_TRACK, PENDULUM, disturbed, extrapolation, noise, one_trajectory, outliers
-from measured_windows import DFKI, driven_pendulum
 
-from herglotz.data.files import write_atomically
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.measured_sets import (
+    AHEAD,
+    AIR_TRACK,
+    DFKI,
+    LEVELS,
+    NOMINAL,
+    PENDULUM,
+    SEEN,
+    coverage_real,
+    coverage_simulated,
+    disturbed,
+    driven_pendulum,
+    extrapolation,
+    noise,
+    outliers,
+)
+from herglotz.plots import style
 
-ROOT = Path(__file__).resolve().parents[1]
-RESULTS = ROOT / "benchmarks" / "results"
-COVERED = (measured_coverage.LOW, measured_coverage.HIGH)
+COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept
 TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest value that meets it
     ("noise", "rms_100_steps"): (0.0, 0.01),
     ("outliers", "over_clean"): (0.0, 2.0),
@@ -45,69 +56,87 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
 }
 ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] = {
     "noise": ((), noise),
-    "one_trajectory": ((), one_trajectory),
+    "one_trajectory": ((), partial(noise, trajectories=1)),
     "outliers": ((), outliers),
     "disturbed": ((), disturbed),
     "real_pendulum": ((PENDULUM,), extrapolation(PENDULUM)),
     "air_track": ((AIR_TRACK,), extrapolation(AIR_TRACK)),
     "driven_pendulum": (DFKI, driven_pendulum),
-    "coverage_simulated": ((), measured_coverage.simulated),
-    "coverage_real": ((measured_coverage.REAL,), measured_coverage.real),
+    "coverage_simulated": ((), coverage_simulated),
+    "coverage_real": ((PENDULUM,), coverage_real),
+}
+CURVES = {
+    "simulated, Laplace": ("coverage_simulated", "laplace_measured"),
+    "simulated, ensemble": ("coverage_simulated", "ensemble_measured"),
+    "measured, Laplace": ("coverage_real", "laplace_measured"),
+    "measured, ensemble": ("coverage_real", "ensemble_measured"),
 }
 
 
 def table(result: dict[str, Any]) -> str:
     """Median and spread of every figure."""
-    lines = ["# Noise, outliers, motors, bands and measured data", "", f"{result['torch']}.", ""]
-    lines += ["| set | commit | figure | seeds | median | min … max | target |", "|---|---|---|---|---|---|---|"]
+    rows = []
     for name, row in result["rows"].items():
         for key, value in row["seeds"][0].items():
-            if isinstance(value, (dict, list)):  # curves
-                continue
-            values = [seed[key] for seed in row["seeds"] if seed[key] is not None]
-            if not values:
+            values = (
+                [] if isinstance(value, dict | list) else [x for seed in row["seeds"] if (x := seed[key]) is not None]
+            )
+            if not values:  # curves
                 continue
             low, high = TARGETS.get((name, key), (0.0, 0.0))
             target = "" if not high else f"{low:g} … {high:g}" if low else f"≤ {high:g}"
-            spread = f"{min(values):.4g} … {max(values):.4g}"
-            median = f"{statistics.median(values):.4g}"
-            lines.append(f"| {name} | {row['commit']} | {key} | {len(values)} | {median} | {spread} | {target} |")
-    return "\n".join(lines) + "\n"
+            span, median = f"{min(values):.4g} … {max(values):.4g}", f"{statistics.median(values):.4g}"
+            rows.append([name, row["commit"], key, len(values), median, span, target])
+    head = ("set", "commit", "figure", "seeds", "median", "min … max", "target")
+    return "\n".join(["# Noise, outliers, motors, bands and measured data", "", *harness.table(head, rows)])
 
 
-def draw(result: dict[str, Any], path: Path) -> None:
-    """Every error that has a target, relative to it, seed by seed."""
-    import matplotlib
+def draw(rows: dict[str, Any], path: Path) -> None:
+    """One held-out motion with its band, and the share inside against the nominal one, for every seed."""
+    example = rows["coverage_simulated"]["seeds"][0]["example"]
+    t, q, model, std = (torch.tensor(example[name]) for name in ("t", "q", "model", "std"))
+    t = t - t[0]
+    measured = 1.645 * (std.square() + example["sigma"] ** 2).sqrt()
+    with style.styled():
+        figure = style.new_figure(9.0, 4.2, "Bands that keep their word: nine samples in ten lie inside")
+        grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1), height_ratios=(1, 1))
+        top = figure.add_subplot(grid[0, 0])
+        bottom, right = figure.add_subplot(grid[1, 0], sharex=top), figure.add_subplot(grid[:, 1])
+        begun = float(t[SEEN - 1] + t[SEEN]) / 2
+        for ax in (top, bottom):
+            ax.axvspan(begun, float(t[-1]), color=style.SHADE, lw=0, zorder=0)
+        top.plot(t, model, color=style.MODEL, zorder=2)
+        top.plot(t, q, ".", color=style.INK, ms=3, zorder=3)
+        top.set(ylabel="angle (rad)", title=f"An unseen start: {SEEN} noisy samples, then {AHEAD} predicted")
+        bottom.fill_between(t, -1e3 * measured, 1e3 * measured, color=style.MODEL, alpha=0.18, lw=0)
+        bottom.fill_between(t, -1645 * std, 1645 * std, color=style.MODEL, alpha=0.45, lw=0)
+        bottom.plot(t, 1e3 * (q - model), ".", color=style.UNSEEN, ms=3)
+        bottom.set(ylabel="measured − model (mrad)", xlabel="time (s)", xlim=(0, float(t[-1])))
+        style.captions(bottom, [("dark: model", style.MODEL), ("light: with a sample's noise", style.MUTED)])
+        right.plot([0.45, 1], [0.45, 1], color=style.MUTED, lw=0.8)
+        right.plot([NOMINAL] * 2, COVERED, color=style.ACCENT, lw=7, alpha=0.3)
+        entries = []
+        for (name, key), color in zip(CURVES.items(), style.SERIES, strict=False):
+            for k, seed in enumerate(rows.get(key[0], {"seeds": []})["seeds"]):
+                right.plot(LEVELS, seed["curves"][key[1]], "-o", ms=2.5, lw=0.8, color=color, alpha=0.75)
+                entries += [(name, color)] if k == 0 else []
+        for line, entry in enumerate(entries):
+            style.captions(right, [entry], row=line)
+        below: dict[str, Any] = {"ha": "center", "va": "top", "xytext": (0, -4)}
+        style.label(right, NOMINAL, COVERED[0], f"target at {NOMINAL:g}", style.ACCENT, **below)
+        right.set(xlabel="nominal", ylabel="share of held-out samples inside", title="Every line a seed")
+        harness.picture(figure, path)
 
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
 
-    names = [(name, key) for (name, key), (low, _) in TARGETS.items() if name in result["rows"] and not low]
-    figure, ax = plt.subplots(figsize=(6, 2.6), layout="constrained")
-    for i, (name, key) in enumerate(names):
-        values = [seed[key] / TARGETS[name, key][1] for seed in result["rows"][name]["seeds"] if seed[key] is not None]
-        ax.plot(values, [i] * len(values), "o", alpha=0.6, color="C0")
-    ax.axvline(1.0, color="0.4", linewidth=1)
-    ax.set(xscale="log", xlabel="figure over its target (each dot a seed)", yticks=range(len(names)))
-    ax.set_yticklabels([f"{name}, {key}" for name, key in names])
-    figure.savefig(path, dpi=150)
-    plt.close(figure)
-
-
-def main() -> None:
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))  # small matrices: more threads only wait
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds (default 5)")
-    parser.add_argument("--only", default=",".join(ROWS), help=f"some of {', '.join(ROWS)}")
-    parser.add_argument("--data", type=Path, default=ROOT.parent / "shared" / "data", help="folder of measured sets")
-    parser.add_argument("--out", type=Path, default=RESULTS / "measured.json")
-    arguments = parser.parse_args()
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
-    old = json.loads(arguments.out.read_text()) if arguments.out.exists() else {"rows": {}}
-    result: dict[str, Any] = {"commit": commit.strip(), "machine": machine, "torch": torch.__version__}
-    result["rows"] = old["rows"]
-    for name in arguments.only.split(","):
+    parser.add_argument("--only", help=f"with commas, some of {', '.join(ROWS)}")
+    parser.add_argument("--data", type=Path, default=harness.DATA, help="folder of measured sets")
+    arguments = parser.parse_args(argv)
+    path = harness.json_file(arguments, "measured")
+    rows = harness.load(path, {"rows": {}})["rows"]
+    for name in harness.chosen(parser, arguments.only, ROWS, "set"):
         files, measure = ROWS[name]
         if not all((arguments.data / file).exists() for file in files):
             print(f"{name}: skipped, no {files[0]} in {arguments.data}")
@@ -118,13 +147,11 @@ def main() -> None:
             seeds.append({**measure(seed, arguments.data), "cpu_seconds": round(time.process_time() - began, 1)})
             shown = {key: value for key, value in seeds[-1].items() if not isinstance(value, dict)}
             print(name, seed, json.dumps(shown), flush=True)
-        result["rows"][name] = {"commit": commit.strip(), "seeds": seeds}
-        result["rows"] = {key: result["rows"][key] for key in ROWS if key in result["rows"]}
-        write_atomically(arguments.out, (json.dumps(result, indent=1) + "\n").encode())
-        write_atomically(arguments.out.with_suffix(".md"), table(result).encode())
-        draw(result, arguments.out.with_suffix(".png"))
-        if "coverage_simulated" in result["rows"]:
-            measured_coverage.draw(result["rows"], arguments.out.with_name("coverage.png"))
+        rows[name] = {"commit": harness.commit(), "seeds": seeds}
+        result = {**harness.conditions(), "rows": {key: rows[key] for key in ROWS if key in rows}}
+        harness.store(path, result, table(result))
+        if "coverage_simulated" in rows:
+            draw(rows, path.with_name("coverage.png"))
 
 
 if __name__ == "__main__":

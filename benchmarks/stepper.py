@@ -2,19 +2,16 @@
 
 One thread, processor time (the rollout of 1e6 steps: time on the wall). What is compared is timed in turn within each
 repeat, so that a busy machine slows both; a ratio is one of a single repeat, and the table gives their median and
-range. Writes stepper.json, stepper.md and stepper.png.
+range. Writes stepper.json and stepper.md.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import os
-import platform
 import resource
 import statistics
-import subprocess
+import sys
 import tempfile
 import time
 import warnings
@@ -25,18 +22,21 @@ from typing import Any
 import numpy as np
 import torch
 from tqdm import tqdm
-from twins import func_step, hand_written, jax_rollout
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import herglotz
+from benchmarks import harness
+from benchmarks.harness import seconds
+from benchmarks.reference_steppers import func_step, hand_written, jax_rollout
+from herglotz import export
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_c
 from herglotz.export.c_header import c_source, read_metadata
 from herglotz.export.c_stepper import CompiledStepper
-from herglotz.export.c_wrapper import FLAGS, compiler
+from herglotz.export.c_wrapper import FLAGS
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 
-ROOT = Path(__file__).resolve().parents[1]
 H = 0.1
 LEVELS = ("conservative", "linear", "affine", "forced", "full", "mass")
 Row = dict[str, Any]
@@ -70,14 +70,6 @@ def start(n: int, batch: int, dtype: torch.dtype) -> State:
     return State(x[:, :n].contiguous(), x[:, n:].contiguous(), torch.zeros(batch, dtype=dtype))
 
 
-def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
-    """Processor time of all threads: what another program takes from this one does not count."""
-    begin = clock()
-    with torch.no_grad():
-        run()
-    return clock() - begin
-
-
 def alternate(ours: Callable[[], Any], other: Callable[[], Any], repeats: int, work: tuple[int, int]) -> Row:
     """µs a step and sample of both, and other / ours; `work` counts the steps · samples of each."""
     pairs = [(seconds(ours) / work[0], seconds(other) / work[1]) for _ in range(repeats + 1)][1:]  # the first warms up
@@ -89,71 +81,100 @@ def alternate(ours: Callable[[], Any], other: Callable[[], Any], repeats: int, w
     }
 
 
-def row(what: str, target: str, met: Callable[[float], bool] | None = None, **found: Any) -> Row:
+def rolls(stepper: Any, state: State, steps: int) -> Callable[[], Any]:
+    """A rollout to be timed."""
+    return torch.no_grad()(lambda: stepper.rollout(*state, h=H, steps=steps))
+
+
+def row(what: str, most: float | None = None, *, least: float | None = None, unit: str = "", **found: Any) -> Row:
+    """A row of the table: what was measured, its target, and whether the target was met."""
     value = found["ratio"]["median"] if "ratio" in found else found.get("value")
-    return {"what": what, "target": target, "met": None if met is None or value is None else met(value), **found}
+    if most is not None and least is not None:
+        target = f"{least:g} … {most:g}"
+    else:
+        target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
+    met = None if value is None or not target else (least or -math.inf) <= value <= (most or math.inf)
+    return {"what": what, "target": f"{target} {unit}".strip() if target else "", "met": met, "unit": unit, **found}
 
 
 def against_hand(quick: bool) -> list[Row]:
+    """C against `hand_written.c` of the same network."""
     rows = []
     for n in (1, 2, 8):
         for width, dtype in ((16, torch.float64), (64, torch.float32)):
             model = model_of(n, width, dtype=dtype)
-            hand, ours = hand_written(model), compile_c(model, h=H)
-            q, p, s = (x[0] for x in start(n, 1, dtype))
+            hand, ours, one = hand_written(model), compile_c(model, h=H), State(*(x[0] for x in start(n, 1, dtype)))
             steps = (2000 if quick else 20000) // (1 if width < 64 else 8) // (1 if n < 8 else 4)
-            close = float((hand.rollout(q, p, s, H, 50) - ours.rollout(q, p, s, h=H, steps=50).q[1:]).abs().max())
+            close = float((hand.rollout(*one, h=H, steps=50) - ours.rollout(*one, h=H, steps=50).q[1:]).abs().max())
             assert close < (1e-9 if dtype == torch.float64 else 1e-4), close
-            timed = alternate(
-                lambda q=q, p=p, s=s, ours=ours, steps=steps: ours.rollout(q, p, s, h=H, steps=steps),
-                lambda q=q, p=p, s=s, hand=hand, steps=steps: hand.rollout(q, p, s, H, steps),
-                3 if quick else 9,
-                (steps, steps),
-            )
-            inverse = {k: 1 / v for k, v in timed["ratio"].items()}
-            timed["ratio"] = {"median": inverse["median"], "min": inverse["max"], "max": inverse["min"]}
-            what = f"C / hand-written C, n={n}, {width}x2, {_short(dtype)}, B=1"
-            rows.append(row(what, "<= 1.3", lambda x: x <= 1.3, **timed))
+            timed = alternate(rolls(hand, one, steps), rolls(ours, one, steps), 3 if quick else 9, (steps, steps))
+            timed |= {"ours_us": timed["other_us"], "other_us": timed["ours_us"]}
+            rows.append(row(f"C / hand-written C, n={n}, {width}x2, {_short(dtype)}, B=1", 1.3, **timed))
     return rows
 
 
 def against_jax(quick: bool) -> list[Row]:
+    """A jitted scan of JAX against C."""
     rows = []
     for batch, width, dtype in ((1, 16, torch.float64), (1, 64, torch.float32), (4096, 16, torch.float64),
                                 (4096, 64, torch.float32)):  # fmt: skip
-        model = model_of(2, width, dtype=dtype)
+        model, least = model_of(2, width, dtype=dtype), 4.0 if batch == 1 else 1.1
         what = f"JAX scan / C, n=2, {width}x2, {_short(dtype)}, B={batch}"
-        target, least = (">= 4", 4.0) if batch == 1 else (">= 1.1", 1.1)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             jax = jax_rollout(model, 2)
         if jax is None:
-            rows.append(row(what, target, note="jax is not installed"))
+            rows.append(row(what, least=least, note="jax is not installed"))
             continue
         ours, state = compile_c(model, h=H), start(2, batch, dtype)
         steps = (2000 if quick else 10000) if batch == 1 else (10 if quick else 50)
-        close = float((torch.as_tensor(np.array(jax(*state, H, steps)[-1])) - ours.rollout(*state, h=H, steps=steps)
-                       .q[:, -1]).abs().max())  # fmt: skip
-        timed = alternate(
-            lambda s=state, o=ours, k=steps: o.rollout(*s, h=H, steps=k),
-            lambda s=state, j=jax, k=steps: j(*s, H, k),
-            3 if quick else 7,
-            (steps * batch, steps * batch),
-        )
-        rows.append(row(what, target, lambda x, least=least: x >= least, difference=close, **timed))
+        last = torch.as_tensor(np.array(jax(*state, H, steps)[-1]))
+        close = float((last - ours.rollout(*state, h=H, steps=steps).q[:, -1]).abs().max())
+        scan = lambda s=state, j=jax, k=steps: j(*s, H, k)  # noqa: E731
+        timed = alternate(rolls(ours, state, steps), scan, 3 if quick else 7, (steps * batch, steps * batch))
+        rows.append(row(what, least=least, difference=close, **timed))
     return rows
 
 
 def long_rollout(quick: bool) -> list[Row]:
-    steps = 100_000 if quick else 1_000_000
-    rows = []
+    """The wall's clock of 1e6 steps."""
+    rows, steps = [], 100_000 if quick else 1_000_000
     for width in (0, 16):
-        stepper, (q, p, s) = herglotz.compile(model_of(2, width)), (x[0] for x in start(2, 1, torch.float64))
-        took = [seconds(lambda q=q, p=p, s=s, o=stepper: o.rollout(q, p, s, h=H, steps=steps), time.perf_counter)
-                for _ in range(3)]  # fmt: skip
+        stepper, one = herglotz.compile(model_of(2, width)), State(*(x[0] for x in start(2, 1, torch.float64)))
+        took = statistics.median(seconds(rolls(stepper, one, steps), time.perf_counter) for _ in range(3))
         what = f"hz.compile, 1e6 steps, n=2, float64, {f'{width}x2 correction' if width else 'no correction'}"
-        scaled = statistics.median(took) * 1_000_000 / steps
-        rows.append(row(what, "<= 8 s", lambda x: x <= 8, value=scaled, unit="s", steps_timed=steps))
+        rows.append(row(what, 8, unit="s", value=took * 1_000_000 / steps, steps_timed=steps))
+    return rows
+
+
+FORMATS = {"ONNX": ("export_onnx", "load_onnx", "onnx"), "AOTInductor": ("export_aoti", "load_pt2", "pt2")}
+
+
+def loaded(model: ContactLagrangian, name: str) -> Any:
+    """The model written in a format and read again; a text that says why where it cannot be had."""
+    write, read, kind = FORMATS[name]
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder, f"model.{kind}")
+            getattr(export, write)(model, path, h=H)
+            return getattr(export, read)(path)
+    except (AttributeError, InputError, ImportError, RuntimeError) as error:
+        return f"not available: {str(error).splitlines()[0][:100]}"
+
+
+def against_c(
+    name: str, model: ContactLagrangian, form: Any, what: str, steps: dict[int, int], repeats: int
+) -> list[Row]:
+    """Rollouts of another form against C, for each batch size of `steps`; C takes 20 times as many steps at B = 1."""
+    ours, rows = compile_c(model, h=H), []
+    for batch, few in steps.items():
+        label, most = f"{name} rollout / C, {what}, B={batch}", 50.0 if batch == 1 else 2.5
+        if isinstance(form, str):
+            rows.append(row(label, note=form))
+            continue
+        state, many = start(2, batch, next(model.parameters()).dtype), few * (20 if batch == 1 else 1)
+        timed = alternate(rolls(ours, state, many), rolls(form, state, few), repeats, (many * batch, few * batch))
+        rows.append(row(label, most, **timed))
     return rows
 
 
@@ -162,110 +183,62 @@ def other_formats(quick: bool) -> list[Row]:
 
     The first six steps of a rollout have no history to guess from: long rollouts are timed, and a lone step apart.
     """
-    from herglotz import export
-
-    rows = []
-    formats = {"ONNX": ("export_onnx", "load_onnx"), "AOTInductor": ("export_aoti", "load_pt2")}
-    if quick:
-        formats.pop("AOTInductor")  # compiles for a minute each
+    rows, few, repeats = [], {1: 16, 1024: 8} if quick else {1: 1000, 1024: 80}, 3 if quick else 5
     for width, dtype in ((16, torch.float64), (64, torch.float32), (0, torch.float64)):
         model = model_of(2, width, dtype=dtype)
-        ours, size = compile_c(model, h=H), f"n=2, {f'{width}x2' if width else 'explicit'}, {_short(dtype)}"
-        for name, (write, read) in formats.items():
-            with tempfile.TemporaryDirectory() as folder:
-                try:
-                    path = Path(folder, f"model.{'onnx' if name == 'ONNX' else 'pt2'}")
-                    getattr(export, write)(model, path, h=H)
-                    loaded = getattr(export, read)(path)
-                except (AttributeError, InputError, ImportError, RuntimeError) as error:
-                    note = f"not available: {str(error).splitlines()[0][:100]}"
-                    rows += [row(f"{name} rollout / C, {size}, B={b}", "", note=note) for b in (1, 1024)]
-                    continue
-                for batch, most in ((1, 50.0), (1024, 2.5)):
-                    steps = (16 if quick else 1000) if batch == 1 else (8 if quick else 80)
-                    state, more = start(2, batch, dtype), 20 if batch == 1 else 1
-                    timed = alternate(
-                        lambda o=ours, s=state, k=steps * more: o.rollout(*s, h=H, steps=k),
-                        lambda o=loaded, s=state, k=steps: o.rollout(*s, h=H, steps=k),
-                        3 if quick else 5,
-                        (steps * more * batch, steps * batch),
-                    )
-                    met = lambda x, most=most: x <= most  # noqa: E731
-                    rows.append(row(f"{name} rollout / C, {size}, B={batch}", f"<= {most:g}", met, **timed))
-                lone, alone = start(2, 1, dtype), 20 if quick else 200
-                took = seconds(lambda o=loaded, s=lone, k=alone: [o.rollout(*s, h=H, steps=1) for _ in range(k)])
-                rows.append(row(f"{name}, a rollout of one step, {size}, B=1", "", value=1e6 * took / alone, unit="µs"))
-                if dtype == torch.float64:
-                    rows.append(_agreement_row(name, model, loaded, 100 if quick else 1000))
+        size = f"n=2, {f'{width}x2' if width else 'explicit'}, {_short(dtype)}"
+        for name in ("ONNX",) if quick else FORMATS:  # AOTInductor compiles for a minute each
+            form = loaded(model, name)
+            rows += against_c(name, model, form, size, few, repeats)
+            if isinstance(form, str):
+                continue
+            alone, lone = 20 if quick else 200, rolls(form, start(2, 1, dtype), 1)
+            took = seconds(lambda k=alone, one=lone: [one() for _ in range(k)])
+            rows.append(row(f"{name}, a rollout of one step, {size}, B=1", unit="µs", value=1e6 * took / alone))
+            if dtype == torch.float64:
+                rows.append(against_eager(name, model, form, 100 if quick else 1000))
     return rows
 
 
 def other_levels(quick: bool) -> list[Row]:
     """The levels whose steps cost more, as ONNX against C: what couples all samples' Jacobians, forces, flows of s."""
-    from herglotz.export import export_onnx, load_onnx
-
-    rows = []
+    rows, few = [], {1: 8, 1024: 4} if quick else {1: 200, 1024: 20}
     for level in ("affine", "forced", "full", "mass"):
         model = model_of(2, 16, level)
-        ours = compile_c(model, h=H)
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                loaded = load_onnx(export_onnx(model, Path(folder, "model.onnx"), h=H))
-        except (InputError, ImportError) as error:
-            rows.append(row(f"ONNX rollout / C, n=2, {level}", "", note=f"not available: {str(error)[:100]}"))
-            continue
-        for batch, most in ((1, 50.0), (1024, 2.5)):
-            steps = (8 if quick else 200) if batch == 1 else (4 if quick else 20)
-            state, more = start(2, batch, torch.float64), 20 if batch == 1 else 1
-            timed = alternate(
-                lambda o=ours, s=state, k=steps * more: o.rollout(*s, h=H, steps=k),
-                lambda o=loaded, s=state, k=steps: o.rollout(*s, h=H, steps=k),
-                3 if quick else 5,
-                (steps * more * batch, steps * batch),
-            )
-            met = lambda x, most=most: x <= most  # noqa: E731
-            rows.append(row(f"ONNX rollout / C, n=2, {level}, 16x2, float64, B={batch}", f"<= {most:g}", met, **timed))
+        what = f"n=2, {level}, 16x2, float64"
+        rows += against_c("ONNX", model, loaded(model, "ONNX"), what, few, 3 if quick else 5)
     return rows
 
 
-def _agreement_row(name: str, model: ContactLagrangian, form: Any, steps: int) -> Row:
-    """The last state of a form of the model against that of the eager stepper."""
+def against_eager(name: str, model: ContactLagrangian, form: Any, steps: int) -> Row:
+    """The states of a form of the model against those of the eager stepper."""
     state = start(2, 2, torch.float64)
     with torch.no_grad():
         ours, eager = (o.rollout(*state, h=H, steps=steps) for o in (form, Stepper(model, tol=4e-16)))
     worst = max(_relative(getattr(ours, x), getattr(eager, x)) for x in "qps")
-    return row(f"{name} against eager over {steps} steps, float64", "<= 1e-12", lambda x: x <= 1e-12, value=worst)
+    return row(f"{name} against eager over {steps} steps, float64", 1e-12, value=worst)
 
 
 def eager_rows(quick: bool) -> list[Row]:
-    rows = []
-    model = model_of(2, 16)
-    state, stepper, func = start(2, 1, torch.float64), Stepper(model_of(2, 16)), func_step(model, 3)
-    few = 3 if quick else 10
-    timed = alternate(
-        lambda: [stepper.step(state, H) for _ in range(few)], lambda: [func(state, H) for _ in range(few)],
-        3 if quick else 7, (few, few),
-    )  # fmt: skip
-    rows.append(row("torch.func step / eager step, n=2, 16x2, B=1", ">= 15", lambda x: x >= 15, **timed))
+    """The eager step against torch.func, and what Newton costs where the step is explicit."""
+    rows, few, repeats = [], 3 if quick else 10, 3 if quick else 7
+    state, stepper, func = start(2, 1, torch.float64), Stepper(model_of(2, 16)), func_step(model_of(2, 16), 3)
+    ours, theirs = (lambda f=f: [f(state, H) for _ in range(few)] for f in (stepper.step, func))
+    timed = alternate(ours, theirs, repeats, (few, few))
+    rows.append(row("torch.func step / eager step, n=2, 16x2, B=1", least=15, **timed))
     for n in (1, 2, 8):
-        model, state = model_of(n, 0), start(n, 1, torch.float64)
-        forms = Stepper(model), Stepper(model, explicit=False)
-        steps = 30 if quick else 200
-        timed = alternate(
-            lambda f=forms, s=state, k=steps: f[0].rollout(*s, h=H, steps=k),
-            lambda f=forms, s=state, k=steps: f[1].rollout(*s, h=H, steps=k), 3 if quick else 7, (steps, steps),
-        )  # fmt: skip
-        rows.append(row(f"Newton / explicit step, eager, n={n}, B=1", ">= 4", lambda x: x >= 4, **timed))
+        model, state, steps = model_of(n, 0), start(n, 1, torch.float64), 30 if quick else 200
+        explicit, implicit = (rolls(s, state, steps) for s in (Stepper(model), Stepper(model, explicit=False)))
+        timed = alternate(explicit, implicit, repeats, (steps, steps))
+        rows.append(row(f"Newton / explicit step, eager, n={n}, B=1", least=4, **timed))
         with tempfile.TemporaryDirectory() as folder:
             text = export_c(model, Path(folder, "a.h"), h=H).read_text()
         newton = CompiledStepper(c_source(model, read_metadata(text, ""), "a.h", explicit=False))
-        ours, one, many = compile_c(model, h=H), State(*(x[0] for x in state)), 5000 if quick else 50000
-        timed = alternate(
-            lambda o=ours, s=one, k=many: o.rollout(*s, h=H, steps=k),
-            lambda o=newton, s=one, k=many: o.rollout(*s, h=H, steps=k), 3 if quick else 9, (many, many),
-        )  # fmt: skip
+        one, many = State(*(x[0] for x in state)), 5000 if quick else 50000
+        explicit, implicit = (rolls(s, one, many) for s in (compile_c(model, h=H), newton))
+        timed = alternate(explicit, implicit, 3 if quick else 9, (many, many))
         what = f"Newton / explicit step, C, n={n}, B=1 (Newton starts at the solution: one evaluation, no more)"
-        rows.append(row(what, ">= 2", lambda x: x >= 2, **timed))
+        rows.append(row(what, least=2, **timed))
     return rows
 
 
@@ -273,29 +246,22 @@ def agreement(quick: bool) -> list[Row]:
     """C against eager after 1000 steps of a damped scene; float32 against float64 with the same weights."""
     rows, steps = [], 100 if quick else 1000
     for level in LEVELS:
-        model = model_of(2, 6, level)
-        state = start(2, 2, torch.float64)
+        model, state = model_of(2, 6, level), start(2, 2, torch.float64)
         try:
             ours = compile_c(model, h=H)
         except InputError as error:
-            rows.append(row(f"C against eager, {level}", "<= 1e-12", note=str(error).split(";")[0]))
+            rows.append(row(f"C against eager, {level}", 1e-12, note=str(error).split(";")[0]))
             continue
-        with torch.no_grad():
-            eager = Stepper(model, tol=4e-16).rollout(*state, h=H, steps=steps)
-        worst = max(_relative(a, b) for a, b in zip(ours.rollout(*state, h=H, steps=steps).final, eager.final,
-                                                     strict=True))  # fmt: skip
-        rows.append(row(f"C against eager after {steps} steps, {level}, float64", "<= 1e-12", lambda x: x <= 1e-12,
-                        value=worst))  # fmt: skip
+        finals = [rolls(form, state, steps)().final for form in (ours, Stepper(model, tol=4e-16))]
+        worst = max(_relative(a, b) for a, b in zip(*finals, strict=True))
+        rows.append(row(f"C against eager after {steps} steps, {level}, float64", 1e-12, value=worst))
         single, h = model_of(2, 6, level).float(), float(torch.tensor(H))
         small = State(*(x.float() for x in state))
         exact = compile_c(model_of(2, 6, level).float().double(), h=h)
         exact = exact.rollout(*(x.double() for x in small), h=h, steps=steps).final
         for name, form in (("C", compile_c(single, h=H)), ("eager", Stepper(single))):
-            with torch.no_grad():
-                out = form.rollout(*small, h=H, steps=steps).final
-            worst = max(_relative(a, b) for a, b in zip(out, exact, strict=True))
-            what = f"{name} float32 against float64 after {steps} steps, {level}"
-            rows.append(row(what, "<= 1e-5", lambda x: x <= 1e-5, value=worst))
+            worst = max(_relative(a, b) for a, b in zip(rolls(form, small, steps)().final, exact, strict=True))
+            rows.append(row(f"{name} float32 against float64 after {steps} steps, {level}", 1e-5, value=worst))
     return rows
 
 
@@ -308,13 +274,12 @@ def sizes(quick: bool) -> list[Row]:
         for batch in (1, 256) if quick else (1, 16, 256, 4096, 65536):
             steps = max(2, min(2000, 400_000 // (batch * n * n)))
             state, repeats = start(n, batch, torch.float64), 3 if n * batch <= 8 * 65536 else 1
-            took = min(seconds(lambda o=ours, s=state, k=steps: o.rollout(*s, h=H, steps=k)) for _ in range(repeats))
+            took = min(seconds(rolls(ours, state, steps)) for _ in range(repeats))
             found = {"n": n, "B": batch, "c_us": 1e6 * took / steps / batch, "steps": steps}
             found["output_bytes_per_trajectory"] = 8 * ((steps + 1) * (2 * n + 2) + steps) + steps
             found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
             if batch <= 256 and n <= 8:
-                eager_took = min(seconds(lambda e=eager, s=state: e.rollout(*s, h=H, steps=3)) for _ in range(2))
-                found["eager_us"] = 1e6 * eager_took / 3 / batch
+                found["eager_us"] = 1e6 * min(seconds(rolls(eager, state, 3)) for _ in range(2)) / 3 / batch
             rows.append(found)
     return rows
 
@@ -328,44 +293,42 @@ def exponents(curve: list[Row]) -> list[Row]:
             x = statistics.linear_regression(*zip(*mine, strict=True)).slope
             largest = max(r["B"] for r in curve if r["n"] == n)
             what = f"C, time ~ B^x from B=256 to {largest}, n={n}: x"
-            rows.append(row(what, "0.9 … 1.1", lambda x: 0.9 <= x <= 1.1, value=x))
+            rows.append(row(what, 1.1, least=0.9, value=x))
     return rows
 
 
 def gpu(quick: bool) -> list[Row]:
     """Eager, compiled and CUDA-graph steps as a fraction of the measured rate of matrix products."""
     if not torch.cuda.is_available():
-        return [row("GPU step", "reported", note="no GPU on this machine")]
+        return [row("GPU step", note="no GPU on this machine")]
     device, rows = torch.device("cuda"), []
     model = model_of(2, 64, dtype=torch.float32).to(device).requires_grad_(False)
     a = torch.randn(8192, 4096, device=device)
     rate = 2 * 8192 * 4096**2 / _cuda_seconds(lambda: a @ a[:4096])
-    from herglotz.export import StepModule
-
-    step = StepModule(model, 4)
+    step = export.StepModule(model, 4)
     # evaluations · multiply-add · (value, gradient, two tangents of both) · weights
     flops = 4 * 2 * 6 * (7 * 64 + 64 * 64)
     for batch in (1000, 10_000) if quick else (1000, 10_000, 100_000, 1_000_000):
-        state = State(*(x.to(device) for x in start(2, batch, torch.float32)))
-        h = torch.full((batch,), H, device=device)
-        forms: dict[str, Callable[[], Any]] = {"eager": lambda s=state, h=h: step(*s, h)}
-        compiled = torch.compile(step)
-        forms["compiled"] = lambda s=state, h=h, c=compiled: c(*s, h)
+        arguments = [x.to(device) for x in (*start(2, batch, torch.float32), torch.full((batch,), H))]
+        forms: dict[str, Callable[[], Any]]
+        forms = {
+            name: lambda f=f, x=arguments: f(*x) for name, f in (("eager", step), ("compiled", torch.compile(step)))
+        }
         with torch.no_grad():
             for _ in range(3):
-                step(*state, h)
+                step(*arguments)
             torch.cuda.synchronize()
             graph = torch.cuda.CUDAGraph()
             try:
                 with torch.cuda.graph(graph):
-                    step(*state, h)
+                    step(*arguments)
                 forms["CUDA graph"] = graph.replay
             except RuntimeError as error:
-                rows.append(row(f"GPU CUDA graph, B={batch}", "reported", note=str(error).splitlines()[0][:100]))
+                rows.append(row(f"GPU CUDA graph, B={batch}", note=str(error).splitlines()[0][:100]))
         for name, form in forms.items():
             took = _cuda_seconds(form)
-            found = {"value": took * 1e3, "unit": "ms", "fraction_of_gemm": flops * batch / took / rate}
-            rows.append(row(f"GPU {name} step, n=2, 64x2, float32, B={batch}", "reported", **found))
+            what, share = f"GPU {name} step, n=2, 64x2, float32, B={batch}", flops * batch / took / rate
+            rows.append(row(what, unit="ms", value=took * 1e3, fraction_of_gemm=share))
     return rows
 
 
@@ -389,25 +352,9 @@ def _short(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def conditions() -> Row:
-    """Machine, load and versions."""
-    words = [*compiler(), "--version"]
-    version = subprocess.run(words, capture_output=True, text=True, check=False).stdout.splitlines()
-    versions = {"torch": torch.__version__, "python": platform.python_version(), "compiler": version[0]}
-    for name in ("jax", "onnxruntime"):
-        try:
-            versions[name] = __import__(name).__version__
-        except ImportError:
-            versions[name] = "not installed"
-    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
-    processor = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    machine = {"processor": processor, "cores": os.cpu_count(), "threads": 1, "load_before": os.getloadavg()}
-    return {"commit": commit.strip(), "machine": machine, "versions": versions, "flags": FLAGS, "h": H}
-
-
 def table(rows: list[Row]) -> str:
-    lines = ["| what | measured | range | µs a step: ours, other | target | met |", "|---|---|---|---|---|---|"]
+    """Markdown: a line a row."""
+    cells = []
     for r in rows:
         measured, span, times = r.get("note", ""), "", ""
         if "ratio" in r:
@@ -416,54 +363,32 @@ def table(rows: list[Row]) -> str:
         elif "value" in r:
             measured = f"{r['value']:.2g} {r.get('unit', '')}".strip()
         met = {None: "", True: "yes", False: "**no**"}[r["met"]]
-        lines.append(f"| {r['what']} | {measured} | {span} | {times} | {r['target']} | {met} |")
-    return "\n".join(lines)
+        cells.append([r["what"], measured, span, times, r["target"], met])
+    return "\n".join(harness.table(("what", "measured", "range", "µs a step: ours, other", "target", "met"), cells))
 
 
-def plot(curve: list[Row], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(figsize=(6, 4), layout="constrained")
-    for n in sorted({r["n"] for r in curve}):
-        mine = [r for r in curve if r["n"] == n]
-        axes.loglog([r["B"] for r in mine], [r["c_us"] for r in mine], "o-", label=f"n = {n}")
-    axes.set(xlabel="batch size B", ylabel="µs a step and trajectory", title="Compiled step, 16x2 correction, float64")
-    axes.legend(fontsize=8)
-    figure.savefig(path, dpi=150)
+PARTS = (against_hand, against_jax, long_rollout, other_formats, other_levels, eager_rows, agreement, gpu, sizes)
 
 
-def main() -> None:
-    torch.set_num_threads(1)
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a test run: shorter, fewer sizes")
-    parser.add_argument("--only", nargs="*", help="names of parts to run, e.g. against_hand sizes")
-    parser.add_argument("--out", type=Path, help="folder for stepper.json, .md and .png, e.g. benchmarks/results")
-    arguments = parser.parse_args()
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__, quick=True)
+    parser.add_argument("--only", nargs="*", choices=[p.__name__ for p in PARTS], help="parts to run")
+    arguments = parser.parse_args(argv)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-    parts = [against_hand, against_jax, long_rollout, other_formats, other_levels, eager_rows, agreement, gpu]
-    chosen = [p for p in parts if not arguments.only or p.__name__ in arguments.only]
-    begin, found, rows = time.perf_counter(), conditions(), []
-    bar = tqdm(chosen)
-    for part in bar:
+    path, found = harness.json_file(arguments, "stepper"), harness.conditions("jax", "onnxruntime")
+    rows, curve = [], []
+    for part in (bar := tqdm([p for p in PARTS if not arguments.only or p.__name__ in arguments.only])):
         bar.set_description(part.__name__)
-        rows += part(arguments.quick)
-    curve = sizes(arguments.quick) if not arguments.only or "sizes" in arguments.only else []
-    rows += exponents(curve)
-    found["machine"]["load_after"] = os.getloadavg()
-    text = table(rows)
-    print(text)
+        if part is sizes:
+            curve = sizes(arguments.quick)
+            rows += exponents(curve)
+        else:
+            rows += part(arguments.quick)
+        found |= {"flags": FLAGS, "h": H, "quick": arguments.quick, "rows": rows, "sizes": curve}
+        harness.store(path, found, table(rows))
+    print(table(rows))
     for r in curve:
         print({k: round(v, 3) for k, v in r.items()})
-    if arguments.out:
-        arguments.out.mkdir(parents=True, exist_ok=True)
-        found |= {"quick": arguments.quick, "seconds": time.perf_counter() - begin, "rows": rows, "sizes": curve}
-        (arguments.out / "stepper.json").write_text(json.dumps(found, indent=1) + "\n")
-        (arguments.out / "stepper.md").write_text(text + "\n")
-        if curve:
-            plot(curve, arguments.out / "stepper.png")
 
 
 if __name__ == "__main__":

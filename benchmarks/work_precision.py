@@ -4,107 +4,364 @@ Eight scenes. In C: learned steppers (their own step, larger steps re-trained, s
 float32, bfloat16 weights, loose Newton; large steps of a few learned kicks), RK4, DOP853 (adaptive and with equal
 steps), implicit midpoint and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same
 data. In PyTorch: discrete Lagrangians of order 1 to 6, compositions, tolerance, iterations and guess of Newton, and the
-learned model eager, as ONNX and under torch.compile. Needs scipy.
+learned model eager, as ONNX and by AOTInductor. Needs scipy.
 
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
 Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn; rules in
 PyTorch: of 4 motions at once, one round), the same in steps of C leapfrog, evaluations and flops beside it.
-Written: OUT.json after each scene, OUT.md, OUT.png. The two scenes of the headline over several training seeds:
-`work_precision_headline.py`.
+Written: work_precision.json after each scene, .md and .png.
+
+`--headline` measures two scenes over several training seeds instead, into headline.json and .md: learned kicks on the
+damped pendulum and a learned equation on the double pendulum, beside neural ODEs trained on the same motions and what
+is best on the true equations. A seed draws the training motions and the first weights of every network. Of each
+starting set the first half chooses a setting, the second half judges it; what it is compared with is the cheapest rival
+that is as accurate on the judging half itself, a choice no user can make.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import platform
-import subprocess
+import math
+import statistics
 import sys
 import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
-from work_precision_analytic import analytic
-from work_precision_cases import prepare
-from work_precision_learned import points
-from work_precision_report import add_leapfrog_unit, draw, front, headline, markdown, spread_of
-from work_precision_scenes import SETUPS
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks import harness
+from benchmarks.work_precision_rivals import classical, equation, neural
+from benchmarks.work_precision_ways import SETUPS, TOLD, Timed, analytic, costs, kicks, learned, prepare
+from herglotz.plots.style import SERIES, new_figure, styled
 
-ROOT = Path(__file__).resolve().parents[1]
+WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}  # errors of the headline
+# Families of the figure, each with what its kinds begin with; the first that fits.
+FAMILIES = (
+    ("learned kicks (C)", ("learned kicks",)),
+    ("learned equation (C)", ("learned equation",)),
+    ("learned, C", ("learned",)),
+    ("neural ODE (C)", ("neural ODE",)),
+    ("DOP853 (C)", ("DOP853",)),
+    ("RK4 (C)", ("RK4",)),
+    ("leapfrog (C)", ("leapfrog",)),
+    ("implicit midpoint (C)", ("implicit midpoint",)),
+    ("rules and compositions (PyTorch)", ("",)),
+)
+SLOW, SLOW_LEARNED = ("eager", "ONNX", "AOTInductor", "torch.compile"), "learned (PyTorch, ONNX)"
+COLOURS = (*SERIES, "#7F7F7F", "#8C564B", "#332288", "#BCBD22")
+RIVALS = (
+    ("neural ODE", lambda p: p["kind"].startswith("neural ODE")),
+    ("DOP853", lambda p: p["kind"] == "DOP853, true equations"),
+    ("DOP853, equal steps", lambda p: p["kind"] == "DOP853 fixed, true equations"),
+    ("RK4", lambda p: p["kind"] == "RK4, true equations"),
+    ("leapfrog", lambda p: p["kind"] == "leapfrog, true equations"),
+)
 
 
-def main(argv: list[str] | None = None) -> dict:
-    """Measure, write, print."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="small fits, few settings")
-    parser.add_argument("--scenes", default=None, help="with commas (default: all)")
-    parser.add_argument("--resume", action="store_true", help="keep the scenes that OUT.json already holds")
+def family(p: dict) -> str:
+    """The family of a point."""
+    if p["kind"].startswith("learned") and p.get("artefact") in SLOW:
+        return SLOW_LEARNED
+    return next(name for name, starts in FAMILIES if p["kind"].startswith(starts))
+
+
+def front(points: list[dict], error: str = "median") -> list[dict]:
+    """Points that no other beats in both error and cost, cheapest first."""
+    kept: list[dict] = []
+    for p in sorted((p for p in points if p.get(error) is not None), key=lambda p: p["us_per_time"]):
+        if not kept or p[error] < kept[-1][error]:
+            kept.append(p)
+    return kept
+
+
+NOT_TERMS = ("learned, bf16 weights",)
+
+
+# What a fit with another set of terms lacks or has besides, where its label does not say it.
+CHANGED = {"level conservative": "no damping", "level linear": "one rate, no drag",
+           "level affine": "drag besides, with its network"}  # fmt: skip
+TERMS = {
+    "damped_oscillator": "K, V quadratic, γ, correction",
+    "damped_pendulum": "K, V network, γ, correction",
+    "double_pendulum": "K(q) network, V network, γ, correction",
+    "parachute": "K, V, γ, λ, drag network, correction",
+    "kepler": "K, V of r, γ, correction",
+    "chain": "K, V of stretches, γ",
+    "driven_pendulum": "K, V network, γ, friction, input, correction",
+    "rigid_body": "K(q) network, V network, γ, correction",
+}
+
+
+def terms(scenes: dict[str, list[dict]]) -> list[str]:
+    """Each scene's own model at the step of its data, and what other terms cost and bring: all fitted alike."""
+    rows = []
+    for name, points in scenes.items():
+        own = next((p for p in points if p["kind"] == "learned" and p["dtype"] == "float64"), None)
+        if own is not None:
+            rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
+        for p in points:
+            label = p["kind"][9:]
+            if not p["kind"].startswith("learned, ") or not p["setting"].startswith(label) or p["kind"] in NOT_TERMS:
+                continue
+            times = ""
+            if own is not None:
+                worse = f"{p['median'] / own['median']:.2g}" if p["median"] and own["median"] else "–"
+                times = f"{p['us_per_time'] / own['us_per_time']:.2g}, {worse}"
+            cost = f"{p['us_per_time'] * p['h']:.2g}{' (PyTorch)' if p['artefact'] == 'eager' else ''}"
+            rows.append(["", CHANGED.get(label, label), cost, _error(p), times])
+    head = ("scene", "terms", "µs a step", "median error", "times the scene's own: cost, error")
+    return ["", "## Terms", "", *harness.table(head, rows)]
+
+
+def headline(points: list[dict], error: str = "median") -> list[dict]:
+    """At the error of each learned setting on the learned front: what the others cost over what it costs.
+
+    The front is that of the choosing starts, where there are any; the errors are those of the judging ones. `error` is
+    "median" or "q95". A rival is the cheapest of its settings, of all sizes and in both precisions, whose error is no
+    larger.
+    """
+    rows = []
+    learned = [{f"choice_{error}": p[error], **p} for p in points if p["kind"].startswith("learned")]
+    for p in front(learned, f"choice_{error}"):
+        if p[error] is None:
+            continue
+        row: dict[str, Any] = {k: p[k] for k in ("setting", "us_per_time", "spread")}
+        row |= {"kind": p["kind"], "error": p[error]}
+        for name, belongs in RIVALS:
+            good = [q for q in points if belongs(q) and q[error] is not None and q[error] <= p[error]]
+            best = min(good, key=lambda q: q["us_per_time"], default=None)
+            row[name] = None if best is None else best["us_per_time"] / p["us_per_time"]
+            row[f"{name}: setting"] = None if best is None else best["setting"]
+        rows.append(row)
+    return rows
+
+
+def add_leapfrog_unit(result: dict[str, Any]) -> None:
+    """The unit of cost: a step of C leapfrog on the damped pendulum (or, without it, another scene) of the same run."""
+    for name in ("damped_pendulum", *result["scenes"]):
+        points = [p for p in result["scenes"].get(name, []) if p["kind"].startswith("leapfrog")]
+        if points:
+            result["leapfrog_step_us"] = min(p["us_per_time"] / p["evaluations_per_time"] for p in points)
+            result["leapfrog_of"] = name
+            return
+
+
+def markdown(result: dict[str, Any]) -> str:
+    """The fronts, the knobs, what the others cost and what terms bring, as tables."""
+    measured = f"Commit {result['commit']}, {result['machine']['cores']} cores, one thread."
+    lines = ["# Error against cost", "", measured, "Errors: the largest departure of a position from the truth at four "
+             "times up to T, median of unseen starts."]  # fmt: skip
+    if unit := result.get("leapfrog_step_us"):
+        lines += [f"One C leapfrog step of the {result['leapfrog_of'].replace('_', ' ')}: {1e3 * unit:.3g} ns."]
+    for name, points in result["scenes"].items():
+        head = ("setting", "µs per time", "±", "leapfrog steps", "evaluations", "flops", "median", "95 %")
+        rows = []
+        for p in front(points):
+            work = [unit and p["us_per_time"] / unit, p.get("evaluations_per_time"), p.get("flops_per_time")]
+            rows.append([f"{p['kind'].split(',')[0]}: {p['setting']}", f"{p['us_per_time']:.3g}", f"{p['spread']:.2g}",
+                         *("" if c is None else f"{c:.3g}" for c in work), f"{p['median']:.2g}",
+                         "" if p["q95"] is None else f"{p['q95']:.2g}"])  # fmt: skip
+        lines += ["", f"## {name}", "", *harness.table(head, rows)]
+        if rows := knob_rows(points):
+            lines += ["", *harness.table(("knob", "setting", "µs per time", "median"), rows)]
+        for error in ("median", "q95"):
+            rows = []
+            for r in result["headline"].get(name, {}).get(error, []):
+                ratios = ["not reached" if r[n] is None else f"{r[n]:.3g}" for n, _ in RIVALS]
+                rows.append([r["setting"], f"{r['error']:.2g}", f"{r['us_per_time']:.3g}", *ratios])
+            if rows:
+                head = ("learned", "error", "µs per time", *(n for n, _ in RIVALS))
+                lines += ["", f"Cost of the others over that of a learned stepper, at its {error} error:", ""]
+                lines += harness.table(head, rows)
+    return "\n".join([*lines, *terms(result["scenes"])])
+
+
+ON_FRONT = ("learned", "learned, distilled", "learned kicks")  # shown there; all others are knobs or terms
+
+
+def knob_rows(points: list[dict]) -> list[list[str]]:
+    """Settings that are off the front and stand for a knob."""
+    solver = [p for p in points if p["kind"].startswith(("Newton", "guess order"))]
+    learned = [p for p in points if p["kind"].startswith("learned") and p["kind"] not in ON_FRONT]
+    return [[p["kind"], p["setting"], f"{p['us_per_time']:.3g}", _error(p)] for p in solver + learned]
+
+
+def _error(p: dict) -> str:
+    return "fails" if p["median"] is None else f"{p['median']:.2g}"
+
+
+def draw(scenes: dict[str, list[dict]], path: Path) -> None:
+    """A panel a scene: every setting as a faint dot, the front of every family as a line; learned ones are thick."""
+    order = [*(n for n, _ in FAMILIES[:3]), SLOW_LEARNED, *(n for n, _ in FAMILIES[3:])]
+    styles = {name: {"color": colour, "marker": marker, "zorder": 3 if name.startswith("learned") else 2}
+              for name, colour, marker in zip(order, COLOURS, "o*sD^vPX<>", strict=True)}  # fmt: skip
+    with styled():
+        columns = min(4, len(scenes))
+        rows = -(-len(scenes) // columns)
+        figure = new_figure(4.4 * columns, 3.7 * rows + 0.7, "Error against cost: lower left is better")
+        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+        for ax in axes[len(scenes) :]:
+            ax.set_visible(False)
+        handles: dict[str, Any] = {}
+        for ax, (name, points) in zip(axes, scenes.items(), strict=False):
+            for kind in order:
+                mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
+                thick = kind.startswith("learned")
+                for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
+                    x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
+                    width = 0 if faint < 1 else 2.2 if thick else 1.0
+                    (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
+            ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
+            ax.set(xlabel="µs per unit of time", ylabel="median error of q")
+            ax.set_ylim(top=10)
+        shown = [n for n in order if n in handles]
+        keys = [handles[n] for n in shown]
+        figure.legend(keys, shown, loc="outside lower center", ncols=columns + 1, fontsize=8)
+        harness.picture(figure, path)
+
+
+def spread_of(points: list[dict]) -> float:
+    """The median of spread over cost: how far to trust a time."""
+    return statistics.median(p["spread"] / p["us_per_time"] for p in points if p["us_per_time"] > 0)
+
+
+def study(name: str, seeds: int, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+    """Every seed's learned and neural settings and the classical ones, timed together; the ratios of each seed."""
+    setup = SETUPS[name]
+    if name == "double_pendulum":
+        setup = replace(setup, fit={**setup.fit, **TOLD})
+    timed: list[Timed] = []
+    seconds = []
+    for seed in range(seeds):
+        say(f"seed {seed}")
+        case = prepare(setup, quick, seed)
+        mine = kicks(case, quick) + equation(case, quick) + neural(case, quick)
+        timed += [Timed({**t.point, "seed": seed}, t.run, t.time, t.idle) for t in mine]
+        seconds.append(case.seconds)
+        if seed == 0:
+            timed += classical(case, quick)
+    found = costs(timed, 3 if quick else 9)
+    rows = {e: [chosen(found, e, w, seeds) for w in WANTED[name]] for e in ("median", "q95")}
+    return {"seeds": seeds, "seconds": seconds, "rows": rows, "points": found}
+
+
+def chosen(points: list[dict], error: str, wanted: float, seeds: int) -> dict[str, Any]:
+    """Of each seed the cheapest learned setting within `wanted` on the choosing starts; its error on the others.
+
+    Beside it the cost of each rival (of this seed, where rivals are trained) that is no less accurate there.
+    """
+    rows = []
+    for seed in range(seeds):
+        mine = [p for p in points if p.get("seed", seed) == seed]
+        good = [p for p in mine if p["kind"].startswith("learned")]
+        good = [p for p in good if p[f"choice_{error}"] is not None and p[f"choice_{error}"] <= wanted]
+        best = min(good, key=lambda p: p["us_per_time"], default=None)
+        if best is None or best[error] is None:
+            continue
+        row = {"seed": seed, "setting": best["setting"], "error": best[error], "us_per_time": best["us_per_time"]}
+        for rival, belongs in RIVALS:
+            costs_ = [p["us_per_time"] for p in mine if belongs(p) and p[error] is not None and p[error] <= best[error]]
+            row[rival] = min(costs_) / best["us_per_time"] if costs_ else None
+        rows.append(row)
+    return {"wanted": wanted, "seeds": rows}
+
+
+def study_table(name: str, result: dict[str, Any]) -> list[str]:
+    """Markdown: one line a wanted error."""
+    own = statistics.median(s["fit"] + s.get("kicks", 0) for s in result["seconds"])
+    theirs = statistics.median(s["neural ODE"] for s in result["seconds"])
+    lines = [
+        "",
+        f"## Headline: {name}, {result['seeds']} training seeds",
+        "",
+        f"Training, CPU seconds a seed: learned {own:.0f}, all neural ODEs {theirs:.0f}. "
+        "Each number: median (range) over the seeds.",
+    ]
+    names = [n for n, _ in RIVALS]
+    for error, wanted in result["rows"].items():
+        rows = []
+        for row in wanted:
+            found = row["seeds"]
+            cells = [middle([r[k] for r in found]) if found else "" for k in ("error", "us_per_time", *names)]
+            rows.append([f"{row['wanted']:g}", f"{len(found)} of {result['seeds']}", *cells])
+        lines += ["", f"By the {'median start' if error == 'median' else '95 % start'}:", ""]
+        lines += harness.table(("wanted", "seeds", "error", "µs per time", *names), rows)
+    return lines
+
+
+def middle(values: list[float | None]) -> str:
+    """Median and range, or how many never get there."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "not reached"
+    text = f"{statistics.median(known):.3g} ({min(known):.3g} … {max(known):.3g})"
+    return text if len(known) == len(values) else f"{text}, not reached by {len(values) - len(known)}"
+
+
+def measure_headline(path: Path, names: list[str], seeds: int, quick: bool) -> None:
+    """Two scenes over several seeds, into headline.json and .md; the points themselves are not stored."""
+    scenes = harness.load(path, {"scenes": {}})["scenes"]
+    for name in names:
+        found = study(name, seeds, quick, lambda what, name=name: print(name, what, flush=True))
+        scenes[name] = {k: v for k, v in found.items() if k != "points"} | {"measured": harness.conditions()}
+        tables = [line for scene, one in scenes.items() for line in study_table(scene, one)]
+        harness.store(path, {"scenes": scenes}, "\n".join(["# Cost of the others over the learned stepper's", *tables]))
+
+
+def measure_scene(name: str, result: dict[str, Any], quick: bool, only: str | None, say: Callable[[str], None]) -> None:
+    """Every setting of a scene, into the result."""
+    began, found, notes = time.process_time(), [], {}
+    setup = SETUPS[name]
+    if only != "learned":
+        say("rules")
+        found += analytic(setup, quick)
+    if only != "analytic":
+        say("fit")
+        case = prepare(setup, quick)
+        timed = []
+        for ways in (learned, equation, classical, neural):
+            say(ways.__name__)
+            timed += ways(case, quick)
+        say("timing")
+        found += costs(timed, 3 if quick else 9)
+        notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
+        result["headline"][name] = {error: headline(found, error) for error in ("median", "q95")}
+    result["scenes"][name] = found
+    notes |= {"T": setup.T, "h": setup.h, "spread": spread_of(found), "total_seconds": time.process_time() - began}
+    result["notes"][name] = notes
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__, quick=True)
+    parser.add_argument("--scenes", help="with commas (default: all)")
+    parser.add_argument("--resume", action="store_true", help="keep the scenes that are stored already")
     parser.add_argument("--only", choices=("analytic", "learned"), help="one half of the settings")
-    parser.add_argument("--out", type=Path, default=ROOT / "benchmarks" / "results" / "work_precision.json")
+    parser.add_argument("--headline", action="store_true", help="two scenes, several training seeds")
+    parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5)")
     arguments = parser.parse_args(argv)
-    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
-    names = arguments.scenes.split(",") if arguments.scenes else list(SETUPS)
-    unknown = [n for n in names if n not in SETUPS]
-    if unknown:
-        parser.error(f"unknown scenes {', '.join(unknown)}; choose from {', '.join(SETUPS)}")
-    result = _begun(arguments)
-    arguments.out.parent.mkdir(parents=True, exist_ok=True)
+    names = harness.chosen(parser, arguments.scenes, WANTED if arguments.headline else SETUPS, "scene")
+    path = harness.json_file(arguments, "headline" if arguments.headline else "work_precision")
+    if arguments.headline:
+        measure_headline(path, names, arguments.seeds, arguments.quick)
+        return
+    result = {**harness.conditions(), "quick": arguments.quick, "scenes": {}, "headline": {}, "notes": {}}
+    if arguments.resume:
+        result |= {k: harness.load(path, result)[k] for k in ("scenes", "headline", "notes")}
     with tqdm([n for n in names if n not in result["scenes"]], disable=None) as bar:
         for name in bar:
-            began = time.process_time()
-
-            def say(what: str, name: str = name) -> None:
-                bar.set_postfix_str(f"{name}: {what}")
-
-            found = []
-            if arguments.only != "learned":
-                say("rules")
-                found += analytic(SETUPS[name], arguments.quick)
-            notes: dict[str, Any] = {}
-            if arguments.only != "analytic":
-                say("fit")
-                case = prepare(SETUPS[name], arguments.quick)
-                found += points(case, arguments.quick, say)
-                notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
-                result["headline"][name] = {error: headline(found, error) for error in ("median", "q95")}
-            result["scenes"][name] = found
-            notes |= {"T": SETUPS[name].T, "h": SETUPS[name].h, "spread": spread_of(found)}
-            result["notes"][name] = {**notes, "total_seconds": time.process_time() - began}
-            _write(result, arguments.out)
+            say = lambda what, name=name: bar.set_postfix_str(f"{name}: {what}")  # noqa: E731
+            measure_scene(name, result, arguments.quick, arguments.only, say)
+            result["scenes"] = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
+            add_leapfrog_unit(result)
+            harness.store(path, result, markdown(result))
+            draw(result["scenes"], path.with_suffix(".png"))
     for name in names:
         print(f"{name}: the front")
         for p in front(result["scenes"][name]):
             print(f"  {p['us_per_time']:>10.3g} µs/time  {p['median']:>8.2g}  {p['kind']}: {p['setting']}")
-    return result
-
-
-def _begun(arguments: argparse.Namespace) -> dict[str, Any]:
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=ROOT).stdout
-    machine = {"processor": platform.machine(), "cores": os.cpu_count(), "threads": torch.get_num_threads()}
-    result: dict[str, Any] = {
-        "commit": commit.strip(), "machine": machine, "torch": torch.__version__, "quick": arguments.quick,
-        "scenes": {}, "headline": {}, "notes": {},
-    }  # fmt: skip
-    if arguments.resume and arguments.out.exists():
-        old = json.loads(arguments.out.read_text())
-        result |= {k: old[k] for k in ("scenes", "headline", "notes")}
-    return result
-
-
-def _write(result: dict[str, Any], out: Path) -> None:
-    order = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
-    result["scenes"] = order
-    add_leapfrog_unit(result)
-    partial = out.with_suffix(".part")
-    partial.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n")
-    partial.replace(out)
-    out.with_suffix(".md").write_text(markdown(result))
-    draw(order, out.with_suffix(".png"))
 
 
 if __name__ == "__main__":

@@ -11,6 +11,25 @@ from herglotz.scenes import scene
 H = 0.5
 # scene, parameters, q, p, s and after H: q, p, s
 MOTIONS = {
+    "cart_pole": (
+        {"cart": 1.3, "m": 0.6, "length": 0.8, "g": 4.0, "gamma": 0.4},
+        ([0.3, 0.9], [0.5, -0.4], 0.2),
+        (
+            [0.6671724947473986961687, -0.1993261673555571806213],
+            [0.409365376538990929335, -0.5312850669718523966443],
+            0.4048287595736069649237,
+        ),
+    ),
+    "duffing": (
+        {"k": 0.7, "beta": 12.0, "gamma": 0.3},
+        ([0.4], [-0.2], 0.3),
+        ([0.2147554286281520937932], [-0.4664252592361972199864], 0.2589351286766991258635),
+    ),
+    "driven_duffing": (
+        {"k": 0.7, "beta": 2.5, "gamma": 0.35, "amplitude": 0.3},
+        ([0.6], [-0.4], 0.3),
+        ([0.364645351691304107276], [-0.4896915431338699133591], 0.3139182770173415636607),
+    ),
     "chain": (
         {"masses": 2, "m": 1.3, "k": 0.8, "beta": 1.1, "gamma": 0.3},
         ([0.4, -0.3], [0.2, 0.5], 0.1),
@@ -48,6 +67,14 @@ def test_flow(name):
     parameters, start, end = MOTIONS[name]
     q, p, s = tensors(*start)
     for value, expected in zip(scene(name, **parameters).flow(q, p, s, H), tensors(*end), strict=True):
+        torch.testing.assert_close(value, expected, rtol=0, atol=2e-14)
+
+
+def test_flow_under_a_force_beside_the_lagrangian():
+    # fails if the damping of van der Pol's oscillator has another sign, or leaks into the action
+    q, p, s = tensors([0.7], [-0.9], 0.3)
+    wanted = tensors([0.03496728922127354203806], [-1.874924464564448874652], 0.7112742996583654496712)
+    for value, expected in zip(scene("van_der_pol", mu=1.4).flow(q, p, s, H), wanted, strict=True):
         torch.testing.assert_close(value, expected, rtol=0, atol=2e-14)
 
 

@@ -7,7 +7,7 @@ import re
 from typing import NoReturn
 
 import herglotz
-from herglotz.cli import export, fit, plot, rollout, select, simulate, trust, tune, verify
+from herglotz.cli import export, fit, plot, predict, rollout, select, simulate, trust, tune, verify
 
 DESCRIPTION = """\
 Learn a discrete contact Lagrangian from measured positions, step it, and prove that it is a contact integrator.
@@ -37,6 +37,6 @@ def build_parser() -> Parser:
     parser = Parser(prog="herglotz", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"herglotz {herglotz.__version__}")
     commands = parser.add_subparsers(title="subcommands", metavar="COMMAND", required=True)
-    for module in (simulate, fit, select, rollout, export, verify, trust, tune, plot):
+    for module in (simulate, fit, select, predict, rollout, export, verify, trust, tune, plot):
         module.add(commands)
     return parser

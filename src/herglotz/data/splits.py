@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import MIN_SAMPLES, check_fraction
+from herglotz.data.checks import MIN_SAMPLES, check_fraction, offsets_of
 from herglotz.errors import InputError
 
 Part = tuple[Tensor, tuple[int, ...]]  # rows of the concatenation, and how many of each trajectory
@@ -76,12 +76,12 @@ class Concatenation(Protocol):
         ...
 
     @property
-    def offsets(self) -> tuple[int, ...]:
-        """Row at which each trajectory starts."""
+    def lengths(self) -> tuple[int, ...]:
+        """Samples of each trajectory."""
         ...
 
 
 def leading_rows(data: Concatenation, lengths: Sequence[int]) -> Tensor:
     """Rows of the first `lengths[b]` samples of every trajectory b."""
-    spans = [torch.arange(first, first + k) for first, k in zip(data.offsets, lengths, strict=True)]
+    spans = [torch.arange(first, first + k) for first, k in zip(offsets_of(data.lengths), lengths, strict=True)]
     return torch.cat(spans).to(data.t.device)

@@ -1,4 +1,4 @@
-"""The contact form η = ds − p·dq and what a map does to it.
+"""The contact form η = ds − p·dq, its pull-back by a map, and the derivative of a map.
 
 Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's derivative is a (2n+1, 2n+1) matrix.
 """

@@ -44,7 +44,7 @@ class Regularity:
         return getattr(self, name) < bound  # NaN, undefined because of another failure, is not this failure
 
     def report(self) -> list[str]:
-        """One line for every condition lost at every sample, e.g. `sample (3,), h = 5: c = 0: FL⁻ is not defined`."""
+        """Return a line for every failed condition of a sample: `sample (3,), h = 5: c = 0: FL⁻ is not defined`."""
         lines = []
         for name, statement in CONDITIONS.items():
             for index in self.lost(name).nonzero().tolist():
@@ -52,7 +52,7 @@ class Regularity:
         return lines
 
     def require(self, *names: str) -> None:
-        """Raise unless these conditions hold at every sample; no name stands for those that stepping needs.
+        """Raise unless these conditions hold at every sample; the default is the conditions that a step needs.
 
         Raises
         ------

@@ -35,15 +35,15 @@ class ActionFlow(nn.Module):
         self.rate = nn.Parameter(torch.zeros(J, dtype=torch.float64))
         self.log_slope = nn.Parameter(torch.zeros(J, dtype=torch.float64))
         self.weight = nn.Parameter(draw(J, inputs) * (0.3 / inputs**0.5))
-        # Centres on both sides of s = 0: units that bend alike there could not tell s from −s.
+        # The centres lie on both sides of s = 0: units with equal slopes there could not tell s from −s.
         self.bias = nn.Parameter(torch.linspace(-1.0, 1.0, J, dtype=torch.float64) + 0.1 * draw(J))
 
     def offsets(self, features: Jet) -> Jet:
-        """The b of every unit, vector-valued (..., J)."""
+        """Return the b of every unit, vector-valued (..., J)."""
         return features.linear(self.weight, self.bias)
 
     def forward(self, s0: Jet, gained: Jet, offsets: Jet, h: Tensor, *, backward: bool = False) -> Jet:
-        """What s has gained after the units of half a step, given what it had before: increments do not cancel."""
+        """Return the gain of s after the units of half a step, from the gain before them; increments do not cancel."""
         slope, rate = self.log_slope.exp() / self.size, self.rate
         order = range(len(rate))
         for j in reversed(order) if backward else order:
@@ -53,7 +53,7 @@ class ActionFlow(nn.Module):
 
 
 def unit_increment(x: Jet, a: Tensor) -> Jet:
-    """asinh(eᵃ sinh x) − x as a jet; a is (...)."""
+    """Return asinh(eᵃ sinh x) − x as a jet; a is (...)."""
     t = x.value.tanh()
     e, E = a.exp(), torch.expm1(2 * a)
     D = (1 + E * t * t).sqrt()

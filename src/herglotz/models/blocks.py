@@ -16,7 +16,7 @@ def affine_partials(
     s0: Tensor,  # (...)
     force: Forces | None,
 ) -> Partials:
-    """The blocks where L_d is affine in s0: D3 = c − 1."""
+    """Return the blocks of an L_d that is affine in s0: D3 = c − 1."""
     n = L.tangents // 2
     gradient = L.gradient.movedim(0, -1)
     D3 = s0.new_zeros(()) if g is None else torch.expm1(g.value if isinstance(g, Jet) else g)
@@ -42,7 +42,7 @@ def affine_partials(
 
 
 def action_partials(L: Jet) -> Partials:
-    """The blocks where L is a jet over the 2n + 1 variables (q0, q1, s0)."""
+    """Return the blocks of an L that is a jet over the 2n + 1 variables (q0, q1, s0)."""
     n = L.tangents // 2
     gradient = L.gradient.movedim(0, -1)
     D1, D2, D3 = gradient[..., :n], gradient[..., n:-1], gradient[..., -1]

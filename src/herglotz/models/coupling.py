@@ -1,4 +1,4 @@
-"""Friction between joints: a hinge that two links share brakes the difference of their speeds."""
+"""Friction between joints: the hinge of two links brakes the difference of their speeds."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class CoupledFriction(nn.Module):
         self.viscous = nn.Parameter(torch.zeros(dof * (dof - 1) // 2, dtype=torch.float64))
 
     def matrix(self) -> Tensor:
-        """The matrix b without its diagonal, (n, n)."""
+        """Return the matrix b without its diagonal, (n, n)."""
         b = self.viscous
         i, j = pairs(self.dof, b.device)
         off = i != j
@@ -31,7 +31,7 @@ class CoupledFriction(nn.Module):
         return upper + upper.T
 
     def forward(self, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
-        """The forces `own` at the velocity v (..., n), and these; with derivatives where `own` has them."""
+        """Return `own` plus these forces at the velocity v (..., n), with derivatives if `own` has them."""
         b = self.matrix()
         f = -v @ b
         minus, plus = own.minus + (c * h / 2)[..., None] * f, own.plus + (h / 2)[..., None] * f

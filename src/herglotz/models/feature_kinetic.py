@@ -1,4 +1,4 @@
-"""A kinetic term with the features of speed that a user names."""
+"""A kinetic term with the named features that contain velocities."""
 
 from __future__ import annotations
 
@@ -27,12 +27,12 @@ class FeatureKinetic(nn.Module):
         super().__init__()
         self.base = base
         self.sum = Combination(features, known, dof)
-        self.monomials: dict[tuple[int, ...], list[int]] = {}  # the products that share their velocities
+        self.monomials: dict[tuple[int, ...], list[int]] = {}  # products by their velocities
         for a, p in enumerate(self.sum.products):
             self.monomials.setdefault(tuple(sorted(p.velocities)), []).append(a)
 
     def forward(self, phase: Phase) -> Jet:
-        """K as a jet over (q0, q1)."""
+        """Return K as a jet over (q0, q1)."""
         p, base = phase, self.base
         K = base(p.q0, p.q1, p.h, p.order, p.delta) if isinstance(base, Kinetic) else base(p)
         f = self._functions(phase, 0)
@@ -41,7 +41,7 @@ class FeatureKinetic(nn.Module):
         return K
 
     def mass(self, q: Tensor) -> Tensor:
-        """The features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
+        """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
         c, n = self.sum, self.sum.dof
         f = c.ridge(q @ c.form.T, 0) * c.weights()
         out = q.new_zeros(*q.shape, n)
@@ -55,7 +55,7 @@ class FeatureKinetic(nn.Module):
         return out
 
     def straight(self, phase: Phase, rate: Tensor) -> Jet:
-        """K_qq[v, v] + 2γ K_q v + γ² K of the features: how K changes along the straight line."""
+        """Return K_qq[v, v] + 2γ K_q v + γ² K of the features: the change of K along the straight line."""
         f = self._functions(phase, 0) * (rate * rate)
         w = phase.velocity.linear(self.sum.form)
         f = f + (self._functions(phase, 1) * (2 * rate) + self._functions(phase, 2) * w) * w
@@ -65,7 +65,7 @@ class FeatureKinetic(nn.Module):
         return out
 
     def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
-        """bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, for constant b and y, (..., n); at most two velocities."""
+        """Return bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, b and y (..., n) constant; up to two velocities."""
         c, v = self.sum, phase.velocity
         f, slope = self._functions(phase, 0), self._functions(phase, 1)
         turned = slope * (b @ c.form.T)
@@ -80,7 +80,7 @@ class FeatureKinetic(nn.Module):
         return out
 
     def _functions(self, phase: Phase, k: int) -> Jet:
-        """θ times the k-th derivatives of the functions, vector-valued (..., A)."""
+        """Return θ times the k-th derivatives of the functions, vector-valued (..., A)."""
         c, x = self.sum, phase.mean
         x = x.linear(c.form)
         f0, f1 = c.ridge(x.value, k), c.ridge(x.value, k + 1)
@@ -92,14 +92,14 @@ def _sum(f: Jet, which: list[int]) -> Jet:
 
 
 def _times(f: Jet, v: Jet, velocities: tuple[int, ...]) -> Jet:
-    """The product f ∏v."""
+    """Return the product f ∏v."""
     for i in velocities:
         f = f * v.select(i)
     return f
 
 
 def _derivative(v: Jet, velocities: tuple[int, ...], b: Tensor) -> Jet:
-    """The derivative of ∏v along b, for at most two velocities."""
+    """Return the derivative of ∏v along b, for at most two velocities."""
     if len(velocities) == 1:
         return v.select(0) * 0.0 + b[..., velocities[0]]
     i, j = velocities

@@ -1,4 +1,4 @@
-"""Linear combinations of the features that a user names, and the potential that is one."""
+"""Linear combinations of named features, and the potential that is one of them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from torch import Tensor, nn
 from herglotz.models.features import Feature, Product, expand, parse
 from herglotz.models.jet import Jet, pairs
 
-RIDGES = ("cos", "sin", "power")  # functions of a linear form w·q; "radius" is one of r²
+RIDGES = ("cos", "sin", "power")  # functions of a linear form w·q; "radius" is a function of r²
 
 
 class Combination(nn.Module):
-    """Σ_g θ_g φ_g, with θ learned from 0, + the sum of the known features as they stand.
+    """Σ_g θ_g φ_g, with θ learned from 0, plus the known features with their own numbers.
 
     Parameters
     ----------
@@ -28,7 +28,7 @@ class Combination(nn.Module):
         super().__init__()
         every = [(p, g) for g, feature in enumerate([*features, *known]) for p in feature]
         names = [*RIDGES, "radius"]
-        every.sort(key=lambda pair: names.index(pair[0].function))  # products of one function stand together
+        every.sort(key=lambda pair: names.index(pair[0].function))  # sorts products of the same function together
         self.products: list[Product] = [p for p, _ in every]
         self.counts = [sum(p.function == f for p in self.products) for f in names]
         self.ridges = sum(self.counts[:3])
@@ -53,14 +53,14 @@ class Combination(nn.Module):
         self.group: Tensor
 
     def weights(self) -> Tensor:
-        """The number before each product, (A,)."""
+        """Return the coefficient of each product, (A,)."""
         if not self.learned:
             return self.factor
         known = torch.ones_like(self.coefficient[:1])
         return torch.cat([self.coefficient, known])[self.group.clamp_max(self.learned)] * self.factor
 
     def ridge(self, x: Tensor, k: int) -> Tensor:
-        """The k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
+        """Return the k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
         cos, sin, power = x.split(self.counts[:3], -1)
         exponent, highest = self.power.split(self.counts)[2], self.highest
         rest, product = exponent - k, torch.ones_like(power)
@@ -69,13 +69,13 @@ class Combination(nn.Module):
         return torch.cat([_wave(cos, k), _wave(sin, k + 3), _front(exponent, k) * product], -1)
 
     def radial(self, square: Tensor, k: int) -> Tensor:
-        """The k-th derivative of the functions of r², (..., radial ones)."""
+        """Return the k-th derivative of the functions of r², (..., number of radial functions)."""
         exponent = self.power.split(self.counts)[3] / 2
         return _front(exponent, k) * square[..., None].pow(exponent - k)
 
 
 class FeaturePotential(nn.Module):
-    """V = Σ_g θ_g φ_g(q) by a sum over products of which each is a function of one number: no jets are multiplied.
+    """V = Σ_g θ_g φ_g(q), a sum of products that are each a function of one number, so that no jets are multiplied.
 
     With a ridge f(w·q): V′ = f′ w, V″ = f″ w wᵀ. With f(r²): V′ = 2 f′ q, V″ = 4 f″ q qᵀ + 2 f′ I.
     """
@@ -85,7 +85,7 @@ class FeaturePotential(nn.Module):
         self.sum = Combination(features, known, dof)
 
     def forward(self, q: Tensor, order: int, along: Tensor | None = None) -> Jet:
-        """V as a jet over the n components of q; with `along` y, (..., n), its derivative V′y for a constant y."""
+        """Return V as a jet over the n components of q, or V′y for a constant y = `along`, (..., n)."""
         c, n = self.sum, self.sum.dof
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
         x = q @ c.form.T
@@ -100,7 +100,7 @@ class FeaturePotential(nn.Module):
         return jet if c.ridges == len(c.products) else jet + self._radial(q, radial, order, along)
 
     def value_and_slope(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """V (...) and V′ (..., n), without a jet."""
+        """Return V (...) and V′ (..., n), without a jet."""
         c = self.sum
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
         x = q @ c.form.T
@@ -111,7 +111,7 @@ class FeaturePotential(nn.Module):
         return V + c.radial(square, 0) @ radial, slope + 2 * (c.radial(square, 1) @ radial)[..., None] * q
 
     def _radial(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:
-        """F(r²) as a jet, or 2F′ q·y where y is given."""
+        """Return F(r²) as a jet, or 2F′ q·y where y is given."""
         n, square = self.sum.dof, (q * q).sum(-1)
         F = [self.sum.radial(square, k) @ weights for k in range(order + 1 + (y is not None))]
         i, j = pairs(n, q.device)
@@ -132,7 +132,7 @@ class FeaturePotential(nn.Module):
 def baseline_features(
     angles: Sequence[bool], stiffness: Sequence[float], tilt: Sequence[float]
 ) -> tuple[list[str], list[float]]:
-    """The baseline's k (1 − cos q) + b sin q, or k q²/2 + b q, as features and their coefficients."""
+    """Return the baseline's k (1 − cos q) + b sin q, or k q²/2 + b q, as features and their coefficients."""
     names, values = [], []
     for i, (angle, k, b) in enumerate(zip(angles, stiffness, tilt, strict=True), 1):
         names += [f"cos(q{i})", f"sin(q{i})"] if angle else [f"q{i}^2", f"q{i}"]
@@ -141,19 +141,19 @@ def baseline_features(
 
 
 def sorted_features(names: Sequence[str], angles: Sequence[bool]) -> tuple[list[Feature], list[Feature]]:
-    """Features of the potential and of the kinetic term, libraries expanded and texts parsed."""
+    """Return the features of the potential and of the kinetic term; libraries are expanded and texts parsed."""
     features = [parse(text, angles) for text in expand(names, angles)]
     return [f for f in features if not f[0].velocities], [f for f in features if f[0].velocities]
 
 
 def _wave(x: Tensor, k: int) -> Tensor:
-    """The k-th derivative of cos; that of sin is three further on."""
+    """Return the k-th derivative of cos; the (k + 3)-th one is the k-th derivative of sin."""
     wave = x.sin() if k % 2 else x.cos()
     return -wave if k % 4 in (1, 2) else wave
 
 
 def _front(exponent: Tensor, k: int) -> Tensor:
-    """The factor p (p − 1) … of the k-th derivative of a power p."""
+    """Return the factor p (p − 1) … of the k-th derivative of a power p."""
     front = torch.ones_like(exponent)
     for j in range(k):
         front = front * (exponent - j)

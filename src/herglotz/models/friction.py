@@ -1,4 +1,4 @@
-"""Forces: friction of each joint and inputs, which one scalar s cannot express (trap 4)."""
+"""Forces that one scalar s cannot express (trap 4): friction of each joint, and inputs."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from herglotz.mechanics import Forces
 from herglotz.models.config import ModelConfig
 from herglotz.models.jet import Jet
 
-SMOOTH, STRIBECK = 0.02, 0.2  # starting widths of dry friction, in typical speeds
-SHARPEST = 0.001  # neither width falls below so many typical speeds: sticking would make a step stiff without limit
+SMOOTH, STRIBECK = 0.02, 0.2  # starting widths v_s and v_st of dry friction, in typical speeds
+SHARPEST = 0.001  # least width, in typical speeds: without a bound sticking would make a step arbitrarily stiff
 
 
 class Friction(nn.Module):
@@ -47,16 +47,16 @@ class Friction(nn.Module):
 
     @property
     def widths(self) -> tuple[Tensor, Tensor]:
-        """v_s and v_st, (n,) each, where friction is dry."""
+        """Return v_s and v_st of dry friction, (n,) each."""
         return self.sharpest + self.log_smooth.exp(), self.sharpest + self.log_stribeck.exp()
 
     @property
     def linear(self) -> bool:
-        """Whether f is linear in v."""
+        """Return whether f is linear in v."""
         return not self.dry
 
     def force(self, v: Tensor, u: Tensor | None) -> Jet:
-        """f, (..., n), with ∂f_i/∂v_i as its only tangent; u None: no input acts."""
+        """Return f, (..., n), with ∂f_i/∂v_i as its only tangent; without u no input acts."""
         x = Jet(torch.stack([v, torch.ones_like(v)]), 1, 1)
         f = x * -self.viscous
         if self.dry:
@@ -66,7 +66,7 @@ class Friction(nn.Module):
         return f if u is None else f + self.applied(u)
 
     def value_and_slope(self, v: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        """The force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet: what one iteration of a step needs."""
+        """Return the force f and its slopes ∂f_i/∂v_i, each (..., n), without a jet, for an iteration of a step."""
         f, slope = -self.viscous * v, -self.viscous
         if self.dry:
             smooth, stribeck = self.widths
@@ -78,7 +78,7 @@ class Friction(nn.Module):
         return f if u is None else f + self.applied(u), slope
 
     def forward(self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None) -> Forces:
-        """F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2."""
+        """Return F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2."""
         f = self.force(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
         minus, plus = before * f.value, after * f.value
@@ -90,11 +90,11 @@ class Friction(nn.Module):
         return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero)
 
     def applied(self, u: Tensor) -> Tensor:
-        """G (u − u₀), (..., n)."""
+        """Return G (u − u₀), (..., n)."""
         if not self.inputs or u.shape[-1:] != (self.inputs,):
             raise InputError(f"u needs shape (..., {self.inputs}), got {tuple(u.shape)}")
         return (u if self.input_zero is None else u - self.input_zero) @ self.input_map.T
 
     def offset(self) -> Tensor:
-        """The force of inputs that are recorded as 0, −G u₀, (n,)."""
+        """Return the force of inputs that are recorded as 0: −G u₀, (n,)."""
         return self.applied(self.input_map.new_zeros(self.inputs))

@@ -1,4 +1,4 @@
-"""A small multilayer perceptron whose derivatives are closed-form jets, and the features it reads."""
+"""A small multilayer perceptron with derivatives by closed-form jets, and its input features."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Network(nn.Module):
         self.weights.append(nn.Parameter(last))
 
     def forward(self, x: Jet) -> Jet:
-        """The network of a jet of features (..., m); the result is a scalar jet, or (..., k)."""
+        """Apply the network to a jet of features (..., m); the result is a scalar jet, or (..., k)."""
         hidden = list(self.weights)[:-1]
         for weight, bias in zip(hidden, self.biases, strict=True):
             x = _activate(x.linear(weight, bias), self.activation)
@@ -77,7 +77,7 @@ def _activate(x: Jet, activation: str) -> Jet:
 
 
 def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]) -> Jet:
-    """(sin q, cos q) of every angle and q / scale of every other coordinate."""
+    """Return (sin q, cos q) of every angle and q / scale of every other coordinate."""
     columns = []
     for i, angle in enumerate(angles):
         x = q.select(slice(i, i + 1))
@@ -86,14 +86,14 @@ def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]
 
 
 def feature_count(angles: tuple[bool, ...]) -> int:
-    """How many features `position_features` makes."""
+    """Return the number of features that `position_features` makes."""
     return sum(2 if angle else 1 for angle in angles)
 
 
 def midpoint_velocity_jets(
     q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None
 ) -> tuple[Jet, Jet]:
-    """q̄ = (q0 + q1)/2 and v = Δ/h as jets over the 2n components of (q0, q1); Δ = q1 − q0 unless it is given."""
+    """Return q̄ = (q0 + q1)/2 and v = Δ/h as jets over the 2n components of (q0, q1); Δ defaults to q1 − q0."""
     n = q0.shape[-1]
     eye = torch.eye(n, dtype=q0.dtype, device=q0.device)
     shape = torch.broadcast_shapes(q0.shape[:-1], h.shape)

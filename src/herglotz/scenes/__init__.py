@@ -1,8 +1,12 @@
 """Scenes with known answers, the rules that discretise them, and the reference flow they are measured against."""
 
+from herglotz.scenes.cart_pole import cart_pole
 from herglotz.scenes.chain import chain
 from herglotz.scenes.double_pendulum import double_pendulum
-from herglotz.scenes.driven_pendulum import DrivenRule, driven_pendulum
+from herglotz.scenes.driven import DrivenRule, driven_scene
+from herglotz.scenes.driven_duffing import driven_duffing
+from herglotz.scenes.driven_pendulum import driven_pendulum
+from herglotz.scenes.duffing import duffing
 from herglotz.scenes.exact import NumericallyExact, Reason, exact_discrete_lagrangian
 from herglotz.scenes.galerkin import GalerkinLobatto, lobatto4, lobatto6
 from herglotz.scenes.kepler import kepler
@@ -33,6 +37,8 @@ from herglotz.scenes.rules import (
     trapezoid_plain,
 )
 from herglotz.scenes.scene import Scene
+from herglotz.scenes.servo_axis import servo_axis
+from herglotz.scenes.van_der_pol import van_der_pol
 
 __all__ = [
     "ORDERS",
@@ -49,11 +55,15 @@ __all__ = [
     "Scene",
     "adjoint",
     "all_rules",
+    "cart_pole",
     "chain",
     "damped_oscillator",
     "damped_pendulum",
     "double_pendulum",
+    "driven_duffing",
     "driven_pendulum",
+    "driven_scene",
+    "duffing",
     "exact_discrete_lagrangian",
     "hamiltonian_motion",
     "herglotz_motion",
@@ -76,8 +86,10 @@ __all__ = [
     "rigid_body",
     "scene",
     "scene_names",
+    "servo_axis",
     "strang",
     "trapezoid",
     "trapezoid_heun",
     "trapezoid_plain",
+    "van_der_pol",
 ]

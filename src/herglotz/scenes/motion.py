@@ -1,4 +1,4 @@
-"""A contact system as a vector field to integrate: from L written out, from any H, or from any L."""
+"""A contact system as a vector field to integrate, from explicit derivatives of L, from any H, or from any L."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def herglotz_motion(
     force: StateFunction,  # (q, v, s) → L_q, (..., n)
     rate: StateFunction,  # (q, v, s) → L_s, (...)
 ) -> Motion:
-    """Everything written out, the fastest: q̇ = v(q, p, s), ṗ = L_q + L_s p, ṡ = L."""
+    """Return the field of explicit derivatives, the fastest form: q̇ = v(q, p, s), ṗ = L_q + L_s p, ṡ = L."""
 
     def field(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         v = velocity(q, p, s)
@@ -55,12 +55,12 @@ def herglotz_motion(
 
 
 def constant_rate(L_s: float) -> StateFunction:
-    """The rate of a contact term linear in s, L = … + L_s s."""
+    """Return the rate L_s of a contact term linear in s, L = … + L_s s."""
     return lambda q, v, s: torch.full_like(s, L_s)  # noqa: ARG005
 
 
 def hamiltonian_motion(hamiltonian: StateFunction, momentum: StateFunction) -> Motion:
-    """From H(q, p, s), differentiated: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H, L_s = −H_s."""
+    """Return the field of H(q, p, s) by autograd: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H, L_s = −H_s."""
 
     def field(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         H = derivatives(hamiltonian, q, p, s)
@@ -70,7 +70,7 @@ def hamiltonian_motion(hamiltonian: StateFunction, momentum: StateFunction) -> M
 
 
 def lagrangian_motion(lagrangian: StateFunction) -> Motion:
-    """From L(q, v, s) alone, differentiated, in the velocity: q̇ = v, v̇ by Herglotz's equations, ṡ = L."""
+    """Return the field of L(q, v, s) by autograd, in (q, v, s): q̇ = v, v̇ by Herglotz's equations, ṡ = L."""
 
     def field(q: Tensor, v: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         L = derivatives(lagrangian, q, v, s)

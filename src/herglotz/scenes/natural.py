@@ -1,4 +1,4 @@
-"""Two ways to write a scene shortly: a constant mass with one damping rate, and a scene without a closed form."""
+"""Short forms of a scene: a constant mass with one damping rate, and a scene without a closed form."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.scenes.exact import exact_discrete_lagrangian
+from herglotz.scenes.forced import External, ForcedRule
 from herglotz.scenes.motion import herglotz_motion
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.rules import all_rules
@@ -19,7 +20,7 @@ from herglotz.scenes.scene import Scene, StateFunction
 
 @dataclass(frozen=True)
 class Natural:
-    """L = m|v|²/2 − V(q) − γs and what follows from it: H = |p|²/2m + V(q) + γs, p = mv."""
+    """L = m|v|²/2 − V(q) − γs, with H = |p|²/2m + V(q) + γs and p = mv."""
 
     potential: Callable[[Tensor], Tensor]
     gamma: float
@@ -50,6 +51,7 @@ def scene_without_closed_form(
     force: StateFunction,
     rate: StateFunction,
     rules: Mapping[str, DiscreteLagrangian] | None = None,
+    external: External | None = None,
     **fields: Any,
 ) -> Scene:
     """The scene whose flow and exact L_d are computed, from L with its derivatives written out.
@@ -61,11 +63,19 @@ def scene_without_closed_form(
         tests hold them to `contact_vector_field` of the Hamiltonian.
     rules
         Discretisations beside the general ones of `rules.py`, or instead of those of the same name.
+    external
+        f(q, v), (..., n), a force beside the Lagrangian's: the rules carry it, and there is no exact L_d.
     fields
         The other fields of `Scene`.
     """
-    motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
-    offered = {**all_rules(lagrangian), **(rules or {})}
+    general = all_rules(lagrangian)
+    if external is None:
+        motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
+    else:
+        general = {name: ForcedRule(rule, external) for name, rule in general.items()}
+        whole = lambda q, v, s: force(q, v, s) + external(q, v)  # noqa: E731
+        motion = herglotz_motion(lagrangian, momentum, velocity, whole, rate)
+    offered = {**general, **(rules or {})}
     return Scene(
         lagrangian=lagrangian,
         momentum=momentum,
@@ -74,6 +84,7 @@ def scene_without_closed_form(
         L_d=offered["midpoint_heun"],
         exact=False,
         L_d_rules=offered,
-        numerical=exact_discrete_lagrangian(motion),
+        numerical=None if external else exact_discrete_lagrangian(motion),
+        external=external,
         **fields,
     )

@@ -21,12 +21,12 @@ Derivative = Callable[[Tensor], Tensor]
 # |weights|: 26 with these six columns; two more would gain order and make it 119, above the tolerance at h ≥ 5.
 SEQUENCE = (2, 4, 6, 8, 10, 12)
 
-HOPELESS = 8  # substeps with which a sample that is still not finite is given up
+HOPELESS = 8  # a sample that is not finite with this many substeps is given up
 
 
 @dataclass(frozen=True)
 class ReferenceSolution:
-    """The end state of each sample and how far to trust it."""
+    """The end state of each sample and its estimated error."""
 
     q1: Tensor  # (..., n)
     p1: Tensor  # (..., n)

@@ -7,9 +7,12 @@ import math
 from collections.abc import Callable
 
 from herglotz.errors import InputError
+from herglotz.scenes.cart_pole import cart_pole
 from herglotz.scenes.chain import chain
 from herglotz.scenes.double_pendulum import double_pendulum
+from herglotz.scenes.driven_duffing import driven_duffing
 from herglotz.scenes.driven_pendulum import driven_pendulum
+from herglotz.scenes.duffing import duffing
 from herglotz.scenes.kepler import kepler
 from herglotz.scenes.linear_drag import linear_drag
 from herglotz.scenes.nonlinear_action import nonlinear_action
@@ -19,21 +22,28 @@ from herglotz.scenes.pendulum import damped_pendulum
 from herglotz.scenes.quadratic_drag import quadratic_drag
 from herglotz.scenes.rigid_body import rigid_body
 from herglotz.scenes.scene import Scene
+from herglotz.scenes.servo_axis import servo_axis
+from herglotz.scenes.van_der_pol import van_der_pol
 
 SCENES: dict[str, Callable[..., Scene]] = {
     make.__name__: make
     for make in (
+        cart_pole,
         chain,
         damped_oscillator,
         damped_pendulum,
         double_pendulum,
+        driven_duffing,
         driven_pendulum,
+        duffing,
         kepler,
         linear_drag,
         nonlinear_action,
         parachute,
         quadratic_drag,
         rigid_body,
+        servo_axis,
+        van_der_pol,
     )
 }
 

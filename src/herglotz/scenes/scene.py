@@ -44,6 +44,9 @@ class Scene:
         The exact L_d computed by shooting (`herglotz.scenes.exact`), for a scene without a closed form.
     examples
         Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
+    external
+        f(q, v), (..., n): a force beside the Lagrangian's, ṗ = L_q + L_s p + f; None: none, and the flow is a contact
+        flow. Where it stands for a set-valued force, `flow` has the force itself and this its smoothed form.
     at, drive
         Of a scene with inputs: the scene at the inputs u, (..., m), held constant, and the given inputs, t (...) ↦ u.
     """
@@ -73,6 +76,7 @@ class Scene:
     examples: tuple[Mapping[str, float], ...] = ()
     at: Callable[[Tensor], Scene] | None = None
     drive: Callable[[Tensor], Tensor] | None = None
+    external: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @property
     def L_d_exact(self) -> DiscreteLagrangian | None:

@@ -215,7 +215,7 @@ class StepOfModel:
         return (x @ torch.linalg.inv_ex(self.maker.mass)[0]) * (k.h[..., None] / k.minus_root)
 
     def at(self, x: Tensor, point: Point) -> Point:
-        """The point with velocity and momentum those of x, the rest as it is."""
+        """Return the point with the velocity and momentum of x, and its other entries unchanged."""
         v = (x if self.increments else x - self.q0) * self.constants.rate
         mv = v if v.shape[-1] == 1 else v @ self.maker.mass
         return Point(point.F, point.J, (v, mv, *point.rest[2:]))

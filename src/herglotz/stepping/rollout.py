@@ -168,7 +168,7 @@ def _write(buffers: Block, block: Block, start: int) -> None:
 
 
 class _Progress:
-    """A bar in a terminal for what takes longer than two seconds."""
+    """A progress bar in a terminal for a rollout of more than two seconds."""
 
     def __init__(self, steps: int):
         self.steps, self.count, self.bar = steps, 0, None

@@ -19,6 +19,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
+from herglotz.training.predict import Prediction, predict
 
 FORMAT = 1
 
@@ -73,6 +74,10 @@ class Run:
     def stepper(self) -> Stepper:
         """The trained time stepper, with Newton's tolerance as tuned."""
         return Stepper(self.model, tol=self.setting.get("tol"))
+
+    def predict(self, data: Trajectories, **settings: Any) -> Prediction:
+        """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
+        return predict(self, data, **settings)
 
 
 def save_run(run: Run, folder: str | Path) -> None:

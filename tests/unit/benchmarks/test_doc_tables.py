@@ -1,31 +1,15 @@
 """Tables of the docs are made by a command from the stored results."""
 
-import importlib
-import sys
-from pathlib import Path
-
-import pytest
-
-FOLDER = Path(__file__).resolve().parents[3] / "benchmarks"
-MODULES = ("doc_tables", "extremes", "work_precision_report")
+from benchmarks import doc_tables, extremes, work_precision
 
 
-@pytest.fixture(scope="module")
-def benchmark():
-    sys.path.insert(0, str(FOLDER))
-    yield {name: importlib.import_module(name) for name in MODULES}
-    sys.path.remove(str(FOLDER))
-    for name in MODULES:
-        sys.modules.pop(name, None)
-
-
-def test_the_pages_hold_what_the_results_hold(benchmark):
+def test_the_pages_hold_what_the_results_hold():
     # fails if results are stored anew and `python benchmarks/doc_tables.py` is not run, or a number is typed in
-    for page, text in benchmark["doc_tables"].documents().items():
+    for page, text in doc_tables.documents().items():
         assert page.read_text() == text, f"{page}: run python benchmarks/doc_tables.py"
 
 
-def test_what_a_term_costs_is_against_the_scenes_own(benchmark):
+def test_what_a_term_costs_is_against_the_scenes_own():
     # fails if a ratio is turned over, another scene's model is compared with, or a weight of 16 bits counts as a term
     def point(kind, us, error, **more):
         return {"kind": kind, "setting": kind[9:] + ", h 0.5, C float64", "us_per_time": us, "median": error, "h": 0.5,
@@ -37,20 +21,20 @@ def test_what_a_term_costs_is_against_the_scenes_own(benchmark):
                    point("learned, no correction", 1.0, None), point("learned, bf16 weights", 1.0, 1e-3)],
         "chain": [point("learned", 8.0, 1e-2, **own), point("learned, level conservative", 4.0, 0.1)],
     }  # fmt: skip
-    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in benchmark["work_precision_report"].terms(scenes)[5:]]
+    rows = [[x.strip() for x in line.split("|")[1:-1]] for line in work_precision.terms(scenes)[5:]]
     assert [row[1] for row in rows if not row[0]] == ["no damping", "no correction", "no damping"]
     assert [row[2:] for row in rows] == [["2", "0.001", ""], ["1", "0.1", "0.5, 1e+02"], ["0.5", "fails", "0.25, –"],
                                          ["4", "0.01", ""], ["2", "0.1", "0.5, 10"]]  # fmt: skip
 
 
-def test_levels_against_the_one_that_the_scene_names(benchmark):
+def test_levels_against_the_one_that_the_scene_names():
     # fails if the named level is not the unit, or a range is not that of the seeds
     def row(level, us, errors):
         fit = {} if not errors else {"errors": errors, "median_error": errors[1]}
         return {"scene": "a", "needs": "linear", "level": level, "c_us": us, "eager_us": 100.0, **fit}
 
     rows = [row("conservative", 1.0, [0.2, 0.4, 0.8]), row("linear", 2.0, [0.1, 0.2, 0.3]), row("full", 8.0, [])]
-    lines = benchmark["extremes"].terms_table(rows)[2:]
+    lines = extremes.terms_table(rows)[2:]
     assert "0.4 (0.2–0.8) | × 2, × 0.5 |" in lines[0]
     assert "**linear**" in lines[1]
     assert lines[1].endswith("0.2 (0.1–0.3) |  |")

@@ -1,27 +1,19 @@
-"""The figures of the sources that `benchmarks/peers.py --reproduce` measures."""
-
-# pyright: reportMissingImports=false
-# (benchmarks are scripts: their folder is put on the path below)
+"""The figures of the sources that `benchmarks/peers --reproduce` measures."""
 
 import math
-import sys
-from pathlib import Path
 
 import pytest
 import torch
 
-ROOT = Path(__file__).resolve().parents[3]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-
-import peers  # noqa: E402
-from peer_models import report, reproduce  # noqa: E402
-from peer_models.discrete import DiscreteLagrangian  # noqa: E402
-from peer_models.known_equation import Equation  # noqa: E402
-from peer_models.lagrangian import acceleration  # noqa: E402
-from peer_models.networks import Scales  # noqa: E402
-from peer_models.reproduce import discrete, lagrangian  # noqa: E402
-from peer_models.reproduce.figures import Figure, at_most_twice, read_off, spread  # noqa: E402
-from peer_models.reproduce.smoothing import smoothed  # noqa: E402
+from benchmarks.peers import __main__ as peers
+from benchmarks.peers import report, reproduce
+from benchmarks.peers.continuous import acceleration
+from benchmarks.peers.discrete import DiscreteLagrangian
+from benchmarks.peers.known_equation import Equation
+from benchmarks.peers.networks import Scales
+from benchmarks.peers.reproduce import discrete, lagrangian
+from benchmarks.peers.reproduce.figures import Figure, at_most_twice, read_off, spread
+from benchmarks.peers.reproduce.smoothing import smoothed
 
 
 @pytest.mark.parametrize("task", reproduce.TASKS)

@@ -54,7 +54,7 @@ def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     assert "note" not in capsys.readouterr().err
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--q0", "0.1", "--p0", "30"]) == 0
-        assert "note: from step 0 on, the motion is not always among the states" in capsys.readouterr().err
+        assert "note: from step 0 on, the motion leaves the range of states" in capsys.readouterr().err
 
 
 def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys):

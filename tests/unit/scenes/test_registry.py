@@ -24,7 +24,7 @@ def test_scene_is_the_function():
 
 def test_unknown_scene():
     # fails if the message does not list the names to choose from
-    with pytest.raises(InputError, match="unknown scene 'pendulum'; choose one of chain, damped_oscillator, damped_p"):
+    with pytest.raises(InputError, match="unknown scene 'pendulum'; choose one of cart_pole, chain, damped_o"):
         scene("pendulum")
 
 
@@ -51,6 +51,12 @@ def test_value_that_is_no_number(value):
         ("quadratic_drag", {"m": -2.0}, "quadratic_drag: mass m must be > 0, got -2.0"),
         ("quadratic_drag", {"lam": 0.0}, "quadratic_drag: drag lam must not be 0, got 0.0"),
         ("kepler", {"m": 0.0}, "kepler: mass m must be > 0, got 0.0"),
+        ("cart_pole", {"length": 0.0}, "cart_pole: length must be > 0, got 0.0"),
+        ("driven_duffing", {"beta": 0.0}, "driven_duffing: cubic stiffness beta must be > 0, got 0.0"),
+        ("duffing", {"beta": -1.0}, "duffing: cubic stiffness beta must be > 0, got -1.0"),
+        ("servo_axis", {"m": 0.0}, "servo_axis: mass m must be > 0, got 0.0"),
+        ("servo_axis", {"dry": -1.0}, "servo_axis: dry friction must be >= 0, got -1.0"),
+        ("van_der_pol", {"mu": 0.0}, "van_der_pol: mu must be > 0, got 0.0"),
         ("chain", {"masses": 2.5}, "chain: masses must be a whole number >= 1, got 2.5"),
         ("chain", {"masses": 0}, "chain: masses must be a whole number >= 1, got 0"),
         ("chain", {"m": -1.0}, "chain: mass m must be > 0, got -1.0"),

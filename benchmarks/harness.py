@@ -1,0 +1,172 @@
+"""What all benchmarks share: flags, the machine, one JSON file that runs add to, tables and pictures.
+
+Every command writes `NAME.json`, what was measured, and `NAME.md`, the table made from it. What an earlier run measured
+is kept, so that parts can be run alone and an interrupted run goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import math
+import os
+import platform
+import statistics
+import subprocess
+import time
+from collections.abc import Callable, Iterable, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from herglotz.data.files import write_atomically
+
+ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "benchmarks" / "results"
+DATA = ROOT.parent / "shared" / "data"  # measured recordings; data/README.md says where to get them
+DIGITS = 6  # significant ones of a stored number: more than any table shows
+PACKED, ABSENT = 30, "-"  # dictionaries from which on they are stored as a table; what a row has not
+COLOURS, DPI = 32, 100  # of pictures: enough for lines and text, a third of the size
+
+
+def parser(text: str | None, *, quick: bool = False) -> argparse.ArgumentParser:
+    """Flags of a command: `--out`, and `--quick` where there is a short form; torch is set to one thread.
+
+    Small matrices on several threads only wait for one another; OMP_NUM_THREADS sets another number.
+    """
+    torch.set_num_threads(int(os.environ.get("OMP_NUM_THREADS", "1")))
+    made = argparse.ArgumentParser(description=text, formatter_class=argparse.RawDescriptionHelpFormatter)
+    made.add_argument("--out", type=Path, help="the JSON file, or a folder for it (default benchmarks/results)")
+    if quick:
+        made.add_argument("--quick", action="store_true", help="a test run: shorter, fewer sizes; default runs/quick")
+    return made
+
+
+def json_file(arguments: argparse.Namespace, name: str) -> Path:
+    """The JSON file that `--out` means: itself, or `name`.json in a folder, which is made."""
+    out = arguments.out or (ROOT / "runs" / "quick" if getattr(arguments, "quick", False) else RESULTS)
+    path = out if out.suffix == ".json" else out / f"{name}.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def chosen(made: argparse.ArgumentParser, given: str | None, known: Iterable[str], what: str) -> list[str]:
+    """Names given with commas, all where none are given; an unknown one ends the command."""
+    known = list(known)
+    names = [name.strip() for name in given.split(",")] if given else known
+    if unknown := [name for name in names if name not in known]:
+        made.error(f"unknown {what} {unknown[0]!r}; choose from {', '.join(known)}")
+    return names
+
+
+def commit() -> str:
+    """Short name of the commit that is measured."""
+    words = ["git", "rev-parse", "--short", "HEAD"]
+    return subprocess.run(words, capture_output=True, text=True, cwd=ROOT, check=False).stdout.strip()
+
+
+def conditions(*packages: str) -> dict[str, Any]:
+    """Commit, machine with its load, and versions of torch, python and these packages."""
+    lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []
+    processor = next((x.split(":", 1)[1].strip() for x in lines if x.startswith("model name")), platform.machine())
+    machine = {"processor": processor, "cores": os.cpu_count(), "threads": torch.get_num_threads()}
+    versions = {"python": platform.python_version()} | {name: _version(name) for name in ("torch", *packages)}
+    return {"commit": commit(), "machine": machine | {"load": os.getloadavg()}, "versions": versions}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:
+    """Processor time of all threads: what another program takes from this one does not count."""
+    begin = clock()
+    with torch.no_grad():
+        run()
+    return clock() - begin
+
+
+def load(path: Path, empty: dict[str, Any]) -> dict[str, Any]:
+    """What earlier runs stored, or `empty`."""
+    return json.loads(path.read_text(encoding="utf-8"), object_hook=_unpacked) if path.is_file() else empty
+
+
+def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
+    """Write the JSON, and the table beside it; each file appears whole or not at all."""
+    write_atomically(path, (_json(result, 0) + "\n").encode())
+    if text is not None:
+        write_atomically(path.with_suffix(".md"), (text.rstrip("\n") + "\n").encode())
+
+
+def _json(value: Any, depth: int) -> str:
+    """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper; many alike as a table."""
+    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
+    alike = len(inside) > 0 and all(isinstance(x, dict) for x in inside)
+    if alike and len(inside) >= PACKED:
+        columns = list(dict.fromkeys(k for x in inside for k in x))
+        rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
+        packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
+        return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
+    if (isinstance(value, dict) and depth < 2 and value) or (isinstance(value, list) and alike):
+        return _lines(value, depth + 1)
+    return json.dumps(_rounded(value), ensure_ascii=False)
+
+
+def _lines(value: Any, depth: int) -> str:
+    """A dictionary or a list, each of its values on a line of its own."""
+    if isinstance(value, dict):
+        pairs = (f"{json.dumps(k, ensure_ascii=False)}: {_json(v, depth)}" for k, v in value.items())
+        return "{\n" + ",\n".join(pairs) + "}"
+    return "[\n" + ",\n".join(_json(v, 9) for v in value) + "]"
+
+
+def _rounded(value: Any) -> Any:
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}") if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {k: _rounded(v) for k, v in value.items()}
+    return [_rounded(x) for x in value] if isinstance(value, list | tuple) else value
+
+
+def _unpacked(found: dict[str, Any]) -> Any:
+    """The dictionaries of a table."""
+    if found.keys() != {"columns", "rows"}:
+        return found
+
+    def one(row: list[Any]) -> dict[str, Any]:
+        return {k: v for k, v in zip(found["columns"], row, strict=True) if v != ABSENT}
+
+    rows = found["rows"]
+    return {k: one(row) for k, row in rows.items()} if isinstance(rows, dict) else [one(row) for row in rows]
+
+
+def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
+    """Lines of a markdown table."""
+    lines = [f"| {' | '.join(head)} |", "|" + "---|" * len(head)]
+    return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
+
+
+def spread(values: Iterable[float | None], digits: str = ".1e", between: str = " – ") -> str:
+    """Median and range over the seeds, the median alone of one seed, or "failed"."""
+    known = [x for x in values if x is not None]
+    if not known:
+        return "failed"
+    middle = f"{statistics.median(known):{digits}}"
+    return middle if len(known) == 1 else f"{middle} ({min(known):{digits}}{between}{max(known):{digits}})"
+
+
+def picture(figure: Any, path: Path) -> None:
+    """Write a figure as PNG of few colours."""
+    from PIL import Image
+
+    whole, small = io.BytesIO(), io.BytesIO()
+    figure.savefig(whole, format="png", dpi=DPI)
+    image = Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    image.save(small, format="png", optimize=True)
+    write_atomically(path, small.getvalue())

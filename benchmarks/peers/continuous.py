@@ -1,0 +1,229 @@
+"""Peers that fit a vector field: Hamiltonian networks, Lagrangian networks and the neural ODE.
+
+S. Greydanus, M. Dzamba, J. Yosinski, "Hamiltonian neural networks", NeurIPS 2019 (arXiv:1906.01563):
+q̇ = ∂H/∂p, ṗ = −∂H/∂q, fitted to rates.
+
+A. Sosanya, S. Greydanus, "Dissipative Hamiltonian neural networks", 2022 (arXiv:2201.10085): a second scalar D adds
+its gradient, q̇ = ∂H/∂p + ∂D/∂q, ṗ = −∂H/∂q + ∂D/∂p.
+
+M. Cranmer, S. Greydanus, S. Hoyer, P. Battaglia, D. Spergel, S. Ho, "Lagrangian neural networks", 2020
+(arXiv:2003.04630): L(q, v) is one network and v̇ = (∂²L/∂v²)⁻¹ (∂L/∂q − ∂²L/∂q∂v v). Here the network is added to
+½|v|² at the start, so that the first Hessian is regular.
+
+M. Lutter, C. Ritter, J. Peters, "Deep Lagrangian networks", ICLR 2019 (arXiv:1907.04490): L = ½ vᵀM(q)v − V(q) with M
+from its Cholesky factor; with the viscous friction of each joint that Lutter, Listmann and Peters (IROS 2019) add. As
+no torque is measured the forward model is fitted, v̇ against accelerations.
+
+Neural ODE, v̇ = net(q, v): R. Chen, Y. Rubanova, J. Bettencourt, D. Duvenaud, NeurIPS 2018 (arXiv:1806.07366).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from .networks import Network, Scales, count, fit_rates, gradient, scales_of, split, train
+from .rollouts import Flow, rk4
+from .samples import Samples
+
+WINDOW = 9  # samples of a window of the neural ODE
+FINEST = 0.25  # its Runge–Kutta step at most, in units of velocity over acceleration
+
+
+class Hamiltonian:
+    """H(q, p), and D(q, p) where dissipative, as networks that `network` makes for a number of inputs."""
+
+    def __init__(self, scales: Scales, network: Callable[[int], nn.Module], *, dissipative: bool):
+        inputs = scales.q_inputs + len(scales.angles)
+        self.scales, self.energy = scales, float((scales.v * scales.v).mean())
+        self.H = network(inputs)
+        self.D = network(inputs) if dissipative else None
+        self.parameters = [*self.H.parameters(), *(self.D.parameters() if self.D else ())]
+
+    def rates(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        """(q̇, ṗ) at (q, p), (B, n) each."""
+        q, p = q.requires_grad_(), p.requires_grad_()
+        x = self.scales.of_state(q, p)
+        H_q, H_p = torch.autograd.grad(self.energy * self.H(x).sum(), (q, p), create_graph=True)
+        if self.D is None:
+            return H_p, -H_q
+        D = self.energy * self.D(x)
+        return H_p + gradient(D, q), -H_q + gradient(D, p)
+
+
+def train_hnn(samples: Samples, seed: int, budget: float, *, dissipative: bool = False) -> Flow:
+    """Fit H to rates; the momentum is the velocity where only positions were given."""
+    generator = torch.Generator().manual_seed(seed)
+    motion = samples.motion()
+    scales = Scales.of(samples.angles, torch.cat(samples.q), motion.p, motion.f)
+    model = Hamiltonian(scales, lambda inputs: Network(inputs, 1, generator), dissipative=dissipative)
+    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=True)
+
+
+def train_dissipative_hnn(samples: Samples, seed: int, budget: float) -> Flow:
+    """Fit H and D to rates."""
+    return train_hnn(samples, seed, budget, dissipative=True)
+
+
+def acceleration(L: Tensor, q: Tensor, v: Tensor, force: Tensor | None = None) -> Tensor:
+    """v̇ of the Euler–Lagrange equation with a force on its right-hand side, (B, n); L is (B,) at (q, v)."""
+    L_q, L_v = torch.autograd.grad(L.sum(), (q, v), create_graph=True)
+    rows = [
+        torch.autograd.grad(L_v[:, i].sum(), (q, v), create_graph=True, materialize_grads=True)
+        for i in range(q.shape[1])
+    ]
+    mixed, mass = (torch.stack([row[k] for row in rows], 1) for k in (0, 1))
+    right = L_q - (mixed @ v[..., None])[..., 0]
+    return torch.linalg.solve_ex(mass, right if force is None else right + force)[0]
+
+
+class FreeLagrangian:
+    """L(q, v) = E [½|v/σ|² + net(q, v)]; `kinetic` is the weight of the first term."""
+
+    def __init__(self, scales: Scales, network: Callable[[int], nn.Module], *, kinetic: float = 1.0):
+        self.scales, self.kinetic = scales, kinetic
+        self.net = network(scales.q_inputs + len(scales.angles))
+        self.parameters = list(self.net.parameters())
+
+    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(v, v̇) at (q, v)."""
+        q, v = q.requires_grad_(), v.requires_grad_()
+        L = self.kinetic * (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
+        return v, acceleration(L, q, v)
+
+
+class DeepLagrangian:
+    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate where asked for.
+
+    The diagonal of C is softplus(net + `shift`) + `least`; with the defaults M is near 1 at the start.
+    """
+
+    def __init__(
+        self,
+        scales: Scales,
+        generator: torch.Generator,
+        *,
+        friction: bool = True,
+        shift: float = 0.54,
+        least: float = 0.0,
+    ):
+        n = len(scales.angles)
+        self.shift, self.least = shift, least
+        self.scales, self.index = scales, torch.tril_indices(n, n)
+        self.factor = Network(scales.q_inputs, self.index.shape[1], generator)
+        self.potential = Network(scales.q_inputs, 1, generator)
+        self.parameters: list[Tensor] = [*self.factor.parameters(), *self.potential.parameters()]
+        self.log_friction = torch.full((n,), -3.0 if friction else -torch.inf, dtype=torch.float64)
+        if friction:
+            self.parameters.append(self.log_friction.requires_grad_())
+
+    def mass(self, q: Tensor) -> Tensor:
+        """M(q) in units of the scaled velocity, (B, n, n), positive definite."""
+        n = q.shape[1]
+        entries = self.factor(self.scales.of_q(q))
+        C = entries.new_zeros(len(q), n, n)
+        C[:, self.index[0], self.index[1]] = entries
+        diagonal = nn.functional.softplus(C.diagonal(dim1=-2, dim2=-1) + self.shift) + self.least  # softplus(0.54) = 1
+        C = C.tril(-1) + torch.diag_embed(diagonal)
+        return C @ C.mT + 1e-3 * torch.eye(n, dtype=q.dtype)
+
+    def equation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(M, r) of M ẇ = r + σ τ for the scaled velocity w = v/σ and a torque τ; (B, n, n) and (B, n)."""
+        q = q.requires_grad_()
+        w = v / self.scales.v
+        M = self.mass(q)
+        V_q = gradient(self.potential(self.scales.of_q(q)), q)
+        Mw = (M @ w[..., None])[..., 0]
+        # d/dt (M w) = Ṁ w + M ẇ and ∂T/∂q = ½ wᵀ M_q w, in scaled velocities; S = diag(σ) takes rates back to v.
+        M_q_w = torch.stack([gradient(Mw[:, i], q) for i in range(q.shape[1])], 1)
+        M_dot_w = (M_q_w @ v[..., None])[..., 0]
+        T_q = gradient((w.detach() * (M @ w.detach()[..., None])[..., 0]).sum(-1) / 2, q)
+        return M, self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
+
+    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(v, v̇) at (q, v) without torque."""
+        M, right = self.equation(q, v)
+        return v, self.scales.v * torch.linalg.solve_ex(M, right)[0]
+
+    def torque(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
+        """The torque (B, n) of the motion, the inverse model that Lutter et al. train."""
+        M, right = self.equation(q, v)
+        return ((M @ (a / self.scales.v)[..., None])[..., 0] - right) / self.scales.v
+
+
+def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
+    """Fit one network L(q, v) to accelerations."""
+    generator = torch.Generator().manual_seed(seed)
+    scales = scales_of(samples, samples.motion())
+    model = FreeLagrangian(scales, lambda inputs: Network(inputs, 1, generator, nn.Softplus()))
+    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
+
+
+def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
+    """Fit M(q), V(q) and friction to accelerations."""
+    generator = torch.Generator().manual_seed(seed)
+    model = DeepLagrangian(scales_of(samples, samples.motion()), generator)
+    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
+
+
+def integrator(field: Callable[[Tensor], Tensor], h: float, parts: int) -> Callable[[Tensor], Tensor]:
+    """One step of length h: torchdiffeq's fixed-step rk4 where it is installed, else the classical one."""
+    try:
+        from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        return lambda y: rk4(field, y, h, parts)
+    times = torch.linspace(0.0, h, parts + 1, dtype=torch.float64)
+
+    def step(y: Tensor) -> Tensor:
+        out: Any = odeint(lambda t, y: field(y), y, times, method="rk4")  # noqa: ARG005
+        return out[-1]
+
+    return step
+
+
+def train_neural_ode(samples: Samples, seed: int, budget: float) -> Flow:
+    """Neural ODE fitted to the samples of short windows.
+
+    Loss: squared error of the positions at every sample of a window (and of the velocities where exact ones are given).
+    Without velocities the one at the start of each window is trained too, from its finite difference.
+    """
+    generator, n, h = torch.Generator().manual_seed(seed), samples.dof, samples.h
+    scales = scales_of(samples, samples.motion())
+    net = Network(scales.q_inputs + n, n, generator)
+    weights = list(net.parameters())
+
+    def field(y: Tensor) -> Tensor:
+        q, v = y[:, :n], y[:, n:]
+        return torch.cat([v, scales.a * net(scales.of_state(q, v))], -1)
+
+    parts = max(1, round(h / (FINEST * float((scales.v / scales.a).min()))))
+    step = integrator(field, h, parts)
+    length = min(WINDOW, max(len(q) for q in samples.q))
+
+    def error(y: Tensor, data: Tensor, first: int, last: int) -> Tensor:
+        """Mean square of samples first … last − 1 of windows that start at y, over the spread of what is measured."""
+        seen, total = data.shape[-1], torch.zeros((), dtype=torch.float64)
+        spread = torch.cat([scales.q, scales.v])[:seen]
+        for k in range(1, last):
+            y = step(y)
+            if k >= first:
+                total = total + ((y[:, :seen] - data[:, k]) / spread).square().mean()
+        return total / (last - first)
+
+    if samples.exact is not None:
+        states = [torch.cat([m.q, m.v], -1) for m in samples.exact]
+        data = torch.cat([x.unfold(0, length, length - 1).transpose(1, 2) for x in states if len(x) >= length])
+        rows, held = split(len(data), generator)
+        exact = lambda i: error(data[i, 0], data[i], 1, length)  # noqa: E731
+        train(lambda i: exact(rows[i]), len(rows), lambda: exact(held), weights, generator, budget)
+        return Flow(field, h, parts, count(weights), step)
+    data = samples.windows(length)
+    start = ((-1.5 * data[:, 0] + 2 * data[:, 1] - 0.5 * data[:, 2]) / h).requires_grad_()
+    loss = lambda i, first, last: error(torch.cat([data[i, 0], start[i]], -1), data[i], first, last)  # noqa: E731
+    # The last sample of each window judges: its start is trained, so held-out windows would have none.
+    judge, fit = (lambda: loss(slice(None), length - 1, length)), (lambda i: loss(i, 1, length - 1))
+    train(fit, len(data), judge, [*weights, start], generator, budget)
+    return Flow(field, h, parts, count(weights), step)

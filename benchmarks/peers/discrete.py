@@ -1,0 +1,145 @@
+"""Peers that step from positions only: discrete Lagrangian networks, without and with forces, and a plain step map.
+
+Conservative: Y. Lishkova, P. Scherer, S. Ridderbusch, M. Jamnik, P. Liò, S. Ober-Blöbaum, C. Offen, "Discrete
+Lagrangian neural networks with automatic symmetry discovery", IFAC 2023 (arXiv:2211.10830). L_d(q0, q1) is one network,
+fitted to the discrete Euler–Lagrange equation D₂L_d(q0, q1) + D₁L_d(q1, q2) = 0. A constant solves it, so L_d is
+normalised at base points as in C. Offen (arXiv:2404.19626): the mixed derivative D₁D₂L_d there is that of a unit mass.
+
+With forces: M. D. Hansen, E. Celledoni, B. K. Tapley, "Learning mechanical systems from real-world data using discrete
+forced Lagrangian dynamics", 2025 (arXiv:2505.20370): L_d = h L(q̄, Δ) at the midpoint q̄ and Δ = (q1 − q0)/h, forces
+F± = ½h F(q̄, Δ), and D₂L_d(q0, q1) + D₁L_d(q1, q2) + F⁺(q0, q1) + F⁻(q1, q2) = 0, with a penalty that keeps L regular.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from .networks import Network, Scales, count, split, train
+from .rollouts import ThreePoint
+from .samples import Samples
+
+REGULAR = 1.0  # weight of the penalty
+ANCHORS = 128  # base points
+
+
+def scales_of_triples(samples: Samples) -> Scales:
+    """Spreads of the middle position, of the difference and of the second difference of triples."""
+    q0, q1, q2 = samples.triples()
+    return Scales.of(samples.angles, q1, (q1 - q0) / samples.h, (q2 - 2 * q1 + q0) / samples.h**2)
+
+
+class DiscreteLagrangian:
+    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1.
+
+    `kinetic` is the weight of the first term.
+    """
+
+    def __init__(
+        self, scales: Scales, h: float, net: nn.Module, force: nn.Module | None = None, *, kinetic: float = 1.0
+    ):
+        self.h, self.scales, self.net, self.force, self.kinetic = h, scales, net, force, kinetic
+        self.weights = [*net.parameters(), *(force.parameters() if force else ())]
+
+    def inputs(self, q0: Tensor, q1: Tensor) -> Tensor:
+        """Network inputs of a pair."""
+        return self.scales.of_state((q0 + q1) / 2, (q1 - q0) / self.h)
+
+    def slopes(self, q0: Tensor, q1: Tensor) -> tuple[Tensor, Tensor]:
+        """(D₁L_d, D₂L_d), (B, n) each, of L_d over h."""
+        v = (q1 - q0) / (self.h * self.scales.v)
+        value = self.kinetic * v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
+        return torch.autograd.grad(value, (q0, q1), create_graph=True)  # type: ignore[return-value]
+
+    def residual(self, q0: Tensor, q1: Tensor, q2: Tensor) -> Tensor:
+        """The (forced) discrete Euler–Lagrange equation, times σ_v² / σ_a: of order one for a unit mass."""
+        q0, q2 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q2))
+        left, right = q1.detach().requires_grad_(), q1.detach().requires_grad_()
+        r = self.slopes(q0, left)[1] + self.slopes(right, q2)[0]
+        r = r * self.scales.v.square() / self.scales.a
+        if self.force is not None:
+            r = r + (self.force(self.inputs(q0, q1)) + self.force(self.inputs(q1, q2))) / 2
+        return r
+
+    def mixed(self, q0: Tensor, q1: Tensor) -> Tensor:
+        """−h² σ D₁D₂L_d σ over h, (B, n, n): the unit matrix for a unit mass."""
+        q0, q1 = (x.detach().requires_grad_() for x in (q0, q1))
+        scale = self.scales.v[:, None] * self.scales.v
+        return -(self.h**2) * scale * jacobian(self.slopes(q0, q1)[0], q1)
+
+
+def jacobian(D1: Tensor, q1: Tensor) -> Tensor:
+    """∂D₁/∂q1 of pairs, (B, n, n)."""
+    rows = [torch.autograd.grad(D1[:, i].sum(), q1, create_graph=True)[0] for i in range(D1.shape[1])]
+    return torch.stack(rows, 1)
+
+
+def regularity(mixed: Tensor) -> Tensor:
+    """Mean (log |det mixed|)² over base points, which leaves the mass free but regular."""
+    return mixed.det().abs().clamp_min(1e-12).log().square().mean()
+
+
+def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, forced: bool = False) -> ThreePoint:
+    """Least squares of the residual with the penalty: |mixed − 1|² at a base point, or `regularity` where forced."""
+    generator = torch.Generator().manual_seed(seed)
+    scales = scales_of_triples(samples)
+    inputs = scales.q_inputs + samples.dof
+    net = Network(inputs, 1, generator, nn.Softplus())
+    model = DiscreteLagrangian(scales, samples.h, net, Network(inputs, samples.dof, generator) if forced else None)
+    q0, q1, q2 = samples.triples()
+    rows, held = split(len(q0), generator)
+    base = rows[torch.randperm(len(rows), generator=generator)[: ANCHORS if forced else 1]]
+    eye = torch.eye(samples.dof, dtype=torch.float64)
+
+    def loss(i: Tensor) -> Tensor:
+        return model.residual(q0[i], q1[i], q2[i]).square().mean()
+
+    def penalty() -> Tensor:
+        mixed = model.mixed(q0[base], q1[base])
+        return regularity(mixed) if forced else (mixed - eye).square().mean()
+
+    fit, judge = (lambda i: loss(rows[i]) + REGULAR * penalty()), (lambda: loss(held) + REGULAR * penalty())
+    train(fit, len(rows), judge, model.weights, generator, budget)
+    return ThreePoint(model.residual, count(model.weights))
+
+
+def train_forced_discrete_lagrangian(samples: Samples, seed: int, budget: float) -> ThreePoint:
+    """With discrete forces."""
+    return train_discrete_lagrangian(samples, seed, budget, forced=True)
+
+
+class StepMap:
+    """q2 = 2q1 − q0 + h² σ_a net(q1, (q1 − q0)/h): a network that predicts the second difference."""
+
+    def __init__(self, samples: Samples, generator: torch.Generator):
+        self.h, self.scales = samples.h, scales_of_triples(samples)
+        self.net = Network(self.scales.q_inputs + samples.dof, samples.dof, generator)
+        self.parameters = count(list(self.net.parameters()))
+
+    def second_difference(self, q0: Tensor, q1: Tensor) -> Tensor:
+        """Predicted (q2 − 2q1 + q0) / (h² σ_a), (B, n)."""
+        return self.net(self.scales.of_state(q1, (q1 - q0) / self.h))
+
+    def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
+        """See `rollouts.Predictor`."""
+        out = [q0, q1]
+        with torch.no_grad():
+            for _ in range(steps):
+                bend = self.h**2 * self.scales.a * self.second_difference(out[-2], out[-1])
+                out.append(2 * out[-1] - out[-2] + bend)
+        return torch.stack(out, 1)
+
+
+def train_mlp(samples: Samples, seed: int, budget: float) -> StepMap:
+    """One-step least squares of the second difference."""
+    generator = torch.Generator().manual_seed(seed)
+    model = StepMap(samples, generator)
+    q0, q1, q2 = samples.triples()
+    target = (q2 - 2 * q1 + q0) / (samples.h**2 * model.scales.a)
+    rows, held = split(len(q0), generator)
+
+    def loss(i: Tensor) -> Tensor:
+        return (model.second_difference(q0[i], q1[i]) - target[i]).square().mean()
+
+    train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), list(model.net.parameters()), generator, budget)
+    return model

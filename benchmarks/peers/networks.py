@@ -1,0 +1,223 @@
+"""Networks, the one training loop that all network peers share, and the fit of a vector field to rates."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+
+from .rollouts import SUBSTEP, Flow
+from .samples import Motion, Samples
+
+WIDTH = 64  # units of each of two hidden layers, for every peer
+BATCH = 256
+LEARNING_RATE = 3e-3  # of Adam, falling as a cosine
+ADAM_PART = 0.6  # of the budget; L-BFGS has the rest
+PATIENCE = 0.35  # part of the budget without a better validation loss after which a fit stops
+ROWS = 2000  # that L-BFGS looks at, at most
+Rates = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (q, y) → (q̇, ẏ), y the velocity or the momentum
+
+
+class Network(nn.Module):
+    """Two hidden layers unless told otherwise; float64; weights from the given generator."""
+
+    def __init__(
+        self,
+        inputs: int,
+        outputs: int,
+        generator: torch.Generator,
+        activation: nn.Module | None = None,
+        hidden: Sequence[int] = (WIDTH, WIDTH),
+    ):
+        super().__init__()
+        sizes = (inputs, *hidden, outputs)
+        layers: list[nn.Module] = []
+        for a, b in pairwise(sizes):
+            linear = nn.Linear(a, b, dtype=torch.float64)
+            with torch.no_grad():
+                linear.weight.copy_(torch.randn(b, a, generator=generator, dtype=torch.float64) / math.sqrt(a))
+                linear.bias.zero_()
+            layers += [linear, activation or nn.Tanh()]
+        self.layers = nn.Sequential(*layers[:-1])
+
+    def forward(self, x: Tensor) -> Tensor:
+        """The network at x, (..., inputs) → (..., outputs)."""
+        return self.layers(x)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """What inputs and targets are divided by, and which coordinates enter as sine and cosine."""
+
+    angles: tuple[bool, ...]
+    middle: Tensor  # (n,) of q
+    q: Tensor  # (n,) spread
+    v: Tensor  # (n,) spread
+    a: Tensor  # (n,) spread
+
+    @classmethod
+    def of(cls, angles: Sequence[bool], q: Tensor, v: Tensor, a: Tensor) -> Scales:
+        """Spreads of points (N, n)."""
+        spread = [x.square().mean(0).sqrt().clamp_min(1e-12) for x in (q - q.mean(0), v, a)]
+        return cls(tuple(angles), q.mean(0), *spread)
+
+    @classmethod
+    def unit(cls, *angles: bool, v: float = 1.0) -> Scales:
+        """No scaling, but of velocities by `v`."""
+        one = torch.ones(len(angles), dtype=torch.float64)
+        return cls(angles, 0 * one, one, v * one, one)
+
+    @property
+    def q_inputs(self) -> int:
+        """Number of inputs that positions make."""
+        return sum(2 if angle else 1 for angle in self.angles)
+
+    def of_q(self, q: Tensor) -> Tensor:
+        """Network inputs of positions: sine and cosine of an angle, a scaled length."""
+        x = (q - self.middle) / self.q
+        columns = []
+        for i, angle in enumerate(self.angles):
+            columns += [q[..., i].sin(), q[..., i].cos()] if angle else [x[..., i]]
+        return torch.stack(columns, -1)
+
+    def of_state(self, q: Tensor, v: Tensor) -> Tensor:
+        """Network inputs of positions and velocities."""
+        return torch.cat([self.of_q(q), v / self.v], -1)
+
+
+def count(parameters: Sequence[Tensor]) -> int:
+    """Number of trained values."""
+    return sum(x.numel() for x in parameters)
+
+
+def train(
+    loss: Callable[[Tensor], Tensor],  # of these rows of the training data
+    rows: int,
+    validation: Callable[[], Tensor] | None,
+    parameters: Sequence[Tensor],
+    generator: torch.Generator,
+    budget: float,  # seconds of processor time
+) -> None:
+    """Adam with minibatches and a falling rate, then L-BFGS; the weights of the best validation loss are kept."""
+    began, parameters = time.process_time(), list(parameters)
+    best, kept, best_at = math.inf, [x.detach().clone() for x in parameters], 0.0
+
+    def used() -> float:
+        return (time.process_time() - began) / budget
+
+    def judge() -> bool:
+        """Whether to go on."""
+        nonlocal best, kept, best_at
+        value = float((validation() if validation else loss(fixed)).detach())
+        if value < best:
+            best, best_at, kept = value, used(), [x.detach().clone() for x in parameters]
+        return used() < 1.0 and used() - best_at < PATIENCE
+
+    fixed = torch.randperm(rows, generator=generator)[:ROWS]
+    optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE)
+    step, going = 0, True
+    while going and used() < ADAM_PART:
+        for group in optimiser.param_groups:
+            group["lr"] = LEARNING_RATE * (0.5 + 0.5 * math.cos(math.pi * used() / ADAM_PART)) + 1e-6
+        optimiser.zero_grad()
+        loss(torch.randint(rows, (min(BATCH, rows),), generator=generator)).backward()
+        nn.utils.clip_grad_norm_(parameters, 10.0)
+        optimiser.step()
+        step += 1
+        if step % 50 == 0:
+            going = judge()
+    judge()
+    _restore(parameters, kept)
+    best_at = used()
+    polish = torch.optim.LBFGS(parameters, max_iter=10, history_size=50, line_search_fn="strong_wolfe")
+
+    def closure() -> Tensor:
+        polish.zero_grad()
+        value = loss(fixed)
+        value.backward()
+        return value
+
+    going = used() < 1.0
+    while going:
+        value = polish.step(closure)  # type: ignore[arg-type]
+        going = bool(torch.isfinite(value)) and judge()
+    _restore(parameters, kept)
+
+
+def _restore(parameters: Sequence[Tensor], values: Sequence[Tensor]) -> None:
+    with torch.no_grad():
+        for x, value in zip(parameters, values, strict=True):
+            x.copy_(value)
+
+
+def split(rows: int, generator: torch.Generator, part: float = 0.12) -> tuple[Tensor, Tensor]:
+    """Rows to train on and rows to validate on, at random."""
+    order = torch.randperm(rows, generator=generator)
+    held = max(1, round(part * rows))
+    return order[held:], order[:held]
+
+
+def gradient(value: Tensor, of: Tensor) -> Tensor:
+    """∂(Σ value)/∂of, differentiable again."""
+    return torch.autograd.grad(value.sum(), of, create_graph=True)[0]
+
+
+def substeps(h: float, scales: Scales) -> int:
+    """Runge–Kutta steps a sample: `SUBSTEP` of the shortest time scale of the data, velocity over acceleration."""
+    return max(1, math.ceil(h / (SUBSTEP * float((scales.v / scales.a).min()))))
+
+
+def scales_of(samples: Samples, motion: Motion) -> Scales:
+    """Spreads of all positions given, of velocities and of accelerations."""
+    return Scales.of(samples.angles, torch.cat(samples.q), motion.v, motion.a)
+
+
+def fit_rates(
+    rates: Rates,
+    parameters: Iterable[Tensor],
+    samples: Samples,
+    generator: torch.Generator,
+    budget: float,
+    *,
+    momentum: bool,
+    velocity_rate: bool = True,
+) -> Flow:
+    """Least squares of (q̇, ẏ) against the data's rates, each divided by its spread.
+
+    Parameters
+    ----------
+    rates
+        The model.
+    parameters
+        What it is trained by.
+    samples, generator, budget
+        See `networks.train`.
+    momentum
+        Whether y is the momentum; else the velocity.
+    velocity_rate
+        Whether q̇ is fitted as well; left out where q̇ = v by construction.
+    """
+    parameters, motion = list(parameters), samples.motion()
+    y, y_rate = (motion.p, motion.f) if momentum else (motion.v, motion.a)
+    scales = scales_of(samples, motion)
+    y_spread = y_rate.square().mean(0).sqrt().clamp_min(1e-12)
+    rows, held = split(len(motion.q), generator)
+
+    def loss(at: Tensor) -> Tensor:
+        q_rate, found = rates(motion.q[at], y[at])
+        value = ((found - y_rate[at]) / y_spread).square().mean()
+        return value + ((q_rate - motion.v[at]) / scales.v).square().mean() if velocity_rate else value
+
+    train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), parameters, generator, budget)
+    n = samples.dof
+
+    def field(state: Tensor) -> Tensor:
+        with torch.enable_grad():
+            return torch.cat(rates(state[:, :n].detach(), state[:, n:].detach()), -1).detach()
+
+    return Flow(field, samples.h, substeps(samples.h, scales), count(parameters), momentum=momentum)

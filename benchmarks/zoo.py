@@ -1,0 +1,89 @@
+"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER] [--json]`.
+
+Each system is drawn from (SEED, index): potential, friction, inputs, step, noise and number of recordings. `herglotz
+fit` runs with its default flags in a process of its own, and is judged by free runs over the unseen third of its
+recordings and over three recordings from unseen starts, in multiples of the noise. Beside it: SINDy, and the true
+equation with its numbers fitted. Rows are kept in FOLDER and are not measured again at the same commit.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shutil
+import sys
+import time
+import warnings
+from pathlib import Path
+from typing import Any
+
+from zoo_systems.drawing import draw
+from zoo_systems.judging import outcome, relative, score
+from zoo_systems.ours import fit_ours, plain
+from zoo_systems.prediction import MechanismModel, own_predictions
+from zoo_systems.report import commit, report, shares
+from zoo_systems.sindy import fit_sindy
+from zoo_systems.systems import ZooSystem
+
+from herglotz.data.files import write_atomically
+
+KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
+
+
+def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
+    """One row of the results."""
+    row = of.facts()
+    for name, fit in (("known", lambda of: MechanismModel(of.fitted)), ("sindy", fit_sindy)):
+        began = time.process_time()
+        found = own_predictions(of, fit(of))
+        row[name] = {"score": score(of, found), "relative": relative(of, found), "cpu_s": time.process_time() - began}
+    ours = fit_ours(of, folder, limit)
+    numbers = {"score": float("inf"), "relative": float("inf")}
+    if ours.predictions is not None:
+        numbers = {"score": score(of, ours.predictions), "relative": relative(of, ours.predictions)}
+    row["ours"] = {**numbers, "cpu_s": ours.cpu, "said": ours.said, **plain(ours.metrics, KEPT)}
+    row["outcome"] = outcome(numbers["score"], numbers["relative"], bool(ours.said))
+    row["ahead_of_sindy"] = numbers["score"] <= max(row["sindy"]["score"], 1.0)
+    return row
+
+
+def line(row: dict[str, Any]) -> str:
+    """A row for people."""
+    numbers = "  ".join(f"{name} {row[name]['score']:8.3g}" for name in ("ours", "sindy", "known"))
+    return f"{row['index']:3d}  {row['outcome']:<15} {numbers}  {row['ours']['cpu_s']:5.0f} s  {row['name']}"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--draw", type=int, default=1, metavar="SEED", help="which zoo (default %(default)s)")
+    parser.add_argument("--count", type=int, default=30, metavar="N", help="systems 0 to N - 1 (default %(default)s)")
+    parser.add_argument("--only", type=int, nargs="+", metavar="I", help="these systems alone")
+    parser.add_argument("--limit", type=float, default=300, metavar="S", help="processor time of a fit (default 300 s)")
+    parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="rows and runs (default %(default)s)")
+    parser.add_argument("--report", type=Path, metavar="FILE", help="write the table there (.md)")
+    parser.add_argument("--again", action="store_true", help="keep rows of other commits too")
+    parser.add_argument("--json", action="store_true", help="print the rows and shares as JSON")
+    arguments = parser.parse_args()
+    warnings.filterwarnings("ignore", category=RuntimeWarning)  # a peer that diverges overflows
+    out: Path = arguments.out
+    path, at = out / f"draw_{arguments.draw}.json", commit()
+    rows = {int(k): row for k, row in json.loads(path.read_text()).items()} if path.is_file() else {}
+    wanted = arguments.only or range(arguments.count)
+    for index in wanted:
+        if index in rows and (arguments.again or rows[index]["commit"] == at):
+            continue
+        folder = out / f"draw_{arguments.draw}" / str(index)
+        shutil.rmtree(folder, ignore_errors=True)
+        rows[index] = {**measure(draw(arguments.draw, index), folder, arguments.limit), "commit": at}
+        out.mkdir(parents=True, exist_ok=True)
+        write_atomically(path, json.dumps(rows, indent=1).encode() + b"\n")
+        print(line(rows[index]), file=sys.stderr, flush=True)
+    chosen = [rows[index] for index in wanted]
+    text = report(chosen, arguments.draw, arguments.limit)
+    if arguments.report:
+        write_atomically(arguments.report, text.encode())
+    print(json.dumps({"shares": shares(chosen), "rows": chosen}, indent=1) if arguments.json else text)
+
+
+if __name__ == "__main__":
+    main()

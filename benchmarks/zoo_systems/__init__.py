@@ -1,0 +1,1 @@
+"""Parts of `benchmarks/zoo.py`: mechanisms drawn at random, their exact motions, peers and the judgement."""

@@ -1,0 +1,64 @@
+"""The table of a zoo: shares, medians, and what failed without saying so."""
+
+from __future__ import annotations
+
+import statistics
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from zoo_systems.judging import OUTCOMES, SILENT
+
+Row = dict[str, Any]
+
+
+def commit() -> str:
+    """The commit of this repository, or "unknown" outside of one."""
+    found = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
+    )
+    return found.stdout.strip() or "unknown"
+
+
+def shares(rows: Sequence[Row]) -> dict[str, float]:
+    """Share of the systems with each outcome, and of those where our free runs are not behind SINDy's."""
+    found = {name: sum(row["outcome"] == name for row in rows) / len(rows) for name in OUTCOMES}
+    return {**found, "ahead of SINDy": sum(row["ahead_of_sindy"] for row in rows) / len(rows)}
+
+
+def report(rows: Sequence[Row], seed: int, limit: float) -> str:
+    """Markdown."""
+    commits = ", ".join(sorted({row["commit"] for row in rows}))
+    medians = {name: statistics.median(row[name]["score"] for row in rows) for name in ("ours", "sindy", "known")}
+    cpu = statistics.median(row["ours"]["cpu_s"] for row in rows)
+    lines = [
+        f"# The zoo: {len(rows)} systems drawn by seed {seed}",
+        "",
+        f"`python benchmarks/zoo.py --draw {seed} --count {len(rows)} --limit {limit:g}` at commit {commits}.",
+        "",
+        "Numbers are errors of free runs over the noise (1: a perfect model; without noise over 1e-4 of the size), the",
+        "worse of two: the unseen third of the training recordings, and three recordings from unseen starts. In",
+        "brackets: over the size of the motion. Known: the true equation with its numbers fitted. Time: of our fit,",
+        "on one processor.",
+        "",
+        "| share | " + " | ".join(shares(rows)) + " |",
+        "|---" * (len(shares(rows)) + 1) + "|",
+        f"| of {len(rows)} | " + " | ".join(f"{100 * x:.0f} %" for x in shares(rows).values()) + " |",
+        "",
+        "Medians: " + ", ".join(f"{name} {value:.3g}" for name, value in medians.items()) + f"; {cpu:.0f} s.",
+        "",
+        "| | system | samples | outcome | ours | SINDy | known | time, s | what the fit said |",
+        "|---" * 9 + "|",
+    ]
+    for row in rows:
+        ours = row["ours"]
+        how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
+        cells = [
+            row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
+            f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
+            *(f"{row[name]['score']:.3g} ({row[name]['relative']:.2g})" for name in ("ours", "sindy", "known")),
+            f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip().replace("|", "/"),
+        ]  # fmt: skip
+        lines.append(f"| {' | '.join(map(str, cells))} |")
+    return "\n".join([*lines, ""])

@@ -1,0 +1,106 @@
+"""SINDy as a peer: sparse regression of smoothed accelerations on a library of polynomials and trigonometric terms.
+
+Local cubic polynomials give position, velocity and acceleration; sequentially thresholded least squares selects. The
+width of the smoothing and the threshold are chosen by free runs over the last fifth of the training part.
+
+Source: S. L. Brunton, J. L. Proctor and J. N. Kutz, PNAS 113 (2016) 3932.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from zoo_systems.mechanisms import Array
+from zoo_systems.prediction import SMOOTH, rk4, roll, start_states, trained
+from zoo_systems.systems import ZooSystem
+
+HALF_WIDTHS = (0.02, 0.05, 0.1, 0.2)  # of the smoothing window, in natural periods; two samples at the least
+THRESHOLDS = (0.0, 0.003, 0.01, 0.03, 0.1)  # of a term's share in the acceleration, relative to its RMS
+RIDGE, ROUNDS = 1e-8, 10
+RECORDED = 0.2  # of the training part, to choose by
+
+
+class SparseModel:
+    """q̈ = Θ(q, q̇, u) ξ."""
+
+    def __init__(self, coefficients: Array, angles: tuple[bool, ...]):
+        self.coefficients, self.angles = coefficients, angles
+
+    def advance(self, q: Array, v: Array, u: Array, h: float) -> tuple[Array, Array]:
+        """One recorded step by RK4."""
+        count = int(np.ceil(h / SMOOTH - 1e-9))
+        for _ in range(count):
+            q, v = rk4(lambda q, v: library(q, v, u, self.angles) @ self.coefficients, q, v, h / count)
+        return q, v
+
+
+def library(q: Array, v: Array, u: Array, angles: tuple[bool, ...]) -> Array:
+    """Candidate terms, (…, T)."""
+    n = q.shape[-1]
+    x, y = [q[..., i] for i in range(n)], [v[..., i] for i in range(n)]
+    terms = [np.ones_like(u), u, *x, *y]
+    for i in range(n):
+        terms += [y[i] * np.abs(y[i]), np.sign(y[i]), x[i] ** 2 * y[i]]
+        terms += [np.sin(x[i]), np.cos(x[i]), np.sin(2 * x[i])] if angles[i] else []
+        for j in range(i, n):
+            terms += [x[i] * x[j], y[i] * y[j]]
+            if j > i:
+                apart = x[i] - x[j]
+                terms += [np.sin(apart), apart**3, y[i] ** 2 * np.sin(apart), y[j] ** 2 * np.sin(apart)]
+                terms += [y[j] ** 2 * np.sin(x[j]), np.sin(2 * x[j])]
+        terms.append(x[i] ** 3)
+    return np.stack(terms, -1)
+
+
+def fit_sindy(of: ZooSystem) -> SparseModel:
+    """The model whose free runs over the last part of the training samples are nearest."""
+    m, angles = trained(of.train), of.mechanism.angles
+    kept = int(m * (1 - RECORDED))
+    models: list[tuple[float, int, SparseModel]] = []
+    for half in sorted({max(2, round(w * of.samples_per_period)) for w in HALF_WIDTHS}):
+        if 2 * half + 1 > kept // 2:
+            continue
+        rows = [_smoothed(of.train.t[:m], q[:m], half) for q in of.train.q]
+        x, y, a = (np.concatenate([row[i] for row in rows]) for i in range(3))
+        terms = library(x, y, np.concatenate([u[half : m - half] for u in of.train.u]), angles)
+        for threshold in THRESHOLDS:
+            model = SparseModel(_thresholded(terms, a, threshold), angles)
+            models.append((_held_out(of, model, kept, m), len(models), model))
+    return min(models)[2]
+
+
+def _smoothed(t: Array, q: Array, half: int) -> tuple[Array, Array, Array]:
+    """Position, velocity and acceleration at the interior samples, from cubics through 2·half + 1 samples."""
+    at = np.arange(half, len(t) - half)
+    near = at[:, None] + np.arange(-half, half + 1)
+    dt = t[near] - t[at][:, None]
+    A = np.stack([dt**k for k in range(min(4, 2 * half) + 1)], -1)
+    c = np.linalg.pinv(A) @ q[near]
+    return c[:, 0], c[:, 1], 2 * c[:, 2]
+
+
+def _thresholded(terms: Array, a: Array, threshold: float) -> Array:
+    """Sequentially thresholded least squares for each coordinate, (T, n)."""
+    scale = np.sqrt(np.mean(terms**2, 0)) + 1e-300
+    found = np.zeros((terms.shape[1], a.shape[1]))
+    for i in range(a.shape[1]):
+        active = scale > 1e-12
+        for _ in range(ROUNDS):
+            X = terms[:, active] / scale[active]
+            c = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(X.shape[1]), X.T @ a[:, i])
+            found[:, i] = 0.0
+            found[active, i] = c / scale[active]
+            small = np.abs(found[:, i] * scale) < threshold * np.sqrt(np.mean(a[:, i] ** 2))
+            if not (small & active).any() or not (active & ~small).any():
+                break
+            active &= ~small
+    return found
+
+
+def _held_out(of: ZooSystem, model: SparseModel, kept: int, m: int) -> float:
+    """Error over the noise of free runs from sample `kept` to the end of the training part; infinite if one is lost."""
+    first = max(0, kept - of.warmup)
+    t, q, u = of.train.t[first:m], of.train.q[:, first:m], of.train.u[:, first:m]
+    warm, n = kept - first, q.shape[-1]
+    x = start_states(model, t[:warm], q[:, :warm], u[:, :warm], of.floor, iterations=5)
+    error = (roll(model, x[:, :n], x[:, n:], t, u) - q)[:, warm:] / of.floor
+    return float(np.nan_to_num(np.sqrt(np.mean(error**2)), nan=np.inf))

@@ -1,0 +1,119 @@
+"""`herglotz predict`: score a trained model on another recording."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from herglotz.cli.common import check_output_file, count, positive, print_json, print_table
+from herglotz.cli.flags import parse_angles
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from herglotz.training.predict import Prediction
+
+WARMUP = 20  # a copy, so that help does not import PyTorch; a test compares
+DESCRIPTION = """\
+Score a trained model on a recording it has not seen: another start, other steps, its own inputs. The state is
+estimated from the first K samples of each trajectory, the model held; from there the model runs on alone, driven by
+the inputs recorded beside the positions. Printed: the RMS error of each coordinate, and the share of the samples that
+the free run did not reach because a step failed.
+
+A recorded step that is longer than those the model was fitted to is crossed in equal model steps. A recording that is
+sampled faster is thinned, its inputs averaged: K counts the samples that are left.
+
+--out FILE writes the predicted motion, and FILE.png beside it: data, free run and their difference.
+With --windows W --horizon T, W windows spread over the recording are scored instead, each K samples and then a free
+run over the time T: for motions that no model follows for long.
+
+examples:
+  herglotz predict runs/pendulum another.csv
+  herglotz predict runs/motor night_shift.csv --warmup 50 --out predicted.csv
+  herglotz predict runs/double_pendulum long.csv --windows 20 --horizon 0.5 --json
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("predict", help="score a run on another recording", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
+    parser.add_argument("data", metavar="DATA", type=Path, help="recording of the same coordinates, in the same units")
+    parser.add_argument(
+        "--warmup", type=count, default=WARMUP, metavar="K",
+        help="samples that the state is estimated from, at least 3 (default %(default)s)",
+    )  # fmt: skip
+    parser.add_argument("--windows", type=count, metavar="W", help="score W windows (with --horizon)")
+    parser.add_argument(
+        "--horizon", type=positive, metavar="T", help="time of the free run in a window, in the data's unit of time"
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write the predicted motion: .csv or .npz, and a .png")
+    parser.add_argument("--angles", metavar="NAMES", help="coordinates that are angles (default: those with unit rad)")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Predict, write, draw, report."""
+    out: Path | None = arguments.out
+    if out is not None:
+        check_output_file(out, (".csv", ".npz"))
+
+    from herglotz.data import load
+    from herglotz.training import load_run
+
+    result = load_run(arguments.source)
+    data = load(arguments.data, angles=parse_angles(arguments.angles))
+    if data.time_unit != result.data.time_unit:
+        raise InputError(
+            f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"
+        )
+    found = result.predict(data, warmup=arguments.warmup, windows=arguments.windows, horizon=arguments.horizon)
+    written = [] if out is None else _write(found, out)
+    if arguments.json:
+        print_json(found.metrics())
+    else:
+        _report(found, arguments)
+        if written:
+            print(f"Written: {', '.join(map(str, written))}")
+    if found.failed_steps > 0:
+        share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
+        print(f"herglotz: note: {share}; the RMS is over the others", file=sys.stderr)
+    return 0
+
+
+def _report(found: Prediction, arguments: argparse.Namespace) -> None:
+    numbers = found.metrics()
+    what = "window" if arguments.windows else "trajectory" if len(found.data) == 1 else "trajectories"
+    print(
+        f"{arguments.source} on {arguments.data}: {len(found.data)} {what}{'s' if arguments.windows else ''}, state "
+        f"from {found.warmup} samples of each, {numbers['predicted_samples']} samples predicted"
+    )
+    each = numbers["rms_per_coordinate"] or dict.fromkeys(found.data.names)
+    rows = [
+        (f"RMS {name}", "not reached" if each[name] is None else f"{each[name]:.4g} {unit}".removesuffix(" 1"))
+        for name, unit in zip(found.data.names, found.data.units, strict=True)
+    ]
+    rows.append(("failed steps", f"{100 * found.failed_steps:.3g} %"))
+    steps = f"at most {found.most_substeps} model steps in a recorded step" if found.most_substeps > 1 else ""
+    if found.every > 1:
+        steps = f"every {found.every} samples of the recording are one step"
+    if found.outside > 0:
+        steps += f"{'; ' if steps else ''}{100 * found.outside:.3g} % are outside of the steps of the training data"
+    print_table([*rows, *([("steps", steps)] if steps else [])])
+
+
+def _write(found: Prediction, out: Path) -> list[Path]:
+    """The predicted motion as far as it goes, and the figure."""
+    from herglotz.data import save
+    from herglotz.plots import save_figure
+    from herglotz.plots.prediction import plot_prediction
+
+    motion: Any = found.motion()
+    written = [] if motion is None else [out]
+    if motion is not None:
+        save(out, motion)
+    picture = out.with_suffix(".png")
+    save_figure(plot_prediction(found), picture)
+    return [*written, picture]

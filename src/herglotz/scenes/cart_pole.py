@@ -1,0 +1,90 @@
+"""A pendulum that hangs from a cart: one length and one angle, and a mass matrix that depends on the angle.
+
+L = (M + m) v_x²/2 + m ℓ cos θ v_x v_θ + m ℓ² v_θ²/2 − m g ℓ (1 − cos θ) − γs, with θ from where the pole hangs. Nothing
+holds the cart: x itself enters nothing, so the momentum p_x falls as e^{−γt}.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.natural import scene_without_closed_form
+from herglotz.scenes.scene import Scene
+
+
+def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float = 9.81, gamma: float = 0.1) -> Scene:
+    """A cart with a hanging pole, one damping rate.
+
+    Parameters
+    ----------
+    cart
+        Mass M of the cart, kg.
+    m
+        Mass at the end of the pole, kg.
+    length
+        Length ℓ of the pole, m.
+    g
+        Gravity, m/s².
+    gamma
+        Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
+
+    Raises
+    ------
+    InputError
+        If a mass or the length is not positive.
+    """
+    for name, value in (("cart", cart), ("m", m), ("length", length)):
+        if not value > 0:
+            raise InputError(f"cart_pole: {name} must be > 0, got {value}")
+    first, third = cart + m, m * length * length
+
+    def second(q: Tensor) -> Tensor:
+        return m * length * torch.cos(q[..., 1])
+
+    def potential(q: Tensor) -> Tensor:
+        return 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2  # 1 − cos θ without its cancellation
+
+    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        vx, vt = v.unbind(-1)
+        kinetic = 0.5 * first * vx**2 + second(q) * vx * vt + 0.5 * third * vt**2
+        return kinetic - potential(q) - gamma * s
+
+    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        (vx, vt), between = v.unbind(-1), second(q)
+        return torch.stack([first * vx + between * vt, between * vx + third * vt], -1)
+
+    def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        (px, pt), between = p.unbind(-1), second(q)
+        determinant = first * third - between * between
+        return torch.stack([third * px - between * pt, first * pt - between * px], -1) / determinant[..., None]
+
+    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        return 0.5 * (p * velocity(q, p, s)).sum(-1) + potential(q) + gamma * s
+
+    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        turn = -m * length * torch.sin(q[..., 1]) * (v[..., 0] * v[..., 1] + g)
+        return torch.stack([torch.zeros_like(turn), turn], -1)
+
+    return scene_without_closed_form(
+        name="cart_pole",
+        description="pendulum that hangs from a cart, one length and one angle; reference flow to about 1e-13",
+        dof=2,
+        coordinates=("x", "theta"),
+        units=("m", "rad"),
+        time_unit="s",
+        angles=(False, True),
+        parameters={"cart": cart, "m": m, "length": length, "g": g, "gamma": gamma},
+        hamiltonian=hamiltonian,
+        lagrangian=lagrangian,
+        momentum=momentum,
+        velocity=velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        q_range=((-0.5, -1.2), (0.5, 1.2)),
+        v_range=((-0.5, -2.0), (0.5, 2.0)),
+        h=0.05,
+        examples=({"cart": 1.3, "m": 0.6, "length": 0.8, "g": 4.0, "gamma": 0.4},),
+    )

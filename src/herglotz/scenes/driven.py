@@ -1,0 +1,124 @@
+"""Scenes with one coordinate and a force that is given: a discrete Lagrangian for each step.
+
+L = v²/2 − V(q) + u q − γs with mass m. The force u is given and held over a step, as the amplifier of a motor holds
+it, so that a motion is a product of contact maps, one Lagrangian L_d^k = L_d(·; u_k) each.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics import DiscreteLagrangian, Forced
+from herglotz.scenes.forced import External, ForcedRule
+from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.natural import Natural, scene_without_closed_form
+from herglotz.scenes.rules import RULES, strang
+from herglotz.scenes.scene import Scene, State
+
+
+@dataclass(frozen=True)
+class DrivenRule:
+    """L_d at the input `u0`; `at(u)` is the one of a step with the input u, (..., 1).
+
+    Source: section 6 of `docs/mathematics.md`, time-dependent L_d.
+    """
+
+    rule: Callable[[Tensor | float], DiscreteLagrangian]
+    u0: float
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """Return L_d, shape (...)."""
+        return self.rule(self.u0)(q0, q1, s0, h)
+
+    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+        """F⁻ and F⁺ of the rule, (..., n) each; None where it has none."""
+        own = self.rule(self.u0)
+        return own.forces(q0, q1, s0, h) if isinstance(own, Forced) else None
+
+    def at(self, u: Tensor) -> DiscreteLagrangian:
+        """The discrete Lagrangian of a step whose input is u, (..., 1)."""
+        return self.rule(u[..., 0])
+
+
+def driven_scene(
+    potential: Callable[[Tensor], Tensor],
+    slope: Callable[[Tensor], Tensor],
+    gamma: float,
+    amplitude: float,
+    frequency: float,
+    *,
+    m: float = 1.0,
+    external: External | None = None,
+    flow: Callable[..., State] | None = None,
+    **fields: Any,
+) -> Scene:
+    """The scene of a potential, one damping rate and the force u(t) = A cos νt.
+
+    Its own functions are those of the force at t = 0; `at(u)` gives the scene of any other, and `drive(t)` the force.
+
+    Parameters
+    ----------
+    potential, slope
+        V(q), (...), and V'(q), (..., 1).
+    gamma
+        Damping rate γ.
+    amplitude, frequency
+        A, and the angular frequency ν.
+    m
+        Mass.
+    external
+        f(q, v), a force beside the Lagrangian's.
+    flow
+        (u, q, p, s, h) → (q1, p1, s1) where it is known; else the reference flow.
+    fields
+        The other fields of `Scene`.
+    """
+
+    def potential_at(u: Tensor | float) -> Callable[[Tensor], Tensor]:
+        return lambda q: potential(q) - u * q[..., 0]
+
+    def system_at(u: Tensor | float) -> Natural:
+        return Natural(potential_at(u), gamma, m)
+
+    def drive(t: Tensor) -> Tensor:
+        return amplitude * torch.cos(frequency * t)[..., None]
+
+    def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
+        return rule if external is None else ForcedRule(rule, external)
+
+    rules: dict[str, DiscreteLagrangian] = {}
+    for name, rule in RULES.items():
+        if name.startswith("lobatto"):  # evaluates L at several nodes at once: no broadcast of u
+            rules[name] = forced(rule(system_at(amplitude).lagrangian))
+        else:
+            rules[name] = DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
+    rules["strang"] = DrivenRule(lambda u: forced(strang(potential_at(u), m, gamma)), amplitude)
+
+    def scene_at(u: Tensor | float) -> Scene:
+        system = system_at(u)
+
+        def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+            return (u[..., None] if isinstance(u, Tensor) else u) - slope(q)
+
+        made = scene_without_closed_form(
+            hamiltonian=system.hamiltonian,
+            lagrangian=system.lagrangian,
+            momentum=system.momentum,
+            velocity=system.velocity,
+            force=force,
+            rate=constant_rate(-gamma),
+            rules=rules,
+            at=lambda u: scene_at(u[..., 0]),
+            drive=drive,
+            external=external,
+            **fields,
+        )
+        return made if flow is None else replace(made, flow=partial(flow, u))
+
+    return scene_at(amplitude)

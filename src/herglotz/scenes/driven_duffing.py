@@ -1,0 +1,60 @@
+"""Duffing's oscillator driven by a force, ẍ = −γẋ − kx − βx³ + u, with mass 1 kg."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.scene import Scene
+
+
+def driven_duffing(
+    k: float = 1.0, beta: float = 4.0, gamma: float = 0.2, amplitude: float = 0.5, frequency: float = 1.3
+) -> Scene:
+    """A mass on a hardening spring under the force u(t) = A cos νt, held over each step of a simulation.
+
+    Parameters
+    ----------
+    k
+        Linear stiffness, N/m.
+    beta
+        Cubic stiffness β > 0, N/m³.
+    gamma
+        Damping rate γ, 1/s.
+    amplitude
+        Force A, N.
+    frequency
+        Angular frequency ν of the force, rad/s.
+
+    Raises
+    ------
+    InputError
+        If β ≤ 0.
+    """
+    if not beta > 0:
+        raise InputError(f"driven_duffing: cubic stiffness beta must be > 0, got {beta}")
+
+    def potential(q: Tensor) -> Tensor:
+        x2 = q[..., 0] ** 2
+        return x2 * (0.5 * k + 0.25 * beta * x2)
+
+    return driven_scene(
+        potential,
+        lambda q: q * (k + beta * q * q),
+        gamma,
+        amplitude,
+        frequency,
+        name="driven_duffing",
+        description="hardening spring under a given force, ẍ = −γẋ − kx − βx³ + u; reference flow to about 1e-13",
+        dof=1,
+        coordinates=("x",),
+        units=("m",),
+        time_unit="s",
+        angles=(False,),
+        parameters={"k": k, "beta": beta, "gamma": gamma, "amplitude": amplitude, "frequency": frequency},
+        q_range=(-0.8, 0.8),
+        v_range=(-0.8, 0.8),
+        h=0.15,
+        examples=({"k": 0.7, "beta": 2.5, "gamma": 0.35, "amplitude": 0.3, "frequency": 0.9},),
+    )

@@ -1,0 +1,67 @@
+"""Duffing's oscillator, ẍ = −γẋ − kx − βx³: a hardening spring, no closed form, so its answer is the reference flow.
+
+L = v²/2 − kx²/2 − βx⁴/4 − γs and H = p²/2 + kx²/2 + βx⁴/4 + γs, with mass 1 kg.
+"""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.scenes.motion import constant_rate
+from herglotz.scenes.natural import Natural, scene_without_closed_form
+from herglotz.scenes.rules import strang
+from herglotz.scenes.scene import Scene
+
+
+def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
+    """A mass on a hardening spring.
+
+    At the default numbers and an amplitude of 0.4 m the cubic force is four times the linear one.
+
+    Parameters
+    ----------
+    k
+        Linear stiffness, N/m; negative: two wells.
+    beta
+        Cubic stiffness β > 0, N/m³.
+    gamma
+        Damping rate γ, 1/s.
+
+    Raises
+    ------
+    InputError
+        If β ≤ 0: the potential would have no bottom.
+    """
+    if not beta > 0:
+        raise InputError(f"duffing: cubic stiffness beta must be > 0, got {beta}; damped_oscillator is linear")
+
+    def potential(q: Tensor) -> Tensor:
+        x2 = q[..., 0] ** 2
+        return x2 * (0.5 * k + 0.25 * beta * x2)
+
+    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+        return -q * (k + beta * q * q)
+
+    system = Natural(potential, gamma)
+    return scene_without_closed_form(
+        name="duffing",
+        description="oscillator with a hardening spring, ẍ = −γẋ − kx − βx³; reference flow to about 1e-13",
+        dof=1,
+        coordinates=("x",),
+        units=("m",),
+        time_unit="s",
+        angles=(False,),
+        parameters={"k": k, "beta": beta, "gamma": gamma},
+        hamiltonian=system.hamiltonian,
+        lagrangian=system.lagrangian,
+        momentum=system.momentum,
+        velocity=system.velocity,
+        force=force,
+        rate=constant_rate(-gamma),
+        rules={"strang": strang(potential, 1.0, gamma)},
+        q_range=(-0.5, 0.5),
+        v_range=(-0.4, 0.4),
+        h=0.1,
+        examples=({"k": 0.7, "beta": 12.0, "gamma": 0.3}, {"k": -0.6, "beta": 4.0, "gamma": 0.1}),
+    )

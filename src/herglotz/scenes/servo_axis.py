@@ -1,0 +1,148 @@
+"""A linear motor axis with dry friction and no spring, M ẍ = u − d ẋ − F_c sign ẋ + f₀, with true sticking.
+
+L = M v²/2 + (u + f₀) x − γs with γ = d/M: viscous friction is the contact term. Dry friction is set-valued: at rest it
+balances any force up to F_c. With u held over a step the motion is known piece by piece: between two events the speed
+relaxes as e^{−γt}, so the time of a reversal is a logarithm, and a step has at most two pieces, before and after rest.
+
+The default numbers are of the size that a published identification of such an axis found: A. Janot, M. Gautier and
+M. Brunot, Data Set and Reference Models of EMPS, 2019 Workshop on Nonlinear System Identification Benchmarks.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.scene import Scene, State, Step
+
+# L_d has no set-valued force: below this share of the default speed range its dry friction is smoothed, as tanh.
+SMOOTHED = 0.01
+# Gauss–Legendre nodes and weights on [−1, 1] for the action of a piece: exact to 1e-14 of it for γh up to 4.
+NODES = (0.9739065285171717, 0.8650633666889845, 0.6794095682990244, 0.4333953941292472, 0.1488743389816312)
+WEIGHTS = (0.0666713443086881, 0.1494513491505806, 0.2190863625159820, 0.2692667193099964, 0.2955242247147529)
+
+
+class Axis(NamedTuple):
+    """The numbers of an axis."""
+
+    m: float
+    gamma: float
+    dry: float
+
+
+def servo_axis(
+    m: float = 95.1, viscous: float = 203.5, dry: float = 20.4, offset: float = 3.2, amplitude: float = 60.0,
+    frequency: float = 3.0,
+) -> Scene:  # fmt: skip
+    """A motor axis under the force u(t) = A cos νt, held over each step of a simulation.
+
+    Parameters
+    ----------
+    m
+        Moving mass M, kg.
+    viscous
+        Viscous friction d ≥ 0, N s/m.
+    dry
+        Dry (Coulomb) friction F_c ≥ 0, N.
+    offset
+        Constant force f₀, N: an offset of the amplifier.
+    amplitude, frequency
+        Force A of the motor, N, and its angular frequency ν, rad/s.
+
+    Raises
+    ------
+    InputError
+        If the mass is not positive or a friction is negative.
+    """
+    if not m > 0:
+        raise InputError(f"servo_axis: mass m must be > 0, got {m}")
+    for name, value in (("viscous", viscous), ("dry", dry)):
+        if not value >= 0:
+            raise InputError(f"servo_axis: {name} friction must be >= 0, got {value}")
+    axis = Axis(m, viscous / m, dry)
+
+    def flow(u: Tensor | float, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        return _flow(axis, u + offset, q, p, s, h)
+
+    return driven_scene(
+        lambda q: -offset * q[..., 0],
+        lambda q: torch.full_like(q, -offset),
+        axis.gamma,
+        amplitude,
+        frequency,
+        m=m,
+        external=lambda q, v: -dry * torch.tanh(v / SMOOTHED),  # noqa: ARG005
+        flow=flow,
+        name="servo_axis",
+        description="motor axis with dry friction and sticking, no spring, in closed form between reversals",
+        dof=1,
+        coordinates=("x",),
+        units=("m",),
+        time_unit="s",
+        angles=(False,),
+        parameters={
+            "m": m, "viscous": viscous, "dry": dry, "offset": offset, "amplitude": amplitude, "frequency": frequency,
+        },
+        q_range=(-0.1, 0.1),
+        v_range=(-0.2, 0.2),
+        h=0.02,
+        examples=({"m": 2.1, "viscous": 3.0, "dry": 0.7, "offset": -0.2, "amplitude": 2.0, "frequency": 2.0},),
+    )  # fmt: skip
+
+
+def _flow(axis: Axis, force: Tensor | float, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+    """The motion under a constant force: slip until rest, if that is within h; then stick, or slip where it pushes."""
+    dtype = q.dtype
+    q, p, s = (x.double() for x in (q, p, s))
+    shape = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, torch.as_tensor(h).shape)
+    h = torch.as_tensor(h, dtype=q.dtype, device=q.device).expand(shape)
+    F = torch.as_tensor(force, dtype=q.dtype, device=q.device).expand(shape)
+    x, v, s = q[..., 0].expand(shape), (p[..., 0] / axis.m).expand(shape), s.expand(shape)
+    way = torch.where(v == 0, _pushed(F, axis.dry), v.sign())
+    first = torch.minimum(_time_to_rest(axis, F - way * axis.dry, v), h)
+    rests = first < h
+    x, v, s = _piece(axis, F, way, x, v, s, first)
+    v = torch.where(rests, 0.0, v)
+    x, v, s = _piece(axis, F, torch.where(rests, _pushed(F, axis.dry), way), x, v, s, h - first)
+    return tuple(y.to(dtype) for y in (x[..., None], axis.m * v[..., None], s))  # type: ignore[return-value]
+
+
+def _pushed(F: Tensor, dry: float) -> Tensor:
+    """Where a body at rest is pushed: −1, 0 (it sticks) or 1."""
+    return torch.where(F.abs() > dry, F.sign(), 0.0)
+
+
+def _time_to_rest(axis: Axis, F: Tensor, v: Tensor) -> Tensor:
+    """When v̇ = F/M − γv stops a body that moves at v; infinite where it does not."""
+    a = F / axis.m
+    brakes = (a * v < 0) & (v != 0)
+    ratio = torch.where(brakes, -v / torch.where(brakes, a, 1.0), 0.0)  # v = a(… ) reaches 0 after this time at γ = 0
+    time = torch.log1p(axis.gamma * ratio) / axis.gamma if axis.gamma > 0 else ratio
+    return torch.where(brakes, time, torch.inf)
+
+
+def _piece(
+    axis: Axis, F: Tensor, way: Tensor, x: Tensor, v: Tensor, s: Tensor, t: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Position, velocity and action after a time t of slip one way, or of rest (way and v are 0)."""
+    rests = (way == 0) & (v == 0)
+    a = torch.where(rests, 0.0, (F - way * axis.dry) / axis.m)
+
+    def motion(t: Tensor) -> tuple[Tensor, Tensor]:
+        if axis.gamma == 0:
+            return x + t * (v + 0.5 * t * a), v + t * a
+        lost = -torch.expm1(-axis.gamma * t) / axis.gamma  # ∫ e^{−γτ} dτ
+        return x + v * lost + a * (t - lost) / axis.gamma, v + lost * (a - axis.gamma * v)
+
+    action = torch.exp(-axis.gamma * t) * s
+    for node, weight in zip(NODES, WEIGHTS, strict=True):
+        for sign in (-1.0, 1.0):
+            tau = 0.5 * t * (1.0 + sign * node)
+            y, w = motion(tau)
+            rate = 0.5 * axis.m * w * w + F * y
+            action = action + 0.5 * t * weight * torch.exp(-axis.gamma * (t - tau)) * rate
+    return *motion(t), action

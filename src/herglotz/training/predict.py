@@ -1,0 +1,264 @@
+"""A trained model on a recording it has not seen: the first samples give the state, the rest is a free run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State, Stepper
+from herglotz.training.grid import SegmentGrid, segment_grid
+from herglotz.training.inputs import step_inputs
+from herglotz.training.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.trajectory_fit import StatesOnly
+
+WARMUP = 20  # samples from which the state is estimated
+BELIEVED = 0.1  # noise of a step relative to the data's in the warm-up, as in `smooth`: the model is believed
+
+
+class Trained(Protocol):
+    """What `predict` needs of a run."""
+
+    @property
+    def model(self) -> ContactLagrangian: ...  # noqa: D102
+    @property
+    def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
+    @property
+    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
+    @property
+    def stepper(self) -> Stepper: ...  # noqa: D102
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """A recording beside the model's free run.
+
+    With windows, each window is one trajectory of `data`.
+    """
+
+    data: Trajectories  # what was scored, angles unwrapped; every `every`-th sample of the recording
+    states: State  # (N, n), (N, n), (N,) smoothed in the warm-up, then free; NaN from a failed step on
+    warmup: int  # leading samples of each trajectory that the state was estimated from
+    every: int  # stride by which the recording was thinned, so that its steps are not shorter than the model's
+    most_substeps: int  # largest number of model steps in a recorded step
+    outside: float  # share of model steps that are shorter or longer than those of the training data
+
+    @property
+    def prediction(self) -> Tensor:
+        """Positions of the model at every sample, (N, n)."""
+        return self.states.q
+
+    @property
+    def train_lengths(self) -> tuple[int, ...]:
+        """Samples of each trajectory that the model was shown: the warm-up."""
+        return (self.warmup,) * len(self.data)
+
+    @property
+    def free(self) -> Tensor:
+        """Whether a sample is in the free run, (N,) bool."""
+        first = torch.tensor(self.data.offsets, device=self.data.t.device)[self.data.trajectory]
+        return torch.arange(self.data.samples, device=first.device) - first >= self.warmup
+
+    @property
+    def failed_steps(self) -> float:
+        """Share of the samples of the free run that it did not reach."""
+        return 1.0 - float(torch.isfinite(self.states.q[self.free]).all(-1).double().mean())
+
+    @property
+    def rms_per_coordinate(self) -> tuple[float, ...] | None:
+        """RMS error of each coordinate over the samples that the free run reached; None where it reached none."""
+        error = (self.states.q - self.data.q)[self.free]
+        error = error[torch.isfinite(error).all(-1)]
+        return tuple(error.square().mean(0).sqrt().tolist()) if len(error) else None
+
+    @property
+    def rms(self) -> float | None:
+        """RMS error over all coordinates."""
+        each = self.rms_per_coordinate
+        return None if each is None else (sum(x * x for x in each) / len(each)) ** 0.5
+
+    def motion(self) -> Trajectories | None:
+        """The predicted motion as far as it was reached; None where no trajectory has three samples."""
+        reached = torch.isfinite(torch.cat([self.states.q, self.states.p], -1)).all(-1)
+        counts = [int(reached[a : a + k].sum()) for a, k in zip(self.data.offsets, self.data.lengths, strict=True)]
+        spans = [(a, k) for a, k in zip(self.data.offsets, counts, strict=True) if k >= 3]
+        if not spans:
+            return None
+        rows = torch.cat([torch.arange(a, a + k) for a, k in spans])
+        whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
+        return _rows(whole, rows, tuple(k for _, k in spans))
+
+    def metrics(self) -> dict[str, Any]:
+        """The numbers, for JSON."""
+        each = self.rms_per_coordinate
+        return {
+            "rms": self.rms,
+            "rms_per_coordinate": None if each is None else dict(zip(self.data.names, each, strict=True)),
+            "units": dict(zip(self.data.names, self.data.units, strict=True)),
+            "failed_steps": self.failed_steps,
+            "warmup": self.warmup,
+            "trajectories": len(self.data),
+            "predicted_samples": int(self.free.sum()),
+            "every": self.every,
+            "most_substeps": self.most_substeps,
+            "steps_outside_training": self.outside,
+        }
+
+
+def predict(
+    run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
+) -> Prediction:
+    """Score a run on another recording.
+
+    The state at sample `warmup` of each trajectory is smoothed from the samples up to it, with the model held. From
+    there the model steps alone, driven by the inputs of the recording. A recorded step that is longer than those of the
+    training data is crossed in equal model steps; a recording sampled faster is thinned, its inputs averaged.
+
+    Parameters
+    ----------
+    run
+        The trained model.
+    data
+        Recordings of the same coordinates, in the same units, with inputs where the model takes them.
+    warmup
+        Number of samples K that the state is estimated from, at least 3.
+    windows, horizon
+        Score this many windows, spread evenly over the recording, of K samples and then a free run over the time
+        `horizon`, instead of one free run to the end of each trajectory.
+
+    Returns
+    -------
+    Prediction
+        A free run that fails says so in `failed_steps`.
+
+    Raises
+    ------
+    InputError
+        If the coordinates, units or inputs are not those of the run, or a trajectory is too short.
+    """
+    if isinstance(warmup, bool) or not isinstance(warmup, int) or warmup < 3:
+        raise InputError(f"warmup must be a whole number >= 3 (samples that the state is read from), got {warmup!r}")
+    data = _of_the_run(run, data).unwrapped().to(dtype=next(run.model.parameters()).dtype, device="cpu")
+    low, high = run.h_range
+    every = max(1, int(high / data.typical_step + 1e-6)) if data.typical_step < low else 1
+    if every > 1:
+        data = data.thinned(every)
+    if windows is not None or horizon is not None:
+        data = _windows(data, warmup, windows, horizon)
+    for b, length in enumerate(data.lengths):
+        if length < warmup + 2:
+            thinned = f", every {every} of the recording" if every > 1 else ""
+            raise InputError(
+                f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
+                f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
+            )
+    states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
+    sigma = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
+    for b in range(len(data)):
+        rows = torch.arange(data.offsets[b], data.offsets[b] + warmup)
+        start = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, high)
+        if start is not None:
+            states[rows] = start
+    grid = _free_run(run.stepper, data, states, warmup, high)
+    inside = torch.arange(grid.longest) < grid.end[:, None]
+    h = grid.h[inside]
+    outside = float(((h < low) | (h > high)).double().mean())
+    most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
+    n = data.dof
+    state = State(states[:, :n], states[:, n : 2 * n], states[:, 2 * n])
+    return Prediction(data, state, warmup, every, most, outside)
+
+
+def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
+    """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
+    wanted, where = run.data, data.source or "data"
+    if data.dof == wanted.dof == 1:
+        at = [0]
+    elif set(wanted.names) <= set(data.names):
+        at = [data.names.index(name) for name in wanted.names]
+    else:
+        raise InputError(
+            f"{where}: the coordinates are {', '.join(data.names)}; the run was fitted to {', '.join(wanted.names)}: "
+            "rename the columns"
+        )
+    for i, name, unit in zip(at, wanted.names, wanted.units, strict=True):
+        if "1" not in (data.units[i], unit) and data.units[i] != unit:
+            raise InputError(f"{where}: {name} is in {data.units[i]}, the run was fitted in {unit}; convert the column")
+    u = data.u if run.model.inputs else None
+    p = None if data.p is None else data.p[:, at]
+    return replace(
+        data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+    )  # fmt: skip
+
+
+def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
+    """`count` windows of `warmup` samples and the time `horizon` after them, spread evenly over all possible starts."""
+    if count is None or horizon is None:
+        raise InputError("windows and horizon go together: how many windows, and the time that each is predicted")
+    if count < 1 or not 0 < horizon < float("inf"):
+        raise InputError(f"windows must be >= 1 and horizon a time > 0, got {count} and {horizon:g}")
+    found: list[tuple[int, int]] = []  # first row, and the row after the last
+    for first, length in zip(data.offsets, data.lengths, strict=True):
+        t = data.t[first : first + length]
+        ends = torch.searchsorted(t, t[warmup - 1 :] + horizon * (1 + 1e-9), right=True).tolist()
+        reach = (t[warmup - 1 :] + horizon * (1 - 1e-9) <= t[-1]).tolist()
+        found += [(first + k, first + end) for k, (end, ok) in enumerate(zip(ends, reach, strict=True)) if ok]
+    found = [(a, b) for a, b in found if b - a >= warmup + 2]
+    if not found:
+        raise InputError(
+            f"{data.source or 'data'}: no trajectory holds {warmup} samples and a time of {horizon:g} after them (at "
+            "least two samples there); use a shorter --horizon or --warmup"
+        )
+    chosen = torch.linspace(0, len(found) - 1, min(count, len(found))).round().long().tolist()
+    spans = [found[k] for k in chosen]
+    rows = torch.cat([torch.arange(a, b) for a, b in spans])
+    return _rows(data, rows, tuple(b - a for a, b in spans))
+
+
+def _smoothed(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> Tensor | None:
+    """States at every sample of a warm-up, (K, 2n+1), the model held; None where the model has no step near it."""
+    problem = SmoothingProblem(
+        model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=BELIEVED
+    )  # fmt: skip
+    x = problem.start()
+    states = StatesOnly(problem, x[: problem.P])
+    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
+    if result.reason == "not_finite":
+        return None
+    return problem.states(states.full(result.x))
+
+
+def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
+    """Fill in the states after the warm-up of every trajectory, all of them stepped as one batch; return the grid."""
+    n, spans = data.dof, list(zip(data.offsets, data.lengths, strict=True))
+    rows = torch.cat([torch.arange(a + warmup - 1, a + length) for a, length in spans])
+    rest = _rows(data, rows, tuple(length - warmup + 1 for length in data.lengths))
+    grid = segment_grid(rest, rest.samples, max_step)
+    start = states[[a + warmup - 1 for a, _ in spans]]
+    known = torch.isfinite(start).all(-1).nonzero()[:, 0]
+    if not len(known):
+        return grid
+    u = step_inputs(stepper.L_d, rest)  # type: ignore[arg-type]
+    with torch.no_grad():
+        out = stepper.rollout(
+            start[known, :n], start[known, n : 2 * n], start[known, 2 * n], h=grid.h[known],
+            inputs=None if u is None else u[grid.row[known]],
+        )  # fmt: skip
+    nodes = states.new_full((len(spans), grid.longest + 1, 2 * n + 1), torch.nan)
+    nodes[known] = torch.cat([out.q, out.p, out.s[..., None]], -1)
+    states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
+    return grid
+
+
+def _rows(data: Trajectories, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
+    """These rows of the data, cut into trajectories of these lengths."""
+    known = {name: x[rows] for name in ("t", "q", "s", "p", "u") if (x := getattr(data, name)) is not None}
+    return replace(data, **known, lengths=lengths)

@@ -1,0 +1,67 @@
+"""`herglotz predict` reads a run and a recording, prints, writes and draws."""
+
+import json
+
+import pytest
+
+from herglotz.cli import main
+from herglotz.cli.predict import WARMUP
+from herglotz.training import predict
+
+
+@pytest.fixture(scope="module")
+def other_csv(tmp_path_factory):
+    path = tmp_path_factory.mktemp("predict") / "other.csv"
+    arguments = ["--trajectories", "2", "--steps", "60", "--h", "0.2", "--noise", "0.005", "--seed", "8"]
+    assert main(["simulate", "damped_pendulum", "--out", str(path), *arguments]) == 0
+    return path
+
+
+def test_the_copy_of_the_default():
+    # fails if the help promises another warm-up than the function takes
+    assert predict.WARMUP == WARMUP
+
+
+def test_json_has_the_promised_numbers(tiny_run, other_csv, capsys):
+    # fails if a number is missing, or text is printed beside the JSON
+    assert main(["predict", str(tiny_run), str(other_csv), "--json"]) == 0
+    numbers = json.loads(capsys.readouterr().out)
+    assert {"rms", "rms_per_coordinate", "failed_steps", "warmup"} <= set(numbers)
+    assert numbers["warmup"] == 20
+    assert numbers["failed_steps"] == 0.0
+    assert set(numbers["rms_per_coordinate"]) == {"theta"}
+    assert numbers["predicted_samples"] == 2 * 41
+
+
+def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
+    # fails if the motion or the picture is not written, or the table lacks a unit
+    out = tmp_path / "motion.csv"
+    assert main(["predict", str(tiny_run), str(other_csv), "--out", str(out), "--warmup", "10"]) == 0
+    text = capsys.readouterr().out
+    assert "RMS theta" in text
+    assert "rad" in text
+    assert out.read_text().startswith("trajectory,t[s],theta[rad],p_theta") or "theta[rad]" in out.read_text()
+    assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_windows(tiny_run, other_csv, capsys):
+    # fails if --windows does not reach the function
+    assert main(["predict", str(tiny_run), str(other_csv), "--windows", "4", "--horizon", "2", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["trajectories"] == 4
+
+
+def test_mistakes_are_one_line(tiny_run, other_csv, tmp_path, capsys):
+    # fails if a mistake is found after the work, or is a traceback
+    cases = {
+        ("--warmup", "200"): "other.csv: trajectory 0 has 61 samples",
+        ("--out", str(tmp_path / "x.png")): "must end in .csv or .npz",
+        ("--windows", "3"): "go together",
+        ("--horizon", "-1"): "must be > 0",
+    }
+    for flags, message in cases.items():
+        assert main(["predict", str(tiny_run), str(other_csv), *flags]) == 2
+        err = capsys.readouterr().err
+        assert message in err
+        assert err.count("\n") == 1
+    assert main(["predict", str(tmp_path), str(other_csv)]) == 2
+    assert "no model.pt in this folder" in capsys.readouterr().err

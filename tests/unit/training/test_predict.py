@@ -1,0 +1,207 @@
+"""`Run.predict`: a recording of the model's own motion is predicted exactly, whatever its steps and inputs."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+from herglotz.training import FitConfig, Run
+from herglotz.training.predict import predict
+
+H = 0.1
+
+
+def model_of(level, **settings):
+    sizes = {"scale": (1.5,), "speed": (1.2,), "stiffness": (1.0,)}
+    model: Any = ContactLagrangian(ModelConfig(level=level, rate=0.2, potential_width=0, **sizes, **settings))
+    make = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if name.startswith(("damping.network", "action")):
+                parameter += 0.1 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        if model.friction is not None:
+            model.friction.viscous.fill_(0.1)
+            if model.inputs:
+                model.friction.input_map.fill_(1.0)
+    return model
+
+
+def recording(model, count=2, steps=80, h=H, seed=0, hold=1, noise=0.0) -> Trajectories:
+    """The model's own motion, its inputs held over `hold` steps; every `hold`-th sample is kept."""
+    make = torch.Generator().manual_seed(seed)
+    draw = lambda *shape: torch.randn(*shape, generator=make, dtype=torch.float64)  # noqa: E731
+    u = draw(count, steps // hold, 1).repeat_interleave(hold, 1) if model.inputs else None
+    with torch.no_grad():
+        out = Stepper(model).rollout(0.8 * draw(count, 1), 0.5 * draw(count, 1), h=h, steps=steps, inputs=u)
+    assert bool(out.ok.all())
+    q = out.q[:, ::hold]
+    q = q + noise * draw(*q.shape)
+    t = (h * hold * torch.arange(q.shape[1], dtype=torch.float64)).repeat(count)
+    if u is not None:
+        u = torch.cat([u[:, ::hold], u[:, -1:]], 1).flatten(0, 1)
+    return Trajectories.of(t, q.flatten(0, 1), (q.shape[1],) * count, angles=(True,), u=u, source="other.csv")
+
+
+def run_of(model, sigma=1e-8) -> Run:
+    """A run as if it were fitted to recordings at the step H."""
+    data = recording(model, seed=9)
+    n = data.samples
+    states = State(data.q, data.q, data.q[:, 0])
+    return Run(model, FitConfig(), {"sigma": sigma}, data, (n // 2,) * 2, states, H, {}, [])
+
+
+@pytest.mark.parametrize("level", ["conservative", "linear", "affine", "full", "forced"])
+def test_own_motion_is_predicted_by_every_level(level):
+    # fails if the state handed from the warm-up to the free run lacks p or s, or belongs to another sample
+    model = model_of(level)
+    found = run_of(model).predict(recording(model))
+    assert found.failed_steps == 0
+    assert found.rms is not None
+    # s is read from 20 positions alone where it enters the motion, and held near 0 by a weight of 1e-16: measured 3e-8
+    assert found.rms < (1e-6 if model.s_enters_motion else 1e-9)
+    assert (found.every, found.most_substeps, found.outside) == (1, 1, 0.0)
+    assert int(found.free.sum()) == 2 * (81 - 20)
+
+
+def test_noise_in_the_warm_up_is_smoothed():
+    # fails if the state is read from two samples: its speed would then be off by 14 times the noise a unit of time
+    model = model_of("linear")
+    found = run_of(model, sigma=0.01).predict(recording(model, count=6, noise=0.01, seed=4))
+    assert found.rms is not None
+    assert 0.009 < found.rms < 0.0125  # measured 0.0098 to 0.0107 at five seeds
+
+
+def test_inputs_act_at_their_own_times():
+    # fails if inputs are shifted by a step, those of the warm-up drive the free run, or gaps shift them
+    model = model_of("forced", inputs=1)
+    data, run = recording(model), run_of(model)
+    assert predict(run, data).rms < 1e-9  # type: ignore[operator]
+    shifted = replace(data, u=data.u.roll(1, 0))  # type: ignore[union-attr]
+    assert predict(run, shifted).rms > 1e-3  # type: ignore[operator]
+    keep = torch.ones(data.samples, dtype=torch.bool)
+    held = data.u.clone()  # type: ignore[union-attr]
+    held[41] = held[40]
+    whole = Stepper(model)
+    with torch.no_grad():  # the motion under an input that is held over the gap from sample 40 to 42
+        start = predict(run, data).states
+        x = State(start.q[19], start.p[19], start.s[19])
+        q = whole.rollout(*x, h=H, inputs=held[19:80]).q
+    data = replace(data, q=torch.cat([data.q[:20], q[1:], data.q[81:]]), u=held)
+    keep[41] = False
+    known = {name: getattr(data, name)[keep] for name in ("t", "q", "u")}
+    gap = replace(data, **known, lengths=(80, 81))
+    found = predict(run, gap)
+    assert found.rms < 1e-9  # type: ignore[operator]
+    assert found.most_substeps == 2
+
+
+def test_longer_recorded_steps_are_crossed_in_steps_of_the_model():
+    # fails if the model is stepped at three times the step that it was fitted to, or an input acts on one of the three
+    model = model_of("forced", inputs=1)
+    found = predict(run_of(model), recording(model, steps=240, hold=3))
+    assert found.rms < 1e-9  # type: ignore[operator]
+    assert (found.most_substeps, found.outside) == (3, 0.0)
+
+
+def test_a_faster_recording_is_thinned():
+    # fails if the model is stepped at half of its step, or the inputs of the two halves are not averaged
+    model = model_of("forced", inputs=1)
+    slow = recording(model, count=1, steps=80)
+    t = torch.linspace(0, 80 * H, 161, dtype=torch.float64)
+    q = slow.q.repeat_interleave(2, 0)[:161]  # samples between are wrong, and must not be read
+    u = slow.u.repeat_interleave(2, 0)[:161]  # type: ignore[union-attr]
+    u[1::2] += 0.3
+    u[:-1:2] -= 0.3
+    fast = Trajectories.of(t, q, angles=(True,), u=u)
+    found = predict(run_of(model), fast)
+    assert (found.every, found.most_substeps, found.outside) == (2, 1, 0.0)
+    assert found.rms < 1e-9  # type: ignore[operator]
+
+
+def test_windows_cover_the_recording():
+    # fails if a window is not K samples and the horizon, overlaps the end, or all lie in the first trajectory
+    model = model_of("linear")
+    found = predict(run_of(model), recording(model), warmup=10, windows=7, horizon=2.0)
+    assert found.data.lengths == (10 + 20,) * 7
+    assert found.rms < 1e-9  # type: ignore[operator]
+    first = found.data.t[list(found.data.offsets)]
+    assert float(first.min()) == 0.0
+    last = float(found.data.t.max())
+    assert abs(last - 8.0) < 1e-9
+    assert found.metrics()["predicted_samples"] == 140
+
+
+def test_a_step_that_fails_is_counted_and_ends_the_motion(monkeypatch):
+    # fails if NaN enters the RMS, or what was not reached is passed over in silence
+    model = model_of("linear")
+    own = Stepper.rollout
+
+    def breaks(self, *state, **settings):
+        out = own(self, *state, **settings)
+        q = out.q.clone()
+        q[0, 11:] = torch.nan
+        return replace(out, q=q)
+
+    monkeypatch.setattr(Stepper, "rollout", breaks)
+    found = predict(run_of_quietly(model, own), recorded_quietly(model, own))
+    assert found.failed_steps == pytest.approx(51 / 122)
+    assert found.rms < 1e-9  # type: ignore[operator]
+    motion = found.motion()
+    assert motion is not None
+    assert motion.lengths == (30, 81)
+
+
+def run_of_quietly(model, own):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Stepper, "rollout", own)
+        return run_of(model)
+
+
+def recorded_quietly(model, own):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Stepper, "rollout", own)
+        return recording(model)
+
+
+def test_float32():
+    # fails if a float64 recording meets a float32 model
+    model = model_of("linear").float()
+    data = recording(model_of("linear"))
+    found = run_of(model_of("linear"))
+    found = predict(replace(found, model=model), data)
+    assert found.states.q.dtype == torch.float32
+    assert found.rms < 1e-4  # type: ignore[operator]
+
+
+def test_mistakes_say_what_to_do():
+    # fails if a wrong recording is scored, or a message does not name the file and the remedy
+    model = model_of("forced", inputs=1)
+    run, data = run_of(model), recording(model)
+    two = replace(data, q=data.q.expand(-1, 2), names=("a", "b"), units=("rad", "rad"), angles=(True, True))
+    cases = [
+        ({"data": replace(data, u=None)}, "other.csv: the model is driven by 1 input.*add u"),
+        ({"data": replace(data, units=("m",), angles=(False,))}, "q is in m, the run was fitted in rad; convert"),
+        ({"data": two}, "other.csv: the coordinates are a, b; the run was fitted to q: rename"),
+        ({"warmup": 80}, "other.csv: trajectory 0 has 81 samples; a warm-up of 80 needs at least 82: use --warmup 40"),
+        ({"warmup": 2}, "warmup must be a whole number >= 3"),
+        ({"windows": 3}, "windows and horizon go together"),
+        ({"windows": 3, "horizon": 99.0}, "other.csv: no trajectory holds 20 samples and a time of 99 after them"),
+    ]
+    for settings, message in cases:
+        with pytest.raises(InputError, match=message):
+            predict(run, **{"data": data, **settings})
+
+
+def test_coordinates_are_found_by_name():
+    # fails if columns are taken by their place: the second column of the file is the first coordinate of the run
+    model = model_of("linear")
+    data, run = recording(model), run_of(model)
+    named = replace(run, data=replace(run.data, names=("theta",)))
+    both = replace(data, q=torch.cat([5 + 0 * data.q, data.q], 1), names=("x", "theta"), units=("m", "rad"),
+                   angles=(False, True))  # fmt: skip
+    assert predict(named, both).rms < 1e-9  # type: ignore[operator]
