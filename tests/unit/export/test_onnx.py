@@ -106,7 +106,7 @@ def test_the_file_is_small_and_says_what_it_is(written):
     constants = sum(len(x.raw_data) for x in proto.graph.initializer if x.data_type == real)
     assert constants < 8 * sum(x.numel() * x.element_size() for x in model.parameters())
     assert not any(node.op_type == "Constant" for node in proto.graph.node)
-    assert len(content) < 250_000  # eight steps written out, and one behind them
+    assert len(content) < 250_000
     assert b"site-packages" not in content
     assert b"src/herglotz" not in content
     known = exported.metadata
@@ -170,8 +170,8 @@ def test_a_file_starts_from_positions(written):
 
 @pytest.mark.parametrize("correction", [0, 4], ids=["explicit", "newton"])
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-def test_attempts_and_what_stands_behind_them_agree_with_eager(correction, dtype, tmp_path):
-    # fails if a step that an attempt has solved, a block taken again or the steps behind the last block differ, or if
+def test_explicit_and_iterated_steps_agree_with_eager(correction, dtype, tmp_path):
+    # fails if a single precision sum, the guess of a first step or a lost neighbour changes a step, or if
     # one h for each sample is read as one for all
     model = model_of(2, "linear", correction, dtype)
     exported = load_onnx(export_onnx(model, tmp_path / "linear.onnx", h=0.1))

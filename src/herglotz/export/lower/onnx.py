@@ -22,10 +22,6 @@ from herglotz.models import ContactLagrangian
 
 OPSET = 20
 OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
-SECOND = {  # inputs and outputs of the further models
-    "init": (("q0", "q1", "s0", "h"), ("p", "s")),
-    "linearise": (("q", "p", "s", "h"), (*OUTPUTS[:6], "jacobian")),
-}
 
 
 def export_onnx(
@@ -68,13 +64,18 @@ def export_onnx(
     entries = describe(model, h, box, units, newton_iterations, metadata or {})
     text = to_json(entries)
     with quiet():
-        programs = programs_of(model, entries, ("rollout", *SECOND))
+        programs = programs_of(model, entries, ("rollout", "linearise", "init"))
     u = ("u",) if entries["inputs"] else ()
+    said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
+    further = {
+        "init": (("q0", "q1", "s0", "h"), ("p", "s")),
+        "linearise": (("q", "p", "s", "h"), (*said, "jacobian")),
+    }
     properties = {KEY: text}
-    for name, (inputs, outputs) in SECOND.items():
+    for name, (inputs, outputs) in further.items():
         second = graph_of(programs[name], (*inputs, *u), outputs, {})
         properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
-    write_atomically(path, graph_of(programs["rollout"], ("q", "p", "s", "h", *u), OUTPUTS, properties))
+    write_atomically(path, graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties))
     return Path(path)
 
 
@@ -90,9 +91,9 @@ def graph_of(
     writer = Writer(Constants(), dtype)
     found = write(writer, program.graph_module, values)
     places: Any = next(x for x in program.graph.nodes if x.op == "output").args[0]
-    for name, x in zip(outputs, found, strict=False):
+    for name, x in zip(outputs, found, strict=True):
         writer.emit("Identity", x, to=name)
-    described_outputs = dict(zip(outputs, places, strict=False))
+    described_outputs = dict(zip(outputs, places, strict=True))
     graph = helper.make_graph(
         writer.nodes, "herglotz",
         [_info(name, described(x)) for name, x in shapes.items()],
