@@ -1,1 +1,1 @@
-"""One traced program of a step, written in the words of each format."""
+"""From a traced function to one format each: tables of operations."""
