@@ -147,6 +147,10 @@ def eliminate(A: Tensor, b: Tensor) -> Tensor:
     n = b.shape[-2]
     if n == 1:
         return b / A
+    if n == 2:  # Cramer's rule: half of the operations
+        (a, c), (d, e) = ((A[..., i, :1], A[..., i, 1:]) for i in range(2))
+        (f, g), rate = b.unbind(-2), 1 / (a * e - c * d)
+        return torch.stack([(e * f - c * g) * rate, (a * g - d * f) * rate], -2)
     rows = [torch.cat([A[..., i, :], b[..., i, :]], -1) for i in range(n)]
     for k in range(n):
         for i in range(k + 1, n):

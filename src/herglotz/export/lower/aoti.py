@@ -16,15 +16,13 @@ from torch.export import ExportedProgram
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
-from herglotz.export.equation import Equations
-from herglotz.export.metadata import describe, to_json
+from herglotz.export.compare import compare
+from herglotz.export.load import load_pt2
+from herglotz.export.metadata import AOTI, KEY, describe, to_json
 from herglotz.export.newton import ITERATIONS
-from herglotz.export.pt2 import init_program, quiet, rollout_program
+from herglotz.export.programs import programs_of, quiet
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
-
-KEY = "herglotz"  # of our metadata among those of torch
-ROLLOUT, INIT = "model", "init"  # the programs of a package
 
 
 def export_aoti(
@@ -64,11 +62,10 @@ def export_aoti(
     settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
     check_compiler()
     with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        package, equations = str(Path(folder, "code.pt2")), Equations.of(model)
-        programs = {ROLLOUT: rollout_program(equations, entries), INIT: init_program(equations, entries)}
-        files = {name: _compiled(program, settings) for name, program in programs.items()}
-        package_aoti(package, files)
-        _check(package, equations.model)
+        package = str(Path(folder, "code.pt2"))
+        programs = programs_of(model, entries, tuple(AOTI))
+        package_aoti(package, {AOTI[name]: _compiled(program, settings) for name, program in programs.items()})
+        _check(package, model)
         content = Path(package).read_bytes()
     write_atomically(path, content)
     return Path(path)
@@ -89,9 +86,6 @@ def _check(package: str, model: ContactLagrangian) -> None:
     InputError
         If they disagree.
     """
-    from herglotz.export.compare import compare
-    from herglotz.export.loader import load_pt2
-
     found = compare(load_pt2(package), Stepper(model), batches=(1, 7), steps=20)
     worst = max(found[key] for key in ("q", "p", "s"))  # NaN, which is not larger, where every start fails
     if worst > (1e-6 if next(model.parameters()).dtype == torch.float64 else 1e-2):

@@ -2,23 +2,17 @@
 
 from __future__ import annotations
 
-import io
-import zipfile
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
 from herglotz.export.box import Box
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
-from herglotz.export.metadata import METADATA, from_json
-from herglotz.export.pt2 import quiet
-from herglotz.stepping import Rollout, State, Step, step_sizes
+from herglotz.stepping import Linearised, Rollout, State, Step, step_sizes
 
 Program = Callable[..., tuple[Tensor, ...]]
 
@@ -106,6 +100,11 @@ class ExportedStepper:
             out = self.programs["model"](*flat)
         else:
             out = tuple(x[0] for x in self.programs["rollout"](*flat[:3], *(x[None] for x in flat[3:])))
+        return self._step(out, state)
+
+    def _step(self, out: Sequence[Tensor], state: State) -> Step:
+        """The outputs of a program as a step of the shape of `state`."""
+        q, _, s = state
         q1, p1, s1, c, residual, status, *outside = out
         new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
         c, residual, status, *outside = (x.reshape(s.shape) for x in (c, residual, status, *outside))
@@ -164,6 +163,35 @@ class ExportedStepper:
         found = Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual, outside=outside)
         return decimated(found, every)
 
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`; autograd does not go through the result.
+
+        Returns
+        -------
+        Linearised
+            The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du.
+
+        Raises
+        ------
+        InputError
+            As `step`, and where the format holds no derivative.
+        """
+        if "linearise" not in self.programs:
+            raise InputError(f"{self.path}: an {self.kind} file holds no derivative; use a .pt2, ONNX or C file")
+        state = State(*(x.detach() for x in state))
+        self._check(*state)
+        h = spread_h(self._checked_h(h), state.s)
+        with torch.no_grad():
+            *out, J = self.programs["linearise"](*self._flat(state, h, u))
+        J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1
+        by_input = J[..., size + 1 :] if self.inputs else None
+        return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input)
+
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
 
@@ -206,75 +234,6 @@ class ExportedStepper:
                 u = u.expand(*shape, u.shape[-1])
         check_inputs(u, self.inputs, shape, self.dtype)
         return (u,)
-
-
-def load_pt2(path: PathLike) -> ExportedStepper:
-    """Read a file that `export_pt2` or `export_aoti` wrote.
-
-    Raises
-    ------
-    InputError
-        If the file is missing, damaged, not one of ours, or of another format version.
-    """
-    content = read_bytes(path)
-    try:
-        with quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
-            if _is_compiled(content):
-                return _load_aoti(path)
-            from torch.export.pt2_archive._package import load_pt2 as unpack
-
-            found = unpack(io.BytesIO(content))
-            text = found.extra_files.get(METADATA)
-            metadata = from_json(text.decode() if isinstance(text, bytes) else text, path)
-            modules = {name: program.module(check_guards=False) for name, program in found.exported_programs.items()}
-    except InputError:
-        raise
-    except Exception as error:  # torch raises whatever its zip, JSON and graph readers raise
-        line = str(error).strip().splitlines() or [""]
-        raise InputError(
-            f"{path}: is not a readable .pt2 file ({type(error).__name__}: {line[0][:120]}); export the model again"
-        ) from error
-    return ExportedStepper(modules, metadata, str(path), "pt2")
-
-
-def load_exported(path: PathLike) -> Any:
-    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
-
-    Returns
-    -------
-    ExportedStepper or CompiledStepper
-        Both have `step`, `rollout`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
-
-    Raises
-    ------
-    InputError
-        As the reader of that format.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".onnx":
-        from herglotz.export.onnx_file import load_onnx
-
-        return load_onnx(path)
-    if suffix == ".h":
-        from herglotz.export.c_stepper import load_c
-
-        return load_c(path)
-    return load_pt2(path)
-
-
-def _is_compiled(content: bytes) -> bool:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        return any("/data/aotinductor/" in f"/{name}" for name in archive.namelist())
-
-
-def _load_aoti(path: PathLike) -> ExportedStepper:
-    from torch._inductor.package.package import load_package
-
-    from herglotz.export.aoti import INIT, KEY, ROLLOUT
-
-    package, init = (load_package(str(path), name) for name in (ROLLOUT, INIT))
-    metadata = from_json(package.loader.get_metadata().get(KEY), path)  # pyright: ignore[reportAttributeAccessIssue]
-    return ExportedStepper({"rollout": package, "init": init}, metadata, str(path), "aoti")
 
 
 def _plain(x: Tensor) -> Tensor:
