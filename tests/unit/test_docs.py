@@ -13,7 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 CODE = {p: p.read_text(encoding="utf-8") for room in ("src", "tests", "train", "benchmarks", "tools")
         for p in sorted((ROOT / room).rglob("*.py")) if p != Path(__file__).resolve()}  # fmt: skip
-EVERYTHING = " ".join([*map(str, CODE), *CODE.values()])
+RUNTIME = [p.read_text(encoding="utf-8") for p in sorted((ROOT / "src").rglob("*.h"))]  # of the generated C
+EVERYTHING = " ".join([*map(str, CODE), *CODE.values(), *RUNTIME])
 # Names of the generated C stand behind a prefix there.
 WORDS = set(re.findall(r"\w+", EVERYTHING)) | set(re.findall(r"(?<=_)[A-Za-z]\w+", EVERYTHING))
 FILES = [p.relative_to(ROOT) for room in ("src", "tests", "train", "benchmarks", "tools", "docs", "data")

@@ -14,15 +14,16 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
+from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
-from herglotz.stepping.equation import End, Equation, ModelEquation, PartialsEquation, StepOfModel, model_equation
+from herglotz.stepping.equation import End, ModelEquation, PartialsEquation, StepEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
-from herglotz.stepping.newton import Found, Increments, Status, find_root, solve, status_of
-from herglotz.stepping.state import State, Step
+from herglotz.stepping.newton import Increments, find_root, status_of
+from herglotz.stepping.state import State, Status, Step
 
 
-class Engine:
+class SingleStep:
     """Steps whose inputs are already checked; keeps what consecutive steps share (the force at the common point).
 
     In float32 steps are taken in increments Δ = q1 − q0 where L_d offers them, and rollouts sum them compensated:
@@ -39,12 +40,17 @@ class Engine:
         self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
 
     def __call__(
-        self, state: State, h: Tensor, guess: Tensor, u: Tensor | None = None, low: State | None = None
+        self,
+        state: State,
+        h: Tensor,
+        guess: Tensor | None = None,
+        u: Tensor | None = None,
+        low: State | None = None,
     ) -> tuple[Step, State | None]:
         """The step with input u, and the rounding errors to carry on; `low` is what the step before has handed on."""
         if self.leapfrog is not None:
             return self._explicit(self.leapfrog, state, h, u, low)
-        return self._implicit(state, h, guess, u, low)
+        return self._implicit(state, h, state.q if guess is None else guess, u, low)
 
     def _explicit(
         self, frog: Leapfrog, state: State, h: Tensor, u: Tensor | None, low: State | None
@@ -99,7 +105,7 @@ class Engine:
 
     def _equation(
         self, L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, increments: bool, order: int
-    ) -> Equation:
+    ) -> StepEquation:
         """The step equation: by terms for a model, else by the partials of L_d."""
         if not self._tried:
             self._tried, self._terms = True, model_equation(self.L_d)
@@ -147,7 +153,7 @@ def _attach(
     """Give the solved x its derivative: one Newton step, which is zero in value and dx = −J⁻¹ dF in slope."""
     q0, p0, s0 = state
     F = momentum_residual(_evaluate(L_d, q0, x, s0, h, increments), p0)
-    x = x - solve(J, F - F.detach())
+    x = attached(x, J, F)
     P = _evaluate(L_d, q0, x, s0, h, increments)
     return x, End(momentum_plus(P), P.L, P.c)
 
@@ -174,9 +180,5 @@ def _compensated(state: State, change: State, low: State | None) -> tuple[State,
 
 
 def _report(new: State, c: Tensor, status: Tensor, residual: Tensor, iterations: int, good: bool) -> Step:
-    """The step, NaN in the samples that failed; `good`: none did."""
-    if not good:
-        failed = status != Status.CONVERGED
-        nan = torch.where(failed, torch.nan, torch.zeros_like(new.s))
-        new, c = State(new.q + nan[..., None], new.p + nan[..., None], new.s + nan), c + nan
-    return Step(new, c, status, residual, iterations)
+    """The step; `good`: no sample failed."""
+    return (Step if good else Step.of)(new, c, status, residual, iterations)

@@ -1,32 +1,20 @@
-"""The iteration of `herglotz.stepping.newton` for one sample, in plain numbers: small tensors cost the most there.
+"""The iteration of `herglotz.mechanics.newton` for one sample, in plain numbers: small tensors cost the most there.
 
 Same rules, same constants; |F|, |J⁻¹F| and every decision are Python floats.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import inf, isfinite, nan
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from herglotz.stepping.equation import Equation, Point
+from herglotz.mechanics.newton import ARMIJO, CONTRACTION, NEAR, Equation, Found, Point, Rules
 
-CLOSE = 1e-3  # of the size of q: nearer than this a Jacobian that is one iteration old converges fast enough
-CONTRACTION = 0.05  # an old Jacobian that gains less than this per iteration is replaced
-
-
-class Found(NamedTuple):
-    """Where an iteration ended."""
-
-    x: Tensor  # (..., n) the unknown
-    point: Point
-    merit: Tensor  # (...) |F|
-    residual: Tensor  # (...) |J⁻¹F|
-    done: Tensor  # (...)
-    iterations: int
-    healthy: bool  # one sample that is done, all numbers finite; False where that is not known
+Numbers = Callable[[Tensor, Point, float], tuple[float, float]]  # `Sizes` of one sample
 
 
 class _Move(NamedTuple):
@@ -37,35 +25,31 @@ class _Move(NamedTuple):
     merit: float  # |F|
 
 
-def find_one(
-    equation: Equation, q0: Tensor, x: Tensor, tol: float, max_iterations: int, order: int, increments: bool
-) -> Found:
-    """Newton with backtracking from x."""
+def newton_one(equation: Equation, x: Tensor, rules: Rules, sizes: Numbers) -> Found:
+    """Iterate from x by rules that measure |F| and have a matrix for a Jacobian."""
     point, J = _evaluate(equation, x, None)
-    move = _newton(J, point.F)
-    scale = _scale(equation, q0, x, point, J, move.left, increments)
-    eps = torch.finfo(x.dtype).eps
-    tiny, near = tol * scale, CLOSE * scale
-    floor = 1e3 * eps * max(scale, equation.typical_increment().item())
+    move = newton_step(J, point.F)
+    scale, floor = sizes(x, point, move.left)
+    tiny, near = rules.tol * scale, NEAR * scale
     # A direction that is not finite can never be followed: such a sample is over.
-    done, length, slow, iterations = move.left <= tiny or not isfinite(move.left), 1.0, False, 0
-    while iterations < max_iterations and not done:
+    done, fraction, slow, iterations = move.left <= tiny or not isfinite(move.left), 1.0, False, 0
+    while iterations < rules.max_iterations and not done:
         iterations += 1
-        trial = x + (move.delta if length == 1.0 else length * move.delta)
+        trial = x + (move.delta if fraction == 1.0 else fraction * move.delta)
         fresh = slow or move.left > near  # at a trial that may be far off, the Jacobian is wanted as well
-        point_trial, J_trial = _evaluate(equation, trial, None if order == 2 or fresh else J)
-        new = _newton(J_trial, point_trial.F)
+        point_trial, J_trial = _evaluate(equation, trial, None if fresh or not rules.keep else J)
+        new = newton_step(J_trial, point_trial.F)
         settled = new.left <= tiny
-        better = settled or new.merit <= (1 - 1e-4 * length) * move.merit
+        better = settled or new.merit <= (1 - ARMIJO * fraction) * move.merit
         stalled = not better and move.left <= floor  # rounding, not a wrong direction
         slow = False
-        if order == 1:
+        if rules.keep:
             slow = not (fresh or settled) and new.left > CONTRACTION * move.left and isfinite(new.left)
             better = better or (slow and not stalled)
         if better:
-            x, point, J, move, length = trial, point_trial, J_trial, new, 1.0
+            x, point, J, move, fraction = trial, point_trial, J_trial, new, 1.0
         else:
-            length /= 2
+            fraction /= 2
         done = settled or stalled
     merit, residual = (x.new_full(x.shape[:-1], value) for value in (move.merit, move.left))
     flag = torch.full(x.shape[:-1], done, device=x.device)
@@ -81,7 +65,7 @@ def _evaluate(equation: Equation, x: Tensor, kept: Tensor | None) -> tuple[Point
     return point, point.J
 
 
-def _newton(J: Tensor, F: Tensor) -> _Move:
+def newton_step(J: Tensor, F: Tensor) -> _Move:
     """−J⁻¹F, not finite where J is singular."""
     n = F.shape[-1]
     if n == 1:
@@ -108,14 +92,6 @@ def _eliminate(a: float, b: float, c: float, d: float, x: float, y: float) -> li
         return [nan, nan]
     second = (y - factor * x) / pivot
     return [(b * second - x) / a, -second]
-
-
-def _scale(equation: Equation, q0: Tensor, x: Tensor, point: Point, J: Tensor, left: float, increments: bool) -> float:
-    """The size that steps are compared with: of the positions or, in increments, of the increment."""
-    size = norm(x.flatten().tolist())
-    other = _newton(J, equation.push(point)).left + size if increments else norm(q0.flatten().tolist())
-    limits = torch.finfo(x.dtype)  # the floor: tolerances of denormal size would keep a motion from coming to rest
-    return max(size, other, left, limits.tiny / limits.eps) if isfinite(size + other + left) else 1.0
 
 
 def norm(values: list[float]) -> float:

@@ -1,4 +1,4 @@
-"""The Newton engine: one answer by every path, samples apart, small steps in float32."""
+"""A single step: one answer by every path, samples apart, small steps in float32."""
 
 import pytest
 import torch
@@ -87,7 +87,7 @@ def test_both_orders_and_a_plain_newton_agree(name):
 
 
 def test_the_torch_func_twin_gives_the_same_step():
-    # fails if the engine and the step as one would write it first differ
+    # fails if a single step and the step as one would write it first differ
     n, h = 2, 0.2
 
     def L_d(q0, q1, s0, h):
