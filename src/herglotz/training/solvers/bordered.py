@@ -20,7 +20,7 @@ from herglotz.training.distributed import everywhere, of_first
 
 @dataclass(frozen=True)
 class Bordered:
-    """The matrix, for S trajectories of M states of d numbers (`levenberg_marquardt.ByProducts`)."""
+    """The matrix, for S trajectories of M states of d numbers (`solvers.levenberg_marquardt.ByProducts`)."""
 
     corner: Tensor  # (P, P)
     border: Tensor  # (S, M, d, P)

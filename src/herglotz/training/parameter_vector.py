@@ -1,4 +1,4 @@
-"""A model seen as a function of one flat parameter vector, for Gauss–Newton."""
+"""A model seen as a function of one vector of its parameters, for Gauss–Newton."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from herglotz.mechanics import Partials
 from herglotz.models import ContactLagrangian
 
 
-class FlatModel:
-    """Partials of a model at any flat parameter vector, without touching the model; usable inside vmap and jacrev."""
+class ParameterVector:
+    """Partials of a model at any vector of parameters, without touching the model; usable inside vmap and jacrev."""
 
     def __init__(self, model: ContactLagrangian):
         self.model = model
@@ -46,7 +46,7 @@ class FlatModel:
         return FixedModel(self, theta, u)
 
     def index(self, prefix: str) -> Tensor:
-        """Positions in the flat vector of the parameters whose name starts with `prefix`."""
+        """Positions in the vector of the parameters whose name starts with `prefix`."""
         ends = torch.tensor(self.sizes).cumsum(0).tolist()
         spans = zip(self.names, ends, self.sizes, strict=True)
         chosen = [torch.arange(end - size, end) for name, end, size in spans if name.startswith(prefix)]
@@ -56,12 +56,12 @@ class FlatModel:
 class FixedModel:
     """A discrete Lagrangian with closed-form partials: the model at one parameter vector (and at inputs u)."""
 
-    def __init__(self, flat: FlatModel, theta: Tensor, u: Tensor | None = None):
-        self.flat, self.theta, self.u = flat, theta, u
+    def __init__(self, parameters: ParameterVector, theta: Tensor, u: Tensor | None = None):
+        self.parameters, self.theta, self.u = parameters, theta, u
 
     def at(self, u: Tensor) -> FixedModel:
         """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
-        return FixedModel(self.flat, self.theta, u)
+        return FixedModel(self.parameters, self.theta, u)
 
     def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """L_d, shape (...)."""
@@ -69,4 +69,4 @@ class FixedModel:
 
     def partials(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
         """See `herglotz.mechanics.partials`."""
-        return self.flat.partials(self.theta, q0, q1, s0, h, order, self.u)
+        return self.parameters.partials(self.theta, q0, q1, s0, h, order, self.u)

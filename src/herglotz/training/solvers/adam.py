@@ -8,7 +8,7 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from herglotz.training.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 
 DECAY = 1e-2  # of AdamW's weights (Loshchilov & Hutter 2019)
 QUIET, PATIENCE = 1e-8, 50  # so many costs in a row that differ by less than this, relative, end the search

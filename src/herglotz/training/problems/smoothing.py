@@ -12,64 +12,44 @@ model does not know, is followed; with w → 0 it is the fit of the start states
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.mechanics import legendre_minus, partials
 from herglotz.models import ContactLagrangian
-from herglotz.training.bordered import Bordered
 from herglotz.training.distributed import everywhere, of_first
-from herglotz.training.flat import FlatModel
-from herglotz.training.grid import SegmentGrid
-from herglotz.training.inputs import step_inputs
-from herglotz.training.lifted import all_steps, parameter_derivatives
-from herglotz.training.prior import Prior
-from herglotz.training.robust import loss, root_weights
+from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.least_squares import StatesProblem
+from herglotz.training.solvers.bordered import Bordered
+from herglotz.training.solvers.lifted_newton import all_steps, parameter_derivatives
 
 DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal
 
 
-class SmoothingProblem:
-    """The sum of squares above, over parameters and the states of all nodes (`LeastSquares`).
+class SmoothingProblem(StatesProblem):
+    """The sum of squares above, over parameters and the states of all nodes.
 
     Parameters
     ----------
-    model
-        Its current parameters are not changed.
-    data
-        Trajectories of positions, and of inputs where the model takes them.
+    model, data, sigma, prior
+        As for `LeastSquares`.
     grid
         Whole trajectories, one segment each.
-    sigma
-        Standard deviation of the noise on q.
     process
         Standard deviation of what a step leaves of the model in p, relative to sigma, in the natural units of both; the
         same share of the natural size in s, and h/√3 of p's in q, as a random force would add.
-    prior
-        Penalty on the parameters.
     freedom
         Degrees of freedom ν of Student's t for the residuals of data and steps (`robust`); None: least squares.
     """
 
     def __init__(
-        self,
-        model: ContactLagrangian,
-        data: Trajectories,
-        grid: SegmentGrid,
-        *,
-        sigma: float,
-        process: float,
-        prior: Prior | None = None,
-        freedom: float | None = None,
+        self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, *, process: float, **settings: Any
     ):
-        self.flat, self.data, self.grid = FlatModel(model), data, grid
-        self.sigma, self.process, self.prior, self.freedom = sigma, process, prior, freedom
-        self.n = n = data.dof
-        self.d = d = 2 * n + (1 if model.s_enters_motion else 0)
-        self.P = len(self.flat.get())
-        u = step_inputs(model, data)
-        self.u = None if u is None else u[grid.row]  # (S, K, m)
+        super().__init__(model, data, grid, **settings)
+        self.process, n, d = process, self.n, self.d
         self.node = grid.node[grid.sample.argsort()]  # (N,) where in (S·M,) each sample is
         S, M = grid.segments, grid.longest + 1
         node = torch.arange(M, device=data.q.device)
@@ -77,17 +57,16 @@ class SmoothingProblem:
         self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
         self.seen[self.node], self.target[self.node] = 1.0, data.q
         self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
-        scale, speed = (data.q.new_tensor(y) for y in (model.config.scale, model.config.speed))
-        self.action = float((speed * scale).sum())  # natural size of s
+        scale, speed = self.scale, self.speed
         # What a force that the model does not know adds to p in a step, to q by the way, and to s.
         p = (speed / scale).expand(*grid.h.shape, n)
         s = (scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
-        self.w = process * sigma * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
+        self.w = process * self.sigma * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
         self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
 
     def start(self) -> Tensor:
         """Positions on straight lines between samples, momenta by FL⁻, s = 0; (P + S·M·d,) with the parameters."""
-        theta, grid, n = self.flat.get(), self.grid, self.n
+        theta, grid, n = self.parameters.get(), self.grid, self.n
         S, K = grid.h.shape
         x = self.data.q.new_zeros(S, K + 1, self.d)
         for b in range(S):
@@ -100,7 +79,7 @@ class SmoothingProblem:
             share = ((t[every] - t[here]) / (t[there] - t[here]))[:, None]
             x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
         with torch.no_grad():
-            _, p, _ = legendre_minus(self.flat.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
+            _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
         x[:, :-1, n : 2 * n] = p
         last = (grid.end - 1)[:, None].clamp_min(0)
         after = torch.arange(K + 1, device=p.device) >= grid.end[:, None]  # the last node, and padding, as before it
@@ -119,8 +98,7 @@ class SmoothingProblem:
             return x.new_full((), torch.inf)
         theta, states = self.unpack(x)
         fit, defect = self._residuals(states, stepped[0])
-        cost = loss(fit, self.freedom) + loss(defect, self.freedom) + self._anchor(states).square().sum() / 2
-        return cost if self.prior is None else cost + self.prior.cost(theta)
+        return self.loss(fit, defect) + self._anchor(states).square().sum() / 2 + self.prior_cost(theta)
 
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Bordered, Tensor]:
         """(cost, JᵀJ, Jᵀr). `held`: of the states alone, θ as it is."""
@@ -134,16 +112,16 @@ class SmoothingProblem:
             return x.new_full((), torch.inf), Bordered(corner, border, (diagonal, upper, lower)), unknown
         y, A = stepped[0], stepped[1][..., :d, :d]
         fit, defect = self._residuals(states, y)
-        by_fit = self.seen * root_weights(fit, self.freedom) / self.sigma  # (S, M, n)
-        by_step = self.inside[:, 1:] * root_weights(defect, self.freedom) / self.w  # (S, K, d)
-        weighted, weight = by_step * root_weights(defect, self.freedom) * defect, by_step.square()[..., None]
+        by_fit = self.seen * self.root_weights(fit) / self.sigma  # (S, M, n)
+        by_step = self.inside[:, 1:] * self.root_weights(defect) / self.w  # (S, K, d)
+        weighted, weight = by_step * self.root_weights(defect) * defect, by_step.square()[..., None]
         WA = weight * A
         diagonal[..., : self.n, : self.n] += torch.diag_embed(by_fit.square())
         diagonal[:, :-1] += A.mT @ WA
         diagonal[:, 1:] += torch.diag_embed(weight[..., 0])
         diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))  # padding stays where it is
         upper[:, :-1], lower[:, 1:] = -WA.mT, -WA
-        gradient[..., : self.n] = by_fit * root_weights(fit, self.freedom) * fit
+        gradient[..., : self.n] = by_fit * self.root_weights(fit) * fit
         gradient[:, :-1] += (A.mT @ weighted[..., None])[..., 0]
         gradient[:, 1:] -= weighted
         if d > 2 * self.n:
@@ -151,17 +129,17 @@ class SmoothingProblem:
             gradient[:, 0, -1] += self._anchor(states) / self.action
         if not held:
             q1 = y[..., : self.n]
-            B = parameter_derivatives(self.flat, theta, self._with_s(states), q1, self.grid.h, self.u)[..., :d, :]
+            B = parameter_derivatives(self.parameters, theta, self.with_s(states), q1, self.grid.h, self.u)[..., :d, :]
             WB = weight * B
             corner, top = torch.einsum("skdp,skdr->pr", B, WB), torch.einsum("skdp,skd->p", B, weighted)
             border[:, :-1] += A.mT @ WB
             border[:, 1:] -= WB
-        cost = loss(fit, self.freedom) + loss(defect, self.freedom) + self._anchor(states).square().sum() / 2
-        if self.prior is not None and held:
-            cost = cost + self.prior.cost(theta)
-        elif self.prior is not None:
-            prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
-            cost, corner, top = cost + prior_cost, corner + prior_A, top + prior_b
+        cost = self.loss(fit, defect) + self._anchor(states).square().sum() / 2
+        if held:
+            cost = cost + self.prior_cost(theta)
+        else:
+            of_prior = self.prior_equations(theta)
+            cost, corner, top = cost + of_prior[0], corner + of_prior[1], top + of_prior[2]
         corner, border, diagonal, upper, lower = of_first(corner, border, diagonal, upper, lower)
         return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
 
@@ -178,25 +156,21 @@ class SmoothingProblem:
     def states(self, x: Tensor) -> Tensor:
         """States (q, p, s) at every sample, (N, 2n+1); where s does not enter the motion it counts along from 0."""
         theta, states = self.unpack(x)
-        full = self._with_s(states)
+        full = self.with_s(states)
         if self.d == 2 * self.n:
             with torch.no_grad():
-                L_d = self.flat.at(theta, self.u)
+                L_d = self.parameters.at(theta, self.u)
                 P = partials(L_d, full[:, :-1, : self.n], full[:, 1:, : self.n], 0 * self.grid.h, self.grid.h)
             for k in range(self.grid.longest):  # L_d = L_d(s = 0) + (c − 1) s
                 full[:, k + 1, -1] = P.c[:, k] * full[:, k, -1] + P.L[:, k]
         return full.flatten(0, 1)[self.node]
-
-    def _with_s(self, states: Tensor) -> Tensor:
-        zero = states.new_zeros(*states.shape[:2], 2 * self.n + 1 - self.d)
-        return torch.cat([states, zero], -1)
 
     def _stepped(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """Φ̃ of every state but the last, and its derivative."""
         if self._stepped_at is None or not torch.equal(self._stepped_at[0], x):
             theta, states = self.unpack(x)
             with torch.no_grad():
-                stepped = all_steps(self.flat.at(theta, self.u), self._with_s(states), self.grid.h)
+                stepped = all_steps(self.parameters.at(theta, self.u), self.with_s(states), self.grid.h)
             self._stepped_at = x.clone(), stepped  # an accepted step has been solved for its cost
         return self._stepped_at[1]
 

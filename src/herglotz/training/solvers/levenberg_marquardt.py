@@ -30,7 +30,7 @@ class ByProducts(Protocol):
         ...
 
 
-class LeastSquares(Protocol):
+class SumOfSquares(Protocol):
     """A sum of squares ½|r(x)|²; problems build JᵀJ and Jᵀr themselves, so that they may work in chunks."""
 
     def cost(self, x: Tensor) -> Tensor:
@@ -54,7 +54,7 @@ class OptimiserResult:
 
 
 def levenberg_marquardt(
-    problem: LeastSquares,
+    problem: SumOfSquares,
     x: Tensor,
     *,
     max_iterations: int = 150,

@@ -9,7 +9,8 @@ from torch.func import functional_call, jacrev
 from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
 from herglotz.models.terms import AffineDamping
-from herglotz.training.flat import FlatModel
+from herglotz.training.baseline import Baseline
+from herglotz.training.parameter_vector import ParameterVector
 
 # Parameters of order one, by the beginning of their names.
 NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.network", "action.log_slope",
@@ -42,8 +43,8 @@ class Prior:
         rate_spread: float = 1.0,
         grid: int = 64,
     ):
-        self.flat = FlatModel(model)
-        theta = self.flat.get()
+        self.parameters = ParameterVector(model)
+        theta = self.parameters.get()
         self.departure = departure
         self.weight_index = self._index(*NETWORKS)
         self.rate_index = self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous")
@@ -64,7 +65,7 @@ class Prior:
         moved = theta - self.start
         parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
         if len(self.force_index):
-            parts.append(moved[self.force_index] / (self.rate_spread * max(self.flat.model.config.speed)))
+            parts.append(moved[self.force_index] / (self.rate_spread * max(self.parameters.model.config.speed)))
             parts.append(moved[self.breakaway_index] / (BREAKAWAY * self.force))
             parts.append(moved[self.width_index] / WIDTH)
         if self.departure is not None:
@@ -81,18 +82,24 @@ class Prior:
         return r.square().sum() / 2, J.T @ J, J.T @ r
 
     def _index(self, *prefixes: str) -> Tensor:
-        return torch.cat([self.flat.index(prefix) for prefix in prefixes])
+        return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
 
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():
-            return self.flat.model.potential.baseline(coordinates(self.grid, 1)).gradient
+            return self.parameters.model.potential.baseline(coordinates(self.grid, 1)).gradient
 
     def _departures(self, theta: Tensor) -> list[Tensor]:
         """Network outputs on the grid, each relative to its natural size."""
-        named = {f"model.{name}": value for name, value in self.flat.unflatten(theta).items()}
-        force, rate = functional_call(_Departures(self.flat.model), named, (self.grid, self.velocity))
+        named = {f"model.{name}": value for name, value in self.parameters.unflatten(theta).items()}
+        force, rate = functional_call(_Departures(self.parameters.model), named, (self.grid, self.velocity))
         parts = [] if force is None else [force.reshape(-1) / self.force]
         return parts if rate is None else [*parts, rate / self.typical_rate]
+
+
+def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior:
+    """The prior of every objective, sized by the data: rates are known to 0.3 of the slowest coordinate's own rate."""
+    typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
+    return Prior(model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical)
 
 
 class _Departures(torch.nn.Module):

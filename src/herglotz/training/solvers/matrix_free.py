@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from herglotz.training.distributed import add_over_processes, is_first, of_first
-from herglotz.training.residual import ResidualProblem
-from herglotz.training.robust import loss, root_weights
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.robust import loss, root_weights
 
 DENSE = 5000  # parameters up to which JᵀJ is built
 PROBES = 16  # of the diagonal
@@ -116,11 +116,11 @@ class MatrixFree:
     """
 
     def __init__(self, problem: ResidualProblem):
-        assert not problem.coupled  # the recurrence of s has a Jacobian of its own
+        assert not problem.carries_s  # the recurrence of s has a Jacobian of its own
         self.problem, self.signs = problem, _signs(len(problem.triples), problem.data.dof)
 
     def cost(self, x: Tensor) -> Tensor:
-        """See `LeastSquares`."""
+        """See `levenberg_marquardt.SumOfSquares`."""
         return self.problem.cost(x)
 
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Curvature, Tensor]:

@@ -17,7 +17,7 @@ from torch.func import jacrev, vmap
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.stepping import Status, solve_step
 from herglotz.training.distributed import add_over_processes, own_parts
-from herglotz.training.flat import FixedModel, FlatModel
+from herglotz.training.parameter_vector import FixedModel, ParameterVector
 
 CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
 
@@ -31,7 +31,7 @@ class Path:
 
 
 def solve_path(
-    flat: FlatModel,
+    parameters: ParameterVector,
     theta: Tensor,  # (P,)
     start: Tensor,  # (S, 2n+1) first states
     h: Tensor,  # (S, K)
@@ -44,7 +44,7 @@ def solve_path(
     x = torch.cat([start[:, None], guess[:, 1:]], 1)
     previous = float("inf")
     for _ in range(sweeps):
-        stepped = all_steps(flat.at(theta, u), x, h)
+        stepped = all_steps(parameters.at(theta, u), x, h)
         if stepped is None:
             return None
         y, A = stepped
@@ -76,7 +76,7 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
 
 
 def parameter_derivatives(
-    flat: FlatModel,
+    parameters: ParameterVector,
     theta: Tensor,  # (P,)
     x: Tensor,  # (S, K+1, 2n+1) states that the steps start from; the last is not used
     q1: Tensor,  # (S, K, n) positions that they lead to
@@ -94,7 +94,7 @@ def parameter_derivatives(
     def step_functions(
         theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
     ) -> Tensor:
-        P = flat.partials(theta, q0, q1, s0, h, 1, u)
+        P = parameters.partials(theta, q0, q1, s0, h, 1, u)
         return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
 
     per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
@@ -103,7 +103,7 @@ def parameter_derivatives(
         here, own = (q0[part], ends[part], p0[part], s0[part], steps[part]), None if inputs is None else inputs[part]
         G = per_step(theta, *here, own)  # (part, 2n+1, P)
         with torch.no_grad():
-            P = partials(flat.at(theta, own), here[0], here[1], here[3], here[4], order=2)
+            P = partials(parameters.at(theta, own), here[0], here[1], here[3], here[4], order=2)
             dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, here[2]), G[:, :n])[0]
             p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
             dp1 = G[:, n : 2 * n] + p1_q1 @ dq1

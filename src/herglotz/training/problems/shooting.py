@@ -1,4 +1,4 @@
-"""Trajectory fitting by multiple shooting: what to do with noise (trap 5).
+"""Trajectory fitting by multiple shooting: what noisy positions need, because one-step errors amplify their noise.
 
 Unknowns are the parameters and the state (q, p[, s]) at the start of every segment. Residuals are
 
@@ -6,11 +6,13 @@ Unknowns are the parameters and the state (q, p[, s]) at the start of every segm
     (end of a segment − start of the next) / weight     between segments,
     (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
 
-and the prior. Derivatives run through every implicit step (`lifted.parameter_derivatives`). Segments grow until each
-trajectory is one.
+and the prior. Derivatives run through every implicit step (`lifted_newton.parameter_derivatives`). Segments grow
+until each trajectory is one.
 """
 
 from __future__ import annotations
+
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,29 +21,20 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.training.distributed import everywhere
-from herglotz.training.flat import FlatModel
-from herglotz.training.grid import SegmentGrid
-from herglotz.training.inputs import step_inputs
-from herglotz.training.lifted import Path, parameter_derivatives, solve_path
-from herglotz.training.prior import Prior
-from herglotz.training.robust import loss, root_weights
+from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.least_squares import StatesProblem
+from herglotz.training.solvers.lifted_newton import Path, parameter_derivatives, solve_path
 
 
-class ShootingProblem:
+class ShootingProblem(StatesProblem):
     """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states.
 
     Parameters
     ----------
-    model
-        Its current parameters are not changed.
-    data
-        Trajectories of positions, and of inputs where the model takes them.
+    model, data, sigma, prior
+        As for `LeastSquares`.
     grid
         The segments.
-    sigma
-        Standard deviation of the noise on q.
-    prior
-        Penalty on the parameters.
     freedom
         Degrees of freedom ν of Student's t for the residuals of data and joints (`robust`); None: least squares.
     used
@@ -56,31 +49,18 @@ class ShootingProblem:
         data: Trajectories,
         grid: SegmentGrid,
         *,
-        sigma: float,
-        prior: Prior | None = None,
-        freedom: float | None = None,
         used: Tensor | None = None,
         s: Tensor | None = None,
+        **settings: Any,
     ):
-        self.freedom = freedom
-        self.flat, self.grid, self.data = FlatModel(model), grid, data
-        self.sigma, self.prior = sigma, prior
-        self.n = data.dof
-        u = step_inputs(model, data)
-        self.u = None if u is None else u[grid.row]  # (S, K, m)
+        super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
         self.weight = self.used[grid.sample].to(data.q)[:, None]  # (N', 1)
-        # s is an unknown only where the positions depend on it.
-        self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
-        self.P = len(self.flat.get())
-        speed = data.q.new_tensor(model.config.speed)
-        scale = data.q.new_tensor(model.config.scale)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
-        relative = sigma / scale
-        self.action = float((speed * scale).sum())  # natural size of s
-        action = (speed * scale * relative)[: self.d - 2 * self.n]
+        relative = self.sigma / self.scale
+        action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
         self.s = s
-        self.joint_weight = torch.cat([scale * relative, speed * relative, action])
+        self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
 
@@ -102,12 +82,12 @@ class ShootingProblem:
         if self._solved is not None and torch.equal(self._solved[0], x):
             return self._solved[1]  # an accepted step has been solved for its cost
         theta, states = self.unpack(x)
-        start = torch.cat([states, states.new_zeros(len(states), 2 * self.n + 1 - self.d)], -1)
+        start = self.with_s(states)
         tol = 1e3 * torch.finfo(x.dtype).eps
         with torch.no_grad():
             path = None
             if self.path is not None:
-                path = solve_path(self.flat, theta, start, self.grid.h, self.path.x, tol, u=self.u)
+                path = solve_path(self.parameters, theta, start, self.grid.h, self.path.x, tol, u=self.u)
             if path is None:
                 path = self._step_through(theta, start, tol)
         self._solved = x.clone(), path
@@ -120,8 +100,7 @@ class ShootingProblem:
             return x.new_full((), torch.inf)
         fit, joints = self._residuals(path.x)
         anchor = self._anchor(x)
-        cost = loss(fit, self.freedom) + loss(joints, self.freedom) + anchor.square().sum() / 2
-        return cost if self.prior is None else cost + self.prior.cost(x[: self.P])
+        return self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(x[: self.P])
 
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Tensor, Tensor]:
         """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
@@ -134,8 +113,8 @@ class ShootingProblem:
         grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
         Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)
-        cost = loss(fit, self.freedom) + loss(joints, self.freedom)
-        by_fit, by_joint = self.weight * root_weights(fit, self.freedom), root_weights(joints, self.freedom)
+        cost = self.loss(fit, joints)
+        by_fit, by_joint = self.weight * self.root_weights(fit), self.root_weights(joints)
         fit, joints = by_fit * fit, by_joint * joints
         S = grid.segments
         A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
@@ -153,14 +132,12 @@ class ShootingProblem:
         A[anchored, anchored] += 1 / self._anchor_weight**2
         b[anchored] += anchor / self._anchor_weight
         cost = cost + anchor.square().sum() / 2
-        if self.prior is not None and held:
-            cost = cost + self.prior.cost(theta)
-        elif self.prior is not None:
-            prior_cost, prior_A, prior_b = self.prior.normal_equations(theta)
-            A[:P, :P] += prior_A
-            b[:P] += prior_b
-            cost = cost + prior_cost
-        return cost, A, b
+        if held:
+            return cost + self.prior_cost(theta), A, b
+        of_prior = self.prior_equations(theta)
+        A[:P, :P] += of_prior[1]
+        b[:P] += of_prior[2]
+        return cost + of_prior[0], A, b
 
     def states_at(self, path: Path, samples: Tensor) -> Tensor:
         """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
@@ -189,7 +166,7 @@ class ShootingProblem:
         Both carry the square roots of the weights: those of a robust loss, and 0 for samples that are not used.
         """
         r = self.misfit(path) / self.sigma
-        by = self.weight * root_weights(r, self.freedom)
+        by = self.weight * self.root_weights(r)
         Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] * (by / self.sigma)[..., None]
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
@@ -239,12 +216,12 @@ class ShootingProblem:
     def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
         """Solve by stepping, when there is no nearby trajectory to start from."""
         n = self.n
-        stepper = Stepper(self.flat.at(theta))
+        stepper = Stepper(self.parameters.at(theta))
         out = stepper.rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h, inputs=self.u)
         if not bool(out.ok.all()):
             return None
         guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
-        return solve_path(self.flat, theta, start, self.grid.h, guess, tol, u=self.u)
+        return solve_path(self.parameters, theta, start, self.grid.h, guess, tol, u=self.u)
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
@@ -253,7 +230,7 @@ class ShootingProblem:
         q1 = path.x[:, 1:, : self.n]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
-            B = parameter_derivatives(self.flat, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
+            B = parameter_derivatives(self.parameters, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         Z = [torch.cat([torch.zeros_like(B[:, 0]), eye], -1)]
         pad = theta.new_zeros(S, d, d)

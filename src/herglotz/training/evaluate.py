@@ -1,38 +1,63 @@
-"""Judging a fit: states at every sample, those of the unseen part by a free run, and their errors."""
+"""`evaluate`: states at every sample, those of the unseen part by a free run, and their errors."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import platform
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
+import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
-from herglotz.models import ContactLagrangian
+from herglotz.data.splits import leading_rows
 from herglotz.stepping import State, Stepper
-from herglotz.training.baseline import Baseline
-from herglotz.training.grid import substeps
 from herglotz.training.inputs import step_inputs
-from herglotz.training.residual import ResidualProblem
-from herglotz.training.supervision import SupervisedProblem
+from herglotz.training.look import Look
+from herglotz.training.objectives import Fitted
+from herglotz.training.plan import Plan
+from herglotz.training.problems.grid import substeps
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.supervised import SupervisedProblem
+from herglotz.training.run import Run, box_of
+from herglotz.training.task import Task
+from herglotz.training.verdict import judged
 
 
-@dataclass(frozen=True)
-class Fitted:
-    """What a fit of the training part hands to the judgement."""
+def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
+    """The finished run: its states, its free run beyond the training part, and what both miss."""
+    train, data, config = seen.train, seen.data, task.config
+    fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
+    dropped = seen.spikes.clone()
+    if fitted.used is not None:
+        dropped[~dropped] = ~fitted.used
+    states, status = _states_everywhere(fitted, data, train.lengths, task.base.model_step)
+    metrics = _errors(fitted, task, seen, dropped, states)
+    metrics |= judged(task, seen, fitted, metrics)
+    metrics |= {
+        "extrapolation_status": status,
+        "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
+        "seed": config.seed,
+        "level": config.level,
+        "plan": plan.to_dict(),
+        "data": {"source": data.source, "sha256": data.digest(), "trajectories": len(data), "samples": data.samples},
+        "versions": {
+            "herglotz": herglotz.__version__,
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }
+    x, n = fitted.states, data.dof
+    box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
+    h = train.typical_step / config.substeps
+    return Run(fitted.model, config, metrics, data, train.lengths, states, h, box, task.stages.history)
 
-    model: ContactLagrangian
-    states: Tensor  # (N_train, 2n+1) states at the training samples
-    objective: str
-    sigma: float
-    notes: dict[str, Any]
-    used: Tensor | None = None  # (N_train,) samples that were not found to be outliers; None: all
 
-
-def with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
+def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
     """States at all training samples: those left out of the fit are reached from the sample before."""
     n, u = train.dof, step_inputs(fitted.model, train)
     out = fitted.states.new_empty(train.samples, 2 * n + 1)
@@ -47,7 +72,7 @@ def with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor
     return out
 
 
-def states_everywhere(
+def _states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
     """States at every sample: fitted ones on the training part, a free run from the last of them after it."""
@@ -78,16 +103,9 @@ def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor]:
     return (t.diff() / counts).repeat_interleave(counts), counts.cumsum(0), row
 
 
-def judge(
-    fitted: Fitted,
-    data: Trajectories,
-    train: Trajectories,
-    dropped: Tensor,
-    states: State,
-    base: Baseline,
-    robust: bool,
-) -> dict[str, Any]:
+def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State) -> dict[str, Any]:
     """RMS errors in the units of q; None where there is nothing to measure or the prediction failed."""
+    data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
     training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, trained in zip(data.offsets, train.lengths, strict=True):
         training[first : first + trained] = True
@@ -96,13 +114,13 @@ def judge(
     used[training] = ~dropped
     if robust:
         beyond &= ~spikes(data)
-    unseen = data if train is data else _test_part(data, train.lengths)
+    unseen = seen.unseen or data
     triples = unseen.triples(base.max_step)
     problem = ResidualProblem(fitted.model, unseen, max_step=base.max_step)
     x = problem.start()
     if unit is not None:
         problem = SupervisedProblem(fitted.model, unseen, momenta=False, max_step=base.max_step)
-        x = torch.cat([x[: len(problem.flat.get())], x.new_tensor([unit]).log()])
+        x = torch.cat([x[: problem.P], x.new_tensor([unit]).log()])
     ratio = (triples.h1 / triples.h0)[:, None]
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
     stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
@@ -113,7 +131,7 @@ def judge(
         "train_rms": _rms(error[used]),
         "outliers": int(dropped.sum()),
         "outliers_unseen": int((~training).sum() - beyond.sum()),
-        "extrapolation_rms": None if train is data else _rms(error[beyond]),
+        "extrapolation_rms": None if seen.unseen is None else _rms(error[beyond]),
         "spread": _rms(data.q - data.q.mean(0)),
         "objective": fitted.objective,
         "sigma": fitted.sigma,
@@ -121,14 +139,6 @@ def judge(
         "parameters": sum(p.numel() for p in fitted.model.parameters()),
         **fitted.notes,
     }
-
-
-def _test_part(data: Trajectories, trained: tuple[int, ...]) -> Trajectories:
-    rows = [torch.arange(f + k, f + n) for f, n, k in zip(data.offsets, data.lengths, trained, strict=True)]
-    index = torch.cat(rows).to(data.t.device)
-    lengths = tuple(n - k for n, k in zip(data.lengths, trained, strict=True))
-    known = {name: x[index] for name in ("t", "q", "s", "p", "u") if (x := getattr(data, name)) is not None}
-    return replace(data, **known, lengths=lengths)
 
 
 def _rms(x: Tensor) -> float | None:
