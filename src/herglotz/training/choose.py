@@ -1,4 +1,4 @@
-"""`choose`: what a fit will do with the data that were looked at, and why."""
+"""`choose`: the decisions of a fit from a `Look` at the data, each with its reason."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from herglotz.training.one_step_fit import NOISE_OF_R
 from herglotz.training.plan import Plan
 from herglotz.training.task import NOISY
 
-RESTARTS = 4  # of a single layer: some random initialisations stall a hundred times higher than others
+RESTARTS = 4  # random initialisations of a single layer: some stall at a hundred times the error of others
 
 
 class Rule(NamedTuple):
-    """One question about the objective: asked in turn, the first that is answered decides."""
+    """One question about the objective; the first question that is answered decides."""
 
     question: str
     objective: str  # that a yes leads to
@@ -73,7 +73,7 @@ RULES = (
 
 
 def choose(seen: Look, user_settings: FitConfig) -> Plan:
-    """The plan that these data and the user's settings call for."""
+    """Return the plan that these data and the user's settings call for."""
     c, base, probe = seen.settings, seen.base, seen.probe
     objective, why = choose_objective(seen, user_settings)
     one_step, covered = objective in ("residual", "raw"), seen.baseline_motion is not None
@@ -104,7 +104,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
 
 
 def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
-    """The objective by the first of `RULES` that is answered, and its reason."""
+    """Return the objective of the first of `RULES` that is answered, and its reason."""
     for rule in RULES:
         reason = rule.answer(seen, user_settings)
         if reason is not None:
@@ -113,7 +113,7 @@ def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
 
 
 def drawing() -> str:
-    """How the objective is chosen, as a mermaid flowchart (docs/trajectory.md)."""
+    """Return the choice of the objective as a mermaid flowchart (docs/trajectory.md)."""
     lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
     for k, rule in enumerate(RULES, 1):
         if k == len(RULES):

@@ -1,4 +1,4 @@
-"""What a fit is asked to do: plain values, stored beside the result."""
+"""Settings of a fit, stored beside its result."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How well a fitted trajectory predicts blocks of time it was not fitted to, without fitting again."""
+"""Errors of a fitted trajectory over held-out blocks of time, without fitting again."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from herglotz.data import Trajectories
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
-FOLDS = 5  # fifths of every trajectory, in time
-MARGIN = 1.05  # an error lower by less than this factor is no reason for a weaker prior or a richer level
+FOLDS = 5  # held-out blocks: fifths of every trajectory, in time
+MARGIN = 1.05  # a weaker prior or a richer level must lower the error by more than this factor
 
 
 class Judged(Protocol):
     """A fit that knows its errors over held-out blocks of time."""
 
     def held_out_errors(self) -> Tensor:
-        """RMS of every fold, (FOLDS,), in units of q."""
+        """Return the RMS of every fold, (FOLDS,), in units of q."""
         ...
 
 
@@ -30,7 +30,7 @@ F = TypeVar("F", bound=Judged)
 
 @dataclass(frozen=True)
 class Chosen(Generic[F]):
-    """The fit whose strength of the prior held-out blocks chose, and the errors of all that were tried."""
+    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
 
     fit: F
     departure: float
@@ -43,7 +43,7 @@ def held_out_errors(
     theta: Tensor,  # (P,)
     A: Tensor,  # JᵀJ of the whole problem at the fit, prior included
 ) -> Tensor:
-    """RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
+    """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
     Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
     there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
@@ -73,7 +73,7 @@ def left_out_errors(
 
 
 def beaten(errors: Tensor, best: Tensor) -> bool:
-    """Whether held-out errors of blocks of time, (blocks,), are higher than the best ones beyond their spread.
+    """Return whether held-out errors of blocks of time, (blocks,), exceed the best ones beyond their spread.
 
     Spread: the standard error over blocks of the difference of their squared errors (the one-standard-error rule of
     Breiman et al. 1984). An error lower by less than a twentieth beats nothing, however certain: a weaker prior, or a
@@ -85,7 +85,7 @@ def beaten(errors: Tensor, best: Tensor) -> bool:
 
 
 def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
-    """The smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
+    """Return the smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
 

@@ -28,7 +28,7 @@ from herglotz.training.verdict import judged
 
 
 def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
-    """The finished run: its states, its free run beyond the training part, and what both miss."""
+    """Return the finished run: its states, its free run beyond the training part, and the errors of both."""
     train, data, config = seen.train, seen.data, task.config
     fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
     dropped = seen.spikes.clone()
@@ -58,7 +58,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
 
 
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
-    """States at all training samples: those left out of the fit are reached from the sample before."""
+    """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
     n, u = train.dof, step_inputs(fitted.model, train)
     out = fitted.states.new_empty(train.samples, 2 * n + 1)
     out[~dropped] = fitted.states
@@ -75,7 +75,7 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
 def _states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
-    """States at every sample: fitted ones on the training part, a free run from the last of them after it."""
+    """Return states at every sample: fitted ones on the training part, then a free run from the last of them."""
     known, n, u = fitted.states, data.dof, step_inputs(fitted.model, data)
     out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
     stepper, status, done = Stepper(fitted.model), "ok", 0
@@ -104,7 +104,7 @@ def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State) -> dict[str, Any]:
-    """RMS errors in the units of q; None where there is nothing to measure or the prediction failed."""
+    """Return RMS errors in units of q; None where no sample can be measured or the prediction failed."""
     data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
     training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, trained in zip(data.offsets, train.lengths, strict=True):

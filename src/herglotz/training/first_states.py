@@ -12,11 +12,11 @@ from herglotz.training.inputs import step_inputs
 from herglotz.training.problems.robust import FREEDOM, MAD, root_weights
 from herglotz.training.problems.shooting import ShootingProblem
 
-START = 8  # samples that a robust start state is read from
+START = 8  # samples that a robust start state is estimated from
 
 
 def first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
-    """Segment states from the first two samples of each, p by FL⁻; from a robust cubic where one may be an outlier."""
+    """Return segment states from the first two samples, p by FL⁻; from a robust cubic beside outliers."""
     i, data = problem.grid.start_sample, problem.data
     q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
     with torch.no_grad():

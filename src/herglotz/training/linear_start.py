@@ -1,4 +1,4 @@
-"""Where a dictionary of features starts: the coefficients of L_d from one linear problem, without a search.
+"""Starting values of a dictionary of features: the coefficients of L_d from one linear problem.
 
 L_d is linear in the coefficients x of its masses, features and friction, and so are the discrete Herglotz residual R
 and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (gauge), and a small L_d has a small R: so
@@ -33,7 +33,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A dictionary's residuals over a set of triples, and what they say of its coefficients."""
+    """Residuals of a dictionary over a set of triples, and the coefficients that they determine."""
 
     R: Tensor  # (T, n, F) of each column of coefficient 1
     J: Tensor  # (T, n, n, F)

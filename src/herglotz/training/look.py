@@ -1,4 +1,4 @@
-"""`look`: what the data are, before anything is decided about them."""
+"""`look`: sampling, noise, outliers, baseline and structure of the data, before any decision."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from herglotz.training.structure import kept_structure, start_of_features, struc
 from herglotz.training.task import NOISY, Task, drag_starts_the_fit
 from herglotz.training.trajectory_fit import check_size
 
-PROBE = 40  # iterations of the flexible one-step fit that measures the noise, and of those that other fits start from
-EXPLAINED = 100.0  # times the σ of exact data: a baseline that errs less explains them
+PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
+EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
 
 
 @dataclass(frozen=True)
 class Probe:
-    """A short one-step fit with a flexible correction: what it cannot explain is noise."""
+    """A short one-step fit with a flexible correction; its remaining error is noise."""
 
     model: ContactLagrangian
     rms: float  # one-step error, in units of q
@@ -44,7 +44,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class Look:
-    """What the data are."""
+    """The properties of the data that a plan depends on."""
 
     data: Trajectories  # all, angles unwrapped
     train: Trajectories  # the first part of every trajectory
@@ -97,7 +97,7 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
 
 
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
-    """Triples of the baseline's motion and how well they are known, where the baseline explains exact data."""
+    """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
     c = task.config
     other = c.features or c.known or c.alike or c.mass_width or c.supervision != "q" or task.data.u is not None
     if c.objective not in ("auto", "residual") or other:

@@ -19,12 +19,12 @@ from herglotz.training.smoothing_fit import fit_smoothing
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
-LOOSE = 0.02  # σ of the short fit that others start from, relative to the motion's size: it shall not follow the noise
+LOOSE = 0.02  # σ of the short fits that others start from, relative to the motion's size: they shall not follow noise
 
 
 @dataclass(frozen=True)
 class Fitted:
-    """What an objective hands to `evaluate`."""
+    """The result of an objective, for `evaluate`."""
 
     model: ContactLagrangian
     states: Tensor  # (N_train, 2n+1) states at the training samples

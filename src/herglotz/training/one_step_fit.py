@@ -17,11 +17,11 @@ from herglotz.training.solvers.matrix_free import DENSE, MatrixFree
 from herglotz.training.stages import Callback
 from herglotz.training.task import Task
 
-NOISE_OF_R = 6**0.5  # standard deviation of q2 − 2 q1 + q0 over that of q: r's of noisy positions
+NOISE_OF_R = 6**0.5  # standard deviation of q2 − 2 q1 + q0, hence of r, over that of independent noise in q
 ITERATIONS_BEFORE_SELECTION = 30  # of each restart, at most a third of all iterations together; only the best goes on
 SEED_STRIDE = 7919  # between the seeds of restarts: no seed below 7919 shares a draw with another
-ADAM_STEPS = 20  # of Adam for an iteration of Levenberg–Marquardt: it needs no Jacobian, and many more steps
-ROWS = 50  # residuals a coefficient that a one-step fit of found features takes: the rest only costs time
+ADAM_STEPS = 20  # steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps
+ROWS = 50  # residuals for each coefficient in a one-step fit of found features: more only cost time
 
 
 def one_step_problem(
@@ -57,7 +57,7 @@ def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tu
 
 
 def _levenberg_marquardt(problem: OneStep, iterations: int) -> Callable[[Tensor, Callback], OptimiserResult]:
-    """The optimiser, without a matrix where there are more parameters than it has room for."""
+    """Return the optimiser; it forms no matrix where there are too many parameters for one."""
     large = isinstance(problem, ResidualProblem) and not problem.carries_s and problem.P > DENSE
     target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
     return lambda x, callback: levenberg_marquardt(target, x, max_iterations=iterations, callback=callback)

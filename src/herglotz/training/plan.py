@@ -72,7 +72,7 @@ class Plan:
             raise InputError(f"the plan is incomplete ({error}); take one that `fit` wrote") from None
 
 
-# What is printed: not the many starting values.
+# The decisions that `table` prints; the starting values are too many.
 DECISIONS = tuple(f.name for f in fields(Plan) if f.name not in ("start", "reasons"))
 
 

@@ -1,4 +1,4 @@
-"""Smoothed states with their standard errors, the model held."""
+"""Smoothed states of a fixed model, with their standard errors."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Smoothed:
 
 
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """Smoothed states of each trajectory, the model held.
+    """Return the smoothed states of each trajectory for a fixed model.
 
     Parameters
     ----------

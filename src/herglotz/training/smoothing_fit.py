@@ -27,11 +27,11 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import LOST, STAGE
 
-ROUNDS = 8  # in which both noises are found; at first the steps' is taken as large as the data's
-FALL = 10.0  # factor by which the steps' noise falls in a round, at the most: a model still far off explains too little
-SETTLED = 0.1  # change of its logarithm that ends the rounds
-SMOOTHED = 20_000  # numbers in q at the most: a held-out fifth of them is solved for at once (1.3 GB, a few times)
-LEAST = 1e-2  # of the steps' noise relative to the data's: with less the states are a motion of the model
+ROUNDS = 8  # rounds of the estimate of both noises, which starts with steps as noisy as the data
+FALL = 10.0  # largest factor by which the noise of the steps falls in a round: a poor model explains too little
+SETTLED = 0.1  # the rounds end where the logarithm of that noise changes by less
+SMOOTHED = 20_000  # most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times)
+LEAST = 1e-2  # least noise of the steps over that of the data: below, the states are a motion of the model
 FLOOR = 1e-8  # least σ relative to the largest |q|: rounding
 
 

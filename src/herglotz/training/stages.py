@@ -21,7 +21,7 @@ EVERY = 25  # iterations between two checkpoints inside a stage
 
 
 class Stages:
-    """Runs optimisations one after the other and remembers them.
+    """Run optimisations one after the other, and record them.
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
     and an unfinished one goes on from its best point.

@@ -1,4 +1,4 @@
-"""What several coordinates are made of, where nobody says it.
+"""The structure of several coordinates, found from the data.
 
 Every planar chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary
 `revolute` (`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and
@@ -35,20 +35,20 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
 
-MOST, MOST_LENGTHS = 3, 12  # coordinates: the dictionary of joints grows as 3ⁿ n²
-TRIPLES, ENOUGH = 4000, 5  # triples that tell the structures apart; residuals a coefficient, at least
-NUMBERS = 3e7  # in the derivatives of the linear problem: 240 MB
-NEAR = 0.02  # of the RMS distance: powers of r below 0 are no candidates where the data come nearer
-THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shorter ones
-MISSED = 2.0  # residual above so many times the noise: a force is missing from the dictionary of lengths
-BETTER = 0.5  # where order 4 lowers the one-step error by less than this factor, order is not what the rule lacks
-EXPLAINED = 1e-7  # one-step error relative to the size of the motion below which the rule lacks nothing
+MOST, MOST_LENGTHS = 3, 12  # most coordinates with and without an angle: the dictionary of joints grows as 3ⁿ n²
+TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
+NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
+NEAR = 0.02  # negative powers of r are candidates where the data stay beyond this share of the RMS distance
+THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
+MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
+BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
+EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
 
 class Structure(NamedTuple):
-    """What several coordinates are made of."""
+    """The terms and starting values that were found for several coordinates."""
 
     config: FitConfig  # the settings with the features, the order and the objective that the data call for
     base: Baseline  # with starting values

@@ -1,4 +1,4 @@
-"""What every stage of a fit works with, and the model that it starts from."""
+"""The data, settings and record that every stage of a fit shares, and the model that it starts from."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.stages import Stages
 
-WIDER = 3  # times the units in a single layer: it reaches a tenth of the error of two layers in as much time
-NOISY = 3e-4  # one-step error relative to the motion's size above which it is noise: 40 iterations reach it without
-EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size: errors below are rounding
+WIDER = 3  # a single layer has this multiple of units: it reaches a tenth of the error of two layers in the same time
+NOISY = 3e-4  # a one-step error above this share of the motion's size is noise: 40 iterations reach it on exact data
+EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
 
 
 @dataclass(frozen=True)
