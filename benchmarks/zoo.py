@@ -18,12 +18,14 @@ import warnings
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.harness import commit
 from benchmarks.zoo_systems.drawing import draw
 from benchmarks.zoo_systems.judging import Predictions, outcome, relative, score
 from benchmarks.zoo_systems.ours import fit_ours, plain
-from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions
+from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
 from benchmarks.zoo_systems.report import report, shares, shown
 from benchmarks.zoo_systems.sindy import fit_sindy
 from benchmarks.zoo_systems.systems import ZooSystem
@@ -34,7 +36,7 @@ KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", 
 
 def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     """One row of the results."""
-    row = of.facts()
+    row = of.facts() | {"beyond": beyond(of)}
     for name, fit in (("known", lambda of: MechanismModel(of.fitted)), ("sindy", fit_sindy)):
         began = time.process_time()
         found = own_predictions(of, fit(of))
@@ -48,10 +50,19 @@ def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     return row
 
 
+def beyond(of: ZooSystem) -> float:
+    """How far the unseen recordings leave the range of the training positions, over the size of the motion."""
+    seen = of.train.truth[:, : trained(of.train)].reshape(-1, of.mechanism.n)
+    out = np.maximum(of.test.truth - seen.max(0), seen.min(0) - of.test.truth) / of.size
+    return round(max(0.0, float(out.max())), 4)
+
+
 def numbers(of: ZooSystem, found: Predictions | None) -> dict[str, float | None]:
-    """Errors over the noise and over the size of the motion; None where a sample was not reached."""
+    """Errors over the noise, of each part too, and over the size of the motion; None where a sample was not reached."""
     pair = (math.inf, math.inf) if found is None else (score(of, found), relative(of, found))
-    return {name: x if math.isfinite(x) else None for name, x in zip(("score", "relative"), pair, strict=True)}
+    values = dict(zip(("score", "relative"), pair, strict=True))
+    values |= {f"score_{part}": score(of, {part: pairs}) for part, pairs in (found or {}).items()}
+    return {name: x if math.isfinite(x) else None for name, x in values.items()}
 
 
 def line(row: dict[str, Any]) -> str:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from benchmarks.zoo import line, numbers
+from benchmarks.zoo import beyond, line, numbers
 from benchmarks.zoo_systems.drawing import KINDS, draw, draw_mechanism
 from benchmarks.zoo_systems.judging import AT, AT_NOISE, SAID, SILENT, USE, outcome, relative, score
 from benchmarks.zoo_systems.known import fit_known
@@ -183,5 +183,15 @@ def test_what_was_not_reached_is_null_in_json(pendulum):
     row["ours"] = numbers(pendulum, None) | {"cpu_s": 150.0, "said": "too slow"}
     json.dumps(row, allow_nan=False)
     assert row["ours"]["score"] is None
+    assert row["known"]["score"] == max(row["known"][f"score_{part}"] for part in ("later", "unseen"))
     assert "too slow" in report([row], 1, 150.0)
     assert "not reached" in line(row)
+
+
+def test_how_far_unseen_motions_leave_what_was_trained_on(pendulum):
+    # fails if the held-out third counts as trained on, or a motion below the range is not seen
+    inside = replace(pendulum.train, truth=pendulum.train.truth[:, : trained(pendulum.train)])
+    assert beyond(replace(pendulum, test=inside)) == 0.0
+    for sign in (-1, 1):
+        far = replace(inside, truth=inside.truth + sign * 100.0 * pendulum.size)
+        assert beyond(replace(pendulum, test=far)) == pytest.approx(100.0, abs=1e-3)
