@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import Partials, partials
-from herglotz.mechanics.root import find_root
+from herglotz.mechanics.newton import find_root
 from herglotz.stepping import State
 
 OSCILLATOR = "damped oscillator m = Ω = 1, γ = 0.2, h = 0.1, start (1, 0.5, 0.3)"
@@ -60,9 +60,9 @@ def two_dof() -> tuple[State, float]:
 def printed_left(L_d: Callable[..., Tensor], p0: Tensor, q1: Tensor, s1: Tensor, h: float, near: Tensor) -> Partials:
     """H⁻ as printed, −p0·q0 − L_d(q0, q1, s1) with D1 L_d(q0, q1, s1) = −p0, and its true derivatives."""
 
-    def equations(q0: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equations(q0: Tensor) -> tuple[Tensor, Tensor]:
         P = partials(L_d, q0, q1, s1, h, order=2)
-        return P.D1 + p0, (P.D11,)
+        return P.D1 + p0, P.D11
 
     q0 = find_root(equations, near).solved
     P = partials(L_d, q0, q1, s1, h)

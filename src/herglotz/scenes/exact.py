@@ -15,6 +15,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
+from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
 from herglotz.scenes.motion import Motion, lagrangian_motion, state_change
 from herglotz.scenes.reference import integrate
 from herglotz.scenes.scene import StateFunction
@@ -105,15 +106,20 @@ class NumericallyExact:
             s0, h = s0.double().expand(shape), as_step(h, q0).expand(shape)
             y = self.motion.start(0.5 * (q0 + q1), (q1 - q0) / h[..., None], s0)
             scale = 1.0 + torch.maximum(q0.abs().amax(-1), q1.abs().amax(-1))
-            for iteration in range(self.max_iterations):
+
+            def shot(y: Tensor, second: bool = True) -> Point:  # noqa: ARG001  one signature for all
                 end = self._end(q0, y, s0, h)
-                miss = q1 - end.q
-                far = ~(miss.abs().amax(-1) <= MISS * scale)
-                step = torch.linalg.solve_ex(end.y, miss[..., None])[0][..., 0]
-                go = far & torch.isfinite(step).all(-1)
-                if iteration + 1 == self.max_iterations or not bool(go.any()):
-                    break
-                y = torch.where(go[..., None], y + step, y)
+                return Point(end.q - q1, end.y, end)
+
+            unit = torch.ones_like(s0)
+            # A move of y moves q1 by about h times as much.
+            rules = Rules(
+                MISS, self.max_iterations, natural=True, shortest=SHORTEST, length=lambda y: largest(y) * h / scale
+            )
+            found = newton(shot, y, rules, lambda *_: (unit, MISS * unit))
+            end: _End = (shot(found.x) if found.mixed else found.point).rest
+            miss = q1 - end.q
+            far = ~(miss.abs().amax(-1) <= MISS * scale)
             reason = torch.full(shape, Reason.NONE, dtype=torch.uint8, device=q0.device)
             reason = torch.where(end.error <= self.tolerance, reason, Reason.UNRESOLVED)
             reason = torch.where(end.opened, reason, Reason.CONJUGATE)

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import Partials, autograd_partials
+from herglotz.mechanics.newton import attached, find_root
 from herglotz.scenes.implicit import MAX_NEWTON, fixed_point
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import Lagrangian
@@ -100,36 +101,24 @@ class GalerkinLobatto:
         n, c = q0.shape[-1], torch.tensor(NODES[self.order], dtype=q0.dtype, device=q0.device)
         shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
         q0, q1, s0 = q0.expand(*shape, n), q1.expand(*shape, n), s0.expand(shape)
+        start = (q0[..., None, :] + c[1:-1, None] * (q1 - q0)[..., None, :]).flatten(-2).detach()
+
+        def equations(inside: Tensor) -> tuple[Tensor, Tensor]:
+            P = self._derivatives(q0, inside, q1, s0, h, 2)
+            return P.D1[..., n:-n], P.D11[..., n:-n, n:-n]
+
         with torch.no_grad():
-            inside = (q0[..., None, :] + c[1:-1, None] * (q1 - q0)[..., None, :]).flatten(-2)
-            inside, P = self._newton(q0, inside, q1, s0, h)
+            scale = 1.0 + torch.maximum(q0.abs().amax(-1, keepdim=True), q1.abs().amax(-1, keepdim=True))
+            tol = torch.finfo(q0.dtype).eps ** 0.5  # the move after one below √eps is below rounding
+            root = find_root(equations, start, scale.expand_as(start), iterations=MAX_NEWTON, tol=tol)
+            inside = torch.where(root.converged[..., None], root.x + root.move, torch.nan)
+            P = self._derivatives(q0, inside, q1, s0, h, 2)
         if torch.is_grad_enabled():
             F = self._derivatives(q0, inside, q1, s0, h, 1).D1[..., n:-n]
             if F.requires_grad:  # an argument, or a parameter of L
-                J = P.D11[..., n:-n, n:-n]
-                inside = inside - torch.linalg.solve_ex(J, (F - F.detach())[..., None])[0][..., 0]
+                inside = attached(inside, P.D11[..., n:-n, n:-n], F)
                 P = self._derivatives(q0, inside, q1, s0, h, 1 + second)
         return torch.cat([q0, inside, q1], -1), P
-
-    def _newton(self, q0: Tensor, inside: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Partials]:
-        n = q0.shape[-1]
-        scale = 1.0 + torch.maximum(q0.abs().amax(-1), q1.abs().amax(-1))
-        tolerance = 64 * torch.finfo(q0.dtype).eps
-        done = torch.zeros_like(s0, dtype=torch.bool)
-        for _ in range(MAX_NEWTON):
-            P = self._derivatives(q0, inside, q1, s0, h, 2)
-            step = torch.linalg.solve_ex(P.D11[..., n:-n, n:-n], P.D1[..., n:-n, None])[0][..., 0]
-            size = step.abs().amax(-1) / scale
-            done = done | (size <= tolerance)
-            if bool(done.all()):
-                break
-            inside = torch.where(done[..., None], inside, inside - step)
-        failed = torch.where(done, 0.0, torch.nan)
-
-        def marked(x: Tensor) -> Tensor:
-            return x + failed.reshape(failed.shape + (1,) * (x.ndim - failed.ndim))
-
-        return marked(inside), P.map(marked)
 
     def _derivatives(self, q0: Tensor, inside: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
         z = torch.cat([q0, inside, q1], -1)

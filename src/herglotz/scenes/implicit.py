@@ -11,6 +11,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from herglotz.mechanics.newton import find_root, solve
 from herglotz.theory.continuous import jacobian
 
 MAX_NEWTON = 30
@@ -27,24 +28,19 @@ def fixed_point(
     Solved outside the graph. Where gradients are on and g wants them, further steps inside the graph carry the first
     three derivatives of x with respect to whatever g depends on.
     """
-    x, inverse, converged = _solve(g, start.detach())
+    start = start.detach()
+    eye = torch.eye(start.shape[-1], dtype=start.dtype, device=start.device)
+
+    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
+        value, slope = jacobian(g, x)
+        return x - value, eye - slope
+
+    # The move after one below √eps is below rounding.
+    root = find_root(
+        equations, start, 1.0 + start.abs(), iterations=MAX_NEWTON, tol=torch.finfo(start.dtype).eps ** 0.5
+    )
+    x = root.x + root.move
     if torch.is_grad_enabled() and g(x).requires_grad:
         for _ in range(EXACT_DERIVATIVES):
-            x = x + (inverse @ (g(x) - x)[..., None])[..., 0]
-    return torch.where(converged[..., None], x, torch.nan)
-
-
-def _solve(g: Callable[[Tensor], Tensor], x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, (I − ∂g/∂x)⁻¹ and whether the iteration has converged."""
-    with torch.no_grad():
-        eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        tolerance = torch.finfo(x.dtype).eps ** 0.5  # the step after it is below round-off
-        for _ in range(MAX_NEWTON):
-            value, slope = jacobian(g, x)
-            inverse = torch.linalg.inv_ex(eye - slope)[0]
-            step = (inverse @ (value - x)[..., None])[..., 0]
-            x = x + step
-            converged = (step.abs() <= tolerance * (1.0 + x.abs())).all(-1)
-            if bool(converged.all()):
-                break
-        return x, inverse, converged
+            x = x - solve(root.J, x - g(x))
+    return torch.where(root.converged[..., None], x, torch.nan)

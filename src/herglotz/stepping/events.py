@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import Crossings, State, Step
+from herglotz.stepping.state import Crossings, State, Status, Step
 
 MAX_TRIALS = 80
 

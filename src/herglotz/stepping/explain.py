@@ -8,8 +8,8 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.regularity import CONDITIONS, Regularity, regularity
-from herglotz.stepping.newton import Status, solve_step
-from herglotz.stepping.state import State
+from herglotz.stepping.newton import solve_step
+from herglotz.stepping.state import State, Status
 
 ATTEMPTS, ESCAPE = 60, 4.0
 STEPPING = ("finite", "c", "M", "pole")  # what a step needs; H⁺ and H⁻ may be lost

@@ -24,7 +24,7 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.newton import Status
+from herglotz.stepping.state import Status
 
 
 class Move(NamedTuple):

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.engine import driven_by
 from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import State, Step
 
 # (q0, p0, s0, h, Δ, u) → F (..., n), p1 (..., n), L (...)

@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from enum import IntEnum
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.stepping.newton import Status
+from herglotz.mechanics.newton import Root
+
+
+class Status(IntEnum):
+    """How the solve for one step ended."""
+
+    CONVERGED = 0
+    MAX_ITERATIONS = 1  # no convergence within the allowed iterations
+    SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
+    DIVERGED = 3  # a value stopped being finite
+    STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
+    BAD_INPUT = 5  # h is no step, or a number is not finite: of exported files only, a stepper raises
+    UNRESOLVED = 6  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
 
 
 class StepError(RuntimeError):
@@ -29,12 +42,22 @@ class State(NamedTuple):
 class Step:
     """One step and how it went."""
 
-    state: State
+    state: Any  # `State`, or `herglotz.theory.BodyState`
     c: Tensor  # (...) conformal factor of the step
     status: Tensor  # (...) Status values
     residual: Tensor  # (...) |J⁻¹F|: what is left of the step equation, in units of q
     iterations: int
     outside: Tensor | None = None  # (...) of an exported file: 1 where the step leaves the box it was fitted in
+
+    @classmethod
+    def of(cls, new: Any, c: Tensor, status: Tensor, residual: Tensor, iterations: int) -> Step:
+        """The step, NaN in the samples that failed."""
+        failed = status != Status.CONVERGED
+        if bool(failed.any()):
+            nan = torch.where(failed, torch.nan, torch.zeros_like(c))
+            add = lambda x: x + nan.reshape(nan.shape + (1,) * (x.ndim - nan.ndim))  # noqa: E731
+            new, c = type(new)(*map(add, new)), c + nan
+        return cls(new, c, status, residual, iterations)
 
 
 @dataclass(frozen=True)
@@ -62,19 +85,6 @@ class Rollout:
     residual: Tensor  # (..., K)
     events: tuple[Crossings, ...] = ()  # one for each event asked for
     outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
-
-    @classmethod
-    def of(cls, states: list[State], steps: list[Step]) -> Rollout:
-        """Join K+1 states and the K steps between them."""
-        factors = torch.stack([torch.ones_like(states[0].s), *(step.c for step in steps)], -1)
-        return cls(
-            q=torch.stack([x.q for x in states], -2),
-            p=torch.stack([x.p for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=factors.cumprod(-1),
-            status=torch.stack([step.status for step in steps], -1),
-            residual=torch.stack([step.residual for step in steps], -1),
-        )
 
     @property
     def final(self) -> State:
@@ -137,6 +147,24 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
     if steps is not None and steps != h.shape[-1]:
         raise InputError(f"h lists {h.shape[-1]} steps but steps={steps}; give one of the two")
     return h
+
+
+def status_of_root(root: Root, finite: Tensor, singular: Tensor | None = None) -> Tensor:
+    """The status of each sample from where its iteration ended, uint8.
+
+    Parameters
+    ----------
+    root
+        The solved unknowns.
+    finite
+        (...) whether the step has finite numbers.
+    singular
+        (...) whether the step is not defined at the solution, beside where J is singular.
+    """
+    singular = ~torch.isfinite(root.error) if singular is None else singular | ~torch.isfinite(root.error)
+    status = torch.where(root.converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+    status = torch.where(singular, int(Status.SINGULAR), status)
+    return torch.where(finite, status, int(Status.DIVERGED)).to(torch.uint8)
 
 
 def throw_failure(status: Tensor, residual: Tensor) -> None:

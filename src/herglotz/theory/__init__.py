@@ -72,7 +72,7 @@ from herglotz.theory.noether import (
     momentum_map,
     noether_defect,
 )
-from herglotz.theory.rigid_body import BodyRollout, BodyState, BodyStep, RigidBodyStepper
+from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
 from herglotz.theory.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
 from herglotz.theory.splitting import ContactSplitting, linear_damping
 
@@ -80,7 +80,6 @@ __all__ = [
     "Action",
     "BodyRollout",
     "BodyState",
-    "BodyStep",
     "ConstrainedStepper",
     "ContactSplitting",
     "Curve",

@@ -23,19 +23,25 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.mechanics.root import Root, find_root
-from herglotz.stepping.newton import Status
-from herglotz.stepping.rollout import Plan, roll_out
-from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
+from herglotz.mechanics.newton import Root, attached, find_root
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.state import (
+    State,
+    Step,
+    check_h,
+    check_state,
+    status_of_root,
+    throw_failure,
+)
 from herglotz.theory.continuous import jacobian
 
 Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
 Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)
 
-PROJECTIONS = 8  # Newton steps for μ at most; where v is linear in p the first is exact
+PROJECTIONS = 20  # Newton steps for μ at most
 
 
-class ConstrainedStepper:
+class ConstrainedStepper(OneStepMethod):
     """Φ̃ on the constraint manifold {g = 0, Dg·v = 0}.
 
     Parameters
@@ -102,42 +108,22 @@ class ConstrainedStepper:
         P = partials(self.L_d, state.q, q1, state.s, h)
         s1 = state.s + P.L
         p1 = self._projected(q1, momentum_plus(P), s1, self._rows(q1)[1])
-        new, c = State(q1, p1, s1), P.c
-        status = self._status(root, new, c)
-        failed = status != Status.CONVERGED
-        if bool(failed.any()):
-            nan = torch.where(failed, torch.nan, torch.zeros_like(s1))
-            new, c = State(q1 + nan[..., None], p1 + nan[..., None], s1 + nan), c + nan
+        # A rank-deficient Dg leaves the saddle-point matrix, or the projection, without an inverse.
+        end = torch.isfinite(p1).all(-1) & torch.isfinite(s1)
+        singular = (P.c == 0) | (root.converged & ~end)
+        status = status_of_root(root, torch.isfinite(root.x).all(-1), singular)
         if self.throw:
             throw_failure(status, root.error)
-        return Step(new, c, status, root.error, root.iterations)
+        return Step.of(State(q1, p1, s1), P.c, status, root.error, root.iterations)
 
     def multiplier(self, state: State, h: Tensor | float) -> Tensor:
         """λ of one step, (..., m); 2λ/h tends to the constraint's force (half of each impulse acts at each end)."""
         state = check_state(state)
         return self._solve(state, check_h(h, state.q), None)[1]
 
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        every: int = 1,
-    ) -> Rollout:
-        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
-        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
-        h_all = step_sizes(check_h(h, q), steps)
-        plan = Plan(h_all.shape[-1], every)
-        return roll_out(
-            start,
-            h_all,
-            lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess if k else None), None),
-            plan,
-            None,
-        )
+    @property
+    def _iterates(self) -> bool:
+        return True
 
     def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """G(q) and Dg(q), (..., m) and (..., m, n)."""
@@ -162,11 +148,11 @@ class ConstrainedStepper:
             F = torch.cat([momentum_residual(P, p0) - (Dg0.mT @ x[..., n:, None])[..., 0], g1], -1)
             return F, Dg1, P
 
-        def equations(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        def equations(x: Tensor) -> tuple[Tensor, Tensor]:
             F, Dg1, P = balance(x, 2)
             upper = torch.cat([momentum_jacobian(P, p0), -Dg0.mT], -1)
             lower = torch.cat([Dg1, Dg1.new_zeros(*Dg1.shape[:-1], m)], -1)
-            return F, (torch.cat([upper, lower], -2),)
+            return F, torch.cat([upper, lower], -2)
 
         with torch.no_grad():
             if guess is None:
@@ -180,31 +166,22 @@ class ConstrainedStepper:
             impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
             scale = torch.cat([size.expand(q0.shape), impulse], -1)
             root = find_root(equations, start, scale, iterations=self.max_iterations)
-            x = root.x
-            (K,) = equations(x)[1]
+        x = root.x
         if torch.is_grad_enabled():
-            F, _, _ = balance(x, 1)
-            if F.requires_grad:
-                x = x - torch.linalg.solve_ex(K, (F - F.detach())[..., None])[0][..., 0]
+            x = attached(x, root.J, balance(x, 1)[0])
         return x[..., :n], x[..., n:], root
 
     def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
-        """The momentum p + Dgᵀμ with Dg·v = 0, by Newton on μ."""
-        rounding = 16 * torch.finfo(p.dtype).eps
-        for _ in range(PROJECTIONS):
-            v, v_p = jacobian(lambda p: self.velocity(q, p, s), p)
-            along = Dg @ v[..., None]
-            p = p - (Dg.mT @ torch.linalg.solve_ex(Dg @ v_p @ Dg.mT, along)[0])[..., 0]
-            left = (Dg @ self.velocity(q, p, s)[..., None]).detach().abs().amax((-2, -1))
-            if not bool((left > rounding * Dg.detach().abs().amax((-2, -1)) * v.detach().abs().amax(-1)).any()):
-                break
-        return p
+        """The momentum p + Dgᵀμ with Dg·v = 0; where v is linear in p one Newton step finds μ."""
 
-    def _status(self, root: Root, new: State, c: Tensor) -> Tensor:
-        status = torch.where(root.converged, Status.CONVERGED, Status.MAX_ITERATIONS)
-        finite = torch.isfinite(root.x).all(-1)
-        end = torch.isfinite(new.p).all(-1) & torch.isfinite(new.s)
-        # A rank-deficient Dg leaves the saddle-point matrix, or the projection, without an inverse.
-        singular = ~torch.isfinite(root.error) | (c == 0) | (root.converged & ~end)
-        status = torch.where(singular, Status.SINGULAR, status)
-        return torch.where(finite, status, Status.DIVERGED).to(torch.uint8)
+        def equations(mu: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+            v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
+            return (Dg @ v[..., None])[..., 0], Dg @ v_p @ Dg.mT
+
+        start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
+        scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
+        root = find_root(lambda mu: equations(mu, p), start, scale, iterations=PROJECTIONS)
+        mu = root.x
+        if torch.is_grad_enabled():
+            mu = attached(mu, root.J, equations(mu, p)[0])
+        return p + (Dg.mT @ mu[..., None])[..., 0]

@@ -24,9 +24,9 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.stepping.newton import Status
-from herglotz.stepping.rollout import Plan, roll_out
-from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
+from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.state import State, Status, Step, check_h, check_state, throw_failure
 from herglotz.theory.continuous import jacobian
 from herglotz.theory.jacobi import Triple
 from herglotz.theory.legendrian import contact_product_point
@@ -49,7 +49,7 @@ def legendrian_relation(
     return contact_product_point((q0, momentum_minus(P), s0), (q1, momentum_plus(P), s0 + P.L), P.c)
 
 
-class LegendrianStepper:
+class LegendrianStepper(OneStepMethod):
     """Steps along the Legendrian relation of a discrete Lagrangian whose M may be singular.
 
     Parameters
@@ -118,11 +118,10 @@ class LegendrianStepper:
         P = partials(self.L_d, q0, q1, s0, h)
         failed = (status != Status.CONVERGED) | (P.c == 0)
         status = torch.where(failed & (status == Status.CONVERGED), Status.SINGULAR, status).to(torch.uint8)
-        nan = torch.where(failed, torch.nan, torch.zeros_like(s0))
-        new = State(q1 + nan[..., None], momentum_plus(P) + nan[..., None], s0 + P.L + nan)
         if self.throw:
             throw_failure(status, residual)
-        return Step(State(*(x.detach() for x in new)), (P.c + nan).detach(), status, residual, iterations)
+        new = State(*(x.detach() for x in (q1, momentum_plus(P), s0 + P.L)))
+        return Step.of(new, P.c.detach(), status, residual, iterations)
 
     def consistent(self, state: State, h: Tensor | float) -> State:
         """The state moved to where a step exists, in the directions of q that FL⁺ does not see (the kernel of M).
@@ -147,28 +146,9 @@ class LegendrianStepper:
         nan = torch.where(status == Status.CONVERGED, torch.zeros_like(s0), torch.nan)
         return State(moved(y).q + nan[..., None], p0, s0)
 
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        every: int = 1,
-    ) -> Rollout:
-        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
-        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
-        h_all = step_sizes(check_h(h, q), steps)
-        plan = Plan(h_all.shape[-1], every)
-        with torch.no_grad():
-            return roll_out(
-                start,
-                h_all,
-                lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess), None),
-                plan,
-                None,
-            )
+    @property
+    def _iterates(self) -> bool:
+        return True
 
     def _chain(self, state: State, h: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """All c_j p_j + D1 L_d(q_j, q_{j+1}, s_j) for x = (q1, q2, …), and the size of their terms."""
@@ -186,32 +166,30 @@ class LegendrianStepper:
     def _least_squares(self, system: System, start: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
         """Gauss–Newton from `start`, moves of least norm; x, status, residual relative to its terms, iterations."""
         eps = torch.finfo(start.dtype).eps
-        x, best = start, torch.full_like(start[..., 0], torch.inf)
-        kept, iterations = start, 0
-        for iterations in range(self.max_iterations + 1):
-            (F, sizes), J = self._linearised(system, x)
-            residual = (F.abs() / torch.where(sizes > 0, sizes, 1.0)).amax(-1)
-            better = residual < best
-            kept, best = torch.where(better[..., None], x, kept), torch.where(better, residual, best)
-            # Two iterations past the square root of rounding reach rounding; a sample that gets no better is over.
-            if bool(((best <= 4 * eps) | ~better).all()) or iterations == self.max_iterations:
-                break
-            x = x - (self._pseudo_inverse(J) @ F[..., None])[..., 0]
-        finite = torch.isfinite(best)
-        done = best <= eps**0.75  # 1.8e-12 in float64, 6e-6 in float32: rounding of several steps
-        status = torch.where(done, Status.CONVERGED, Status.SINGULAR)
-        return kept, torch.where(finite, status, Status.DIVERGED), best, iterations
 
-    def _linearised(self, system: System, x: Tensor) -> tuple[tuple[Tensor, Tensor], Tensor]:
-        sizes: list[Tensor] = []
+        def at(x: Tensor, second: bool = True) -> Point:  # noqa: ARG001  one signature for all
+            terms: list[Tensor] = []
 
-        def F(x: Tensor) -> Tensor:
-            value, size = system(x)
-            sizes.append(size)
-            return value
+            def F(x: Tensor) -> Tensor:
+                value, size = system(x)
+                terms.append(torch.where(size > 0, size, 1.0))
+                return value
 
-        value, J = jacobian(F, x)
-        return (value.detach(), sizes[-1]), J.detach()
+            value, J = jacobian(F, x)
+            return Point(value.detach(), self._pseudo_inverse(J.detach()), terms[-1])
+
+        def sizes(x: Tensor, _: Point, left: Tensor) -> tuple[Tensor, Tensor]:
+            scale = torch.maximum(largest(x), torch.nan_to_num(left, nan=0.0, posinf=0.0))
+            return scale, eps ** (2 / 3) * scale
+
+        solver = lambda inverse, F: (inverse @ F[..., None])[..., 0]  # noqa: E731
+        rules = Rules(4 * eps, self.max_iterations, natural=True, shortest=SHORTEST, solver=solver)
+        found = newton(at, start, rules, sizes)
+        point = at(found.x) if found.mixed else found.point
+        residual = largest(point.F / point.rest)
+        status = torch.where(residual <= eps**0.75, int(Status.CONVERGED), int(Status.SINGULAR))  # 1.8e-12 in float64
+        status = torch.where(torch.isfinite(residual), status, int(Status.DIVERGED))
+        return found.x, status, residual, found.iterations
 
     def _pseudo_inverse(self, J: Tensor) -> Tensor:
         """J⁺ with the rank decided at `rank_tol`; zeros where J is not finite."""

@@ -12,9 +12,16 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.root import Root, find_root
-from herglotz.stepping.newton import Status, solve
-from herglotz.stepping.state import Rollout, State, Step, StepError, check_h, check_state, step_sizes, throw_failure
+from herglotz.mechanics.newton import attached, find_root
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.state import (
+    State,
+    Step,
+    check_h,
+    check_state,
+    status_of_root,
+    throw_failure,
+)
 from herglotz.theory.continuous import Hamiltonian, contact_vector_field, evolution_vector_field, square_jacobian
 from herglotz.theory.discrete_gradient import DiscreteGradient, midpoint_gradient
 from herglotz.theory.jacobi import join, sharp_bivector, split
@@ -22,7 +29,7 @@ from herglotz.theory.jacobi import join, sharp_bivector, split
 FIELDS = {"evolution": evolution_vector_field, "contact": contact_vector_field}
 
 
-class EvolutionStepper:
+class EvolutionStepper(OneStepMethod):
     """Second-order, implicit steps of E_H or X_H by a discrete gradient.
 
     Parameters
@@ -63,7 +70,7 @@ class EvolutionStepper:
         self.max_iterations = max_iterations
         self.throw = throw
 
-    def step(self, state: State, h: Tensor | float) -> Step:
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """One step. Differentiable once with respect to the state, by the implicit-function theorem.
 
         Parameters
@@ -83,46 +90,24 @@ class EvolutionStepper:
         h = check_h(h, q)
         x0 = join(q, p, s)
 
-        def linearised(delta: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        def linearised(delta: Tensor) -> tuple[Tensor, Tensor]:
             G, J = square_jacobian(lambda d: self._equation(x0, d, h)[0], delta)
-            return G, (J,)
+            return G, J
 
         with torch.no_grad():
             euler = h[..., None] * join(*FIELDS[self.field](self.H, q, p, s))
             scale = (x0.abs() + euler.abs()).amax(-1, keepdim=True)
             root = find_root(linearised, euler, scale, iterations=self.max_iterations)
-            G, rate = self._equation(x0, root.x, h)
-            status, delta = _status(root, G), root.x
-        if torch.is_grad_enabled():
-            G, rate = self._equation(x0, delta, h)
-            if G.requires_grad:  # zero in value, and dΔ = −J⁻¹ dG in slope
-                with torch.no_grad():
-                    (J,) = linearised(delta)[1]
-                delta = delta - solve(J, G - G.detach())
-                rate = self._equation(x0, delta, h)[1]
-        failed = status != Status.CONVERGED
+        delta = root.x
+        G, rate = self._equation(x0, delta, h)
+        status = status_of_root(root, torch.isfinite(G.detach()).all(-1))
+        if G.requires_grad:
+            delta = attached(delta, root.J, G)
+            rate = self._equation(x0, delta, h)[1]
         if self.throw:
             throw_failure(status, root.error)
-        nan = torch.where(failed, torch.nan, torch.zeros_like(s))
-        new = State(*split(x0 + delta + nan[..., None]))
-        return Step(new, (1 - h * rate / 2) / (1 + h * rate / 2) + nan, status, root.error, root.iterations)
-
-    def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
-    ) -> Rollout:
-        """Step K times from (q, p, s); arguments, result and errors as for `Stepper.rollout`."""
-        s = torch.zeros_like(q[..., 0]) if s is None else s
-        h_all = step_sizes(torch.as_tensor(h, dtype=q.dtype, device=q.device), steps)
-        states: list[State] = [State(q, p, s)]
-        results: list[Step] = []
-        for k in range(h_all.shape[-1]):
-            try:
-                out = self.step(states[-1], h_all[..., k])
-            except StepError as error:
-                raise StepError(f"step {k}: {error}") from None
-            results.append(out)
-            states.append(out.state)
-        return Rollout.of(states, results)
+        new, c = State(*split(x0 + delta)), (1 - h * rate / 2) / (1 + h * rate / 2)
+        return Step.of(new, c, status, root.error, root.iterations)
 
     def _equation(self, x0: Tensor, delta: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Δ − h (B(x̄)∇̄H − H̄∂_s), whose zero is the step x1 = x0 + Δ, and ∇̄_sH."""
@@ -138,11 +123,3 @@ class EvolutionStepper:
             mean = 0.5 * (H(x0) + H(x1))
             velocity = torch.cat([velocity[..., :-1], velocity[..., -1:] - mean[..., None]], -1)
         return delta - h[..., None] * velocity, g[..., -1]
-
-
-def _status(root: Root, G: Tensor) -> Tensor:
-    """The statuses of `Stepper`, from where the iteration ended and what is left of the equation there."""
-    status = torch.full_like(root.error, Status.MAX_ITERATIONS, dtype=torch.uint8)
-    status = torch.where(root.converged, Status.CONVERGED, status)
-    status = torch.where(~torch.isfinite(root.error), Status.SINGULAR, status)
-    return torch.where(torch.isfinite(G).all(-1), status, Status.DIVERGED).to(torch.uint8)

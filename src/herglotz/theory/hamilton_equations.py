@@ -9,8 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
-from herglotz.mechanics.root import find_root
 
 DiscreteHamiltonian = DiscreteLagrangian  # the same kind of callable: two vectors, a scalar and h
 
@@ -65,9 +65,9 @@ def right_step(
         NaN in the samples where Newton found no solution.
     """
 
-    def equations(p1: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equations(p1: Tensor) -> tuple[Tensor, Tensor]:
         P = partials(H_plus, q0, p1, s0, h, order=2)
-        return P.D1 - (1 - P.D3)[..., None] * p0, (P.D12 + p0[..., :, None] * P.D23[..., None, :],)
+        return P.D1 - (1 - P.D3)[..., None] * p0, P.D12 + p0[..., :, None] * P.D23[..., None, :]
 
     p1 = find_root(equations, p0 if guess is None else guess).solved
     q1, _, s1 = right_equations(partials(H_plus, q0, p1, s0, h), p1, s0)
@@ -91,13 +91,13 @@ def left_step(
     """
     n = q0.shape[-1]
 
-    def equations(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equations(x: Tensor) -> tuple[Tensor, Tensor]:
         P = partials(H_minus, p0, x[..., :n], x[..., n], h, order=2)
         q, _, s = left_equations(P, p0, x[..., n])
         q_row = -torch.cat([P.D12, P.D13[..., None]], -1)
         s_q = P.D2 - (p0[..., None, :] @ P.D12)[..., 0, :]
         s_row = torch.cat([s_q, (1 + P.D3 - (p0 * P.D13).sum(-1))[..., None]], -1)
-        return torch.cat([q - q0, (s - s0)[..., None]], -1), (torch.cat([q_row, s_row[..., None, :]], -2),)
+        return torch.cat([q - q0, (s - s0)[..., None]], -1), torch.cat([q_row, s_row[..., None, :]], -2)
 
     q_guess, s_guess = (q0, s0) if guess is None else guess
     start = torch.cat([q_guess, s_guess[..., None]], -1)

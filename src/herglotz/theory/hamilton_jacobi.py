@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Flow
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
-from herglotz.mechanics.root import find_root
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.jacobi import join
 
@@ -76,10 +76,10 @@ def projected_step(
     s0 = germ(S0, q0).S
     eye = torch.eye(q0.shape[-1], dtype=q0.dtype, device=q0.device)
 
-    def equations(q1: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equations(q1: Tensor) -> tuple[Tensor, Tensor]:
         at = germ(S1, q1)
         P = partials(H_plus, q0, at.dS, s0, h, order=2)
-        return q1 - P.D2, (eye - P.D22 @ at.d2S,)
+        return q1 - P.D2, eye - P.D22 @ at.d2S
 
     return find_root(equations, q0 if guess is None else guess).solved
 

@@ -6,9 +6,9 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.legendre import mixed_hessian
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 from herglotz.mechanics.regularity import scaled_margin
-from herglotz.mechanics.root import find_root
 from herglotz.theory.left import LeftLagrangian, unforced
 
 
@@ -47,9 +47,9 @@ class RightHamiltonian:
     def position(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
         """q1 with D2L_d(q0, q1, s0) = p1, without a graph; shape (..., n), NaN where there is none."""
 
-        def equations(q1: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        def equations(q1: Tensor) -> tuple[Tensor, Tensor]:
             P = partials(self.L_d, q0, q1, s0, h, order=2)
-            return P.D2 - p1, (P.D22,)
+            return P.D2 - p1, P.D22
 
         with torch.no_grad():
             q0, p1, s0 = _broadcast(q0.detach(), p1.detach(), s0.detach(), h)
@@ -108,9 +108,9 @@ class LeftHamiltonian:
     def position(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
         """q0 with D1L⁻(q0, q1, s1) = −p0, without a graph; shape (..., n), NaN where there is none."""
 
-        def equations(q0: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        def equations(q0: Tensor) -> tuple[Tensor, Tensor]:
             P = partials(self.left, q0, q1, s1, h, order=2)
-            return P.D1 + p0, (P.D11,)
+            return P.D1 + p0, P.D11
 
         with torch.no_grad():
             p0, q1, s1 = _broadcast(p0.detach(), q1.detach(), s1.detach(), h)

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
+from herglotz.mechanics.newton import attached, find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.mechanics.root import find_root
 from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives, jacobian
 
 Section = Callable[[Tensor, Tensor], Tensor]  # p = γ(q, s), (..., n) and (...) → (..., n)
@@ -89,7 +89,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
         `InputError` where no preimage is found: past a caustic of γ0, or for too large an h.
     """
 
-    def equation(x: Tensor, q1: Tensor, s1: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equation(x: Tensor, q1: Tensor, s1: Tensor) -> tuple[Tensor, Tensor]:
         q0, s0 = x[..., :-1], x[..., -1]
         p0, g_q, g_s = section_derivatives(gamma0, q0, s0)
         P = partials(L_d, q0, q1, s0, h, order=2)
@@ -97,7 +97,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
         E_q = P.D11 + p0[..., :, None] * P.D13[..., None, :] + c[..., None] * g_q
         E_s = P.D13 + p0 * P.D33[..., None] + c * g_s
         J = torch.cat([torch.cat([E_q, E_s[..., None]], -1), torch.cat([P.D1, c], -1)[..., None, :]], -2)
-        return torch.cat([momentum_residual(P, p0), (s0 + P.L - s1)[..., None]], -1), (J,)
+        return torch.cat([momentum_residual(P, p0), (s0 + P.L - s1)[..., None]], -1), J
 
     def gamma1(q1: Tensor, s1: Tensor) -> Tensor:
         root = find_root(lambda x: equation(x, q1, s1), torch.cat([q1, s1[..., None]], -1))
@@ -112,9 +112,7 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
             q0, s0 = x[..., :-1], x[..., -1]
             P = partials(L_d, q0, q1, s0, h)
             E = torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
-            with torch.no_grad():
-                (J,) = equation(x, q1, s1)[1]
-            x = x - torch.linalg.solve(J, (E - E.detach())[..., None])[..., 0]
+            x = attached(x, root.J, E)
         return momentum_plus(partials(L_d, x[..., :-1], q1, x[..., -1], h))
 
     return gamma1

@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import step_sizes
+from herglotz.stepping.state import Status, step_sizes
 from herglotz.theory.boundary import Curve, family_value
 from herglotz.theory.function_germ import Function, FunctionGerm
 

@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
-from herglotz.mechanics.root import find_root
 
 
 class LeftLagrangian:
@@ -38,9 +38,9 @@ class LeftLagrangian:
     ) -> Tensor:
         """s0 with s0 + L_d(q0, q1, s0) = s1, without a graph; shape (...), NaN where there is none."""
 
-        def equations(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+        def equations(x: Tensor) -> tuple[Tensor, Tensor]:
             P = partials(self.L_d, q0, q1, x[..., 0], h)
-            return (x[..., 0] + P.L - s1)[..., None], (P.c[..., None, None],)
+            return (x[..., 0] + P.L - s1)[..., None], P.c[..., None, None]
 
         with torch.no_grad():
             q0, q1, s1 = q0.detach(), q1.detach(), s1.detach()

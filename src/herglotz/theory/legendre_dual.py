@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.root import find_root
+from herglotz.mechanics.newton import attached, find_root
 from herglotz.theory.continuous import ScalarField, derivatives
 
 
@@ -47,9 +47,9 @@ def fiber_inverse(
     """
     q, y = torch.broadcast_tensors(q, y)
 
-    def equation(x: Tensor) -> tuple[Tensor, tuple[Tensor]]:
+    def equation(x: Tensor) -> tuple[Tensor, Tensor]:
         P = derivatives(f, q, x, s, order=2)
-        return P.D2 - y, (P.D22,)
+        return P.D2 - y, P.D22
 
     root = find_root(equation, y if guess is None else guess)
     if not bool(root.converged.all()):
@@ -60,11 +60,7 @@ def fiber_inverse(
         )
     if not torch.is_grad_enabled():
         return root.x
-    # Zero in value, and dx = −J⁻¹ dF in slope.
-    F = fiber_derivative(f, q, root.x, s) - y
-    with torch.no_grad():
-        J = derivatives(f, q, root.x, s, order=2).D22
-    return root.x - torch.linalg.solve(J, (F - F.detach())[..., None])[..., 0]
+    return attached(root.x, root.J, fiber_derivative(f, q, root.x, s) - y)
 
 
 def legendre_dual(f: ScalarField) -> ScalarField:

@@ -20,12 +20,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.stepping.newton import Status
-from herglotz.stepping.state import check_h, step_sizes, throw_failure
+from herglotz.mechanics.newton import attached, find_root
+from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
+from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes, throw_failure
 from herglotz.theory.rotations import cayley, hat
-
-MAX_ITERATIONS = 30
-CORRECTIONS = 2  # Newton steps after convergence, to rounding
 
 
 class BodyState(NamedTuple):
@@ -34,17 +32,6 @@ class BodyState(NamedTuple):
     R: Tensor  # (..., 3, 3) attitude: body to space
     M: Tensor  # (..., 3) body angular momentum JΩ
     s: Tensor  # (...) action variable
-
-
-@dataclass(frozen=True)
-class BodyStep:
-    """One step and how it went."""
-
-    state: BodyState
-    c: Tensor  # (...) conformal factor
-    status: Tensor  # (...) Status values
-    residual: Tensor  # (...) last Newton step in the Cayley vector f of F
-    iterations: int
 
 
 @dataclass(frozen=True)
@@ -96,7 +83,7 @@ class RigidBodyStepper:
         """½ M·J⁻¹M, shape (...), J."""
         return 0.5 * (M * torch.linalg.solve(self.inertia.to(M.dtype), M[..., None])[..., 0]).sum(-1)
 
-    def step(self, state: BodyState, h: Tensor | float) -> BodyStep:
+    def step(self, state: BodyState, h: Tensor | float) -> Step:
         """One step: solve FL⁻ for F → attitude → momentum → action. Differentiable with respect to the state and h.
 
         Parameters
@@ -108,7 +95,7 @@ class RigidBodyStepper:
 
         Returns
         -------
-        BodyStep
+        Step
             NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F.
 
         Raises
@@ -130,34 +117,27 @@ class RigidBodyStepper:
             c[..., None] * (F.mT @ M[..., None])[..., 0],
             s + torch.expm1(-self.gamma * h) * s + root / h * action,
         )
-        failed = status != Status.CONVERGED
-        if bool(failed.any()):
-            nan = torch.where(failed, torch.nan, torch.zeros_like(s))
-            new, c = BodyState(new.R + nan[..., None, None], new.M + nan[..., None], new.s + nan), c + nan
         if self.throw:
             throw_failure(status, residual)
-        return BodyStep(new, c, status, residual, iterations)
+        return Step.of(new, c, status, residual, iterations)
 
     def rollout(
-        self, R: Tensor, M: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
+        self,
+        R: Tensor,
+        M: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        every: int = 1,
     ) -> BodyRollout:
-        """Step K times from (R, M, s); s defaults to 0. h is a scalar with `steps`, or (K,), or (..., K)."""
+        """Step K times from (R, M, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
         state = _checked(BodyState(R, M, torch.zeros_like(M[..., 0]) if s is None else s))
-        states, results = [state], []
-        for h_k in step_sizes(check_h(h, M), steps).unbind(-1):
-            result = self.step(state, h_k)
-            state = result.state
-            states.append(state)
-            results.append(result)
-        factors = torch.stack([torch.ones_like(state.s), *(x.c for x in results)], -1)
-        return BodyRollout(
-            R=torch.stack([x.R for x in states], -3),
-            M=torch.stack([x.M for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=factors.cumprod(-1),
-            status=torch.stack([x.status for x in results], -1),
-            residual=torch.stack([x.residual for x in results], -1),
-        )
+        h_all = step_sizes(check_h(h, M), steps)
+        single: OneStep = lambda state, h, *_: (self.step(state, h), None)  # noqa: E731
+        track = roll_out(state, Drive(lambda: single, h_all, Plan(h_all.shape[-1], every), extrapolate=False))
+        R, M, s = track.states
+        return BodyRollout(R, M, s, track.sigma, track.status, track.residual)
 
     def _times(self, f: Tensor) -> Tensor:
         return f @ self.inertia.to(f)
@@ -170,39 +150,16 @@ class RigidBodyStepper:
         """
         J2 = 2.0 * self.inertia.to(g)
         with torch.no_grad():
-            f = torch.linalg.solve(J2, g.detach()[..., None])[..., 0]
-            f, residual, done, iterations = _newton(g.detach(), J2, f)
-            finite = torch.isfinite(f).all(-1) & torch.isfinite(residual)
+            start = torch.linalg.solve(J2, g.detach()[..., None])[..., 0]
+            root = find_root(lambda f: _equation(g.detach(), J2, f), start, torch.ones_like(start))
+            f = root.x
             # The equation has further roots, e.g. π − θ beside θ; the flow's branch ends before a quarter turn, and
             # at a fold, where the determinant changes sign.
-            wanted = ((f * f).sum(-1) < 1.0) & (torch.linalg.det(_equation(g.detach(), J2, f)[1]) < 0)
-            status = torch.where(done, Status.CONVERGED, Status.MAX_ITERATIONS)
-            status = torch.where(done & ~wanted, Status.SINGULAR, status)
-            status = torch.where(finite, status, Status.DIVERGED).to(torch.uint8)
+            wanted = ((f * f).sum(-1) < 1.0) & (torch.linalg.det(root.J) < 0)
+            status = status_of_root(root, torch.isfinite(f).all(-1), root.converged & ~wanted)
         if torch.is_grad_enabled() and g.requires_grad:
-            E, D = _equation(g, J2, f)
-            f = f - torch.linalg.solve_ex(D.detach(), (E - E.detach())[..., None])[0][..., 0]
-        return f, status, residual, iterations
-
-
-def _newton(g: Tensor, J2: Tensor, f: Tensor) -> tuple[Tensor, Tensor, Tensor, int]:
-    """Newton for every sample alone: a sample that has converged takes `CORRECTIONS` more steps and stays."""
-    tol = torch.finfo(g.dtype).eps ** 0.75
-    residual = torch.full_like(g[..., 0], torch.inf)
-    extra = torch.zeros_like(residual)
-    iterations = 0
-    while iterations < MAX_ITERATIONS:
-        iterations += 1
-        E, D = _equation(g, J2, f)
-        delta = torch.linalg.solve_ex(D, E[..., None])[0][..., 0]
-        left = delta.abs().amax(-1)
-        go = extra < CORRECTIONS
-        f = torch.where(go[..., None], f - delta, f)
-        residual = torch.where(go, left, residual)
-        extra = extra + ((residual <= tol * (1.0 + f.abs().amax(-1))) | ~torch.isfinite(left))
-        if bool((extra >= CORRECTIONS).all()):
-            break
-    return f, residual, extra >= 1, iterations
+            f = attached(f, root.J, _equation(g, J2, f)[0])
+        return f, status, root.error, root.iterations
 
 
 def _equation(g: Tensor, J2: Tensor, f: Tensor) -> tuple[Tensor, Tensor]:

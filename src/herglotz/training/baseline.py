@@ -13,7 +13,7 @@ from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
 from herglotz.data.windows import Triples
 from herglotz.errors import InputError
-from herglotz.training.robust import FREEDOM, root_weights, scale_of
+from herglotz.training.problems.robust import FREEDOM, root_weights, scale_of
 
 ROUNDS = 10  # of re-weighting
 JITTER = 1.05  # steps longer than the typical one by less than this are crossed in as many model steps
@@ -52,8 +52,8 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     constant V acts there as a force dV, so that the weight of one coordinate, −b, starts as V = −b/d.
 
     Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
-    Student's t takes the place of least squares (`herglotz.training.robust`), and rows that miss grossly set no size.
-    A recorded step is crossed in `substeps` model steps by trajectory fitting.
+    Student's t takes the place of least squares (`problems.robust`), and rows that miss grossly set no size. A recorded
+    step is crossed in `substeps` model steps by trajectory fitting.
 
     Raises
     ------

@@ -2,17 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.training.lifted import Path
-from herglotz.training.shooting import ShootingProblem
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import Path
 
-FOLDS = 5
+FOLDS = 5  # fifths of every trajectory, in time
 MARGIN = 1.05  # an error lower by less than this factor is no reason for a weaker prior or a richer level
+
+
+class Judged(Protocol):
+    """A fit that knows its errors over held-out blocks of time."""
+
+    def held_out_errors(self) -> Tensor:
+        """RMS of every fold, (FOLDS,), in units of q."""
+        ...
+
+
+F = TypeVar("F", bound=Judged)
+
+
+@dataclass(frozen=True)
+class Chosen(Generic[F]):
+    """The fit whose strength of the prior held-out blocks chose, and the errors of all that were tried."""
+
+    fit: F
+    departure: float
+    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 def held_out_errors(
@@ -66,3 +88,20 @@ def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
     """The smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
+
+
+def strongest_not_beaten(departures: Sequence[float], fit: Callable[[float], F | None]) -> Chosen[F] | None:
+    """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
+
+    None where none could be fitted.
+    """
+    fits: dict[float, F] = {}
+    held_out: dict[float, Tensor] = {}
+    for departure in sorted(departures, reverse=True):
+        found = fit(departure)
+        if found is not None:
+            fits[departure], held_out[departure] = found, found.held_out_errors()
+    if not fits:
+        return None
+    chosen = simplest_not_beaten(held_out)
+    return Chosen(fits[chosen], chosen, held_out)

@@ -19,7 +19,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
-from herglotz.training.structure import nothing_told
+from herglotz.training.structure import structure_is_free
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
@@ -180,7 +180,7 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
         return ("forced", "auto")
     if config.coulomb or config.coupled or config.input_map:
         return ("forced",)
-    return (*CANDIDATES, "auto") if nothing_told(data, replace(config, level="auto")) else CANDIDATES
+    return (*CANDIDATES, "auto") if structure_is_free(data, replace(config, level="auto")) else CANDIDATES
 
 
 def block_errors(run: Run) -> Tensor:

@@ -11,10 +11,10 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
-from herglotz.training.grid import segment_grid
-from herglotz.training.levenberg_marquardt import levenberg_marquardt
-from herglotz.training.smoothing import DAMPING, SmoothingProblem
-from herglotz.training.trajectory_fit import StatesOnly
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.least_squares import StatesOnly
+from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from tqdm import tqdm
 from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
 from herglotz.training.distributed import is_first
-from herglotz.training.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 
 Callback = Callable[[int, float, Tensor], None]
 EVERY = 25  # iterations between two checkpoints inside a stage

@@ -13,7 +13,7 @@ from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, SmoothingProblem, fit
 from herglotz.training.cross_validation import left_out_errors
-from herglotz.training.grid import segment_grid
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.smoothing_fit import _hat
 
 NOISE = 0.01

@@ -1,0 +1,231 @@
+"""Newton's iteration with backtracking, batched: the one loop for every equation of this package.
+
+Samples do not influence one another: each has its own Jacobian, its own fraction of a step and its own end. One sample
+alone takes the same iteration in plain numbers (`herglotz.mechanics.newton_one`) where its rules allow that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol
+
+import torch
+from torch import Tensor
+
+Jacobian = Any  # a matrix (..., m, m), or what the solver of the rules understands: a tuple of tensors (..., *)
+Solver = Callable[[Jacobian, Tensor], Tensor]  # (J, F) → J⁻¹F, not finite where J is singular
+
+
+class Point(NamedTuple):
+    """An equation at one trial."""
+
+    F: Tensor  # (..., m)
+    J: Jacobian  # ∂F/∂x; None where it was not asked for
+    rest: Any = None  # what the equation wants back at the solution
+
+
+class Equation(Protocol):
+    """An equation F(x) = 0."""
+
+    def __call__(self, x: Tensor, second: bool, /) -> Point:
+        """F at x (..., m), and J if `second`."""
+        ...
+
+
+# The size of the unknown and the size below which a move is rounding, (...) each, from x, the first point and |J⁻¹F|.
+Sizes = Callable[[Tensor, Point, Tensor], tuple[Tensor, Tensor]]
+
+
+def largest(x: Tensor) -> Tensor:
+    """The largest component, (..., m) → (...)."""
+    if x.shape[-1] == 1:
+        return x[..., 0].abs()
+    return x.abs().amax(-1) if x.shape[-1] else x.sum(-1)
+
+
+def solve(matrix: Tensor, vector: Tensor) -> Tensor:
+    """matrix⁻¹ vector without an exception: inf or nan where the matrix is singular; written out for n ≤ 2."""
+    n = matrix.shape[-1]
+    if n == 1:
+        return vector / matrix[..., 0]
+    if n == 2:
+        return _eliminate(matrix, vector)
+    return torch.linalg.solve_ex(matrix, vector[..., None])[0][..., 0]
+
+
+def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Gauss with a row exchange, for n = 2."""
+    (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))
+    x, y = vector.unbind(-1)
+    swap = c.abs() > a.abs()
+    a, c = torch.where(swap, c, a), torch.where(swap, a, c)
+    b, d = torch.where(swap, d, b), torch.where(swap, b, d)
+    x, y = torch.where(swap, y, x), torch.where(swap, x, y)
+    factor = c / a
+    y = (y - factor * x) / (d - factor * b)
+    return torch.stack([(x - b * y) / a, y], -1)
+
+
+def attached(x: Tensor, J: Tensor, F: Tensor) -> Tensor:
+    """A solved x with its derivative: one Newton step, zero in value and dx = −J⁻¹ dF in slope; F has the graph."""
+    return x - solve(J, F - F.detach())
+
+
+@dataclass(frozen=True)
+class Rules:
+    """How an equation is iterated.
+
+    A move is accepted where it makes |F| smaller or, with `natural`, where the simplified Newton step J(x)⁻¹F(x + λδ)
+    is shorter than δ; that test does not depend on the units of F. Else it is halved.
+    """
+
+    tol: float  # a sample has converged when its next move is below this times its size
+    max_iterations: int
+    keep: bool = False  # near the solution an old Jacobian serves, and costs first derivatives only
+    natural: bool = False
+    shortest: float = 0.0  # a direction of which no larger fraction helps is none, and its sample is given up
+    solver: Solver | None = None  # default `solve`
+    length: Callable[[Tensor], Tensor] = largest  # of a move
+
+
+NEAR = 1e-3  # of the size of x: nearer than this a Jacobian that is one iteration old converges fast enough
+CONTRACTION = 0.05  # an old Jacobian that gains less than this per iteration is replaced
+ARMIJO = 1e-4  # |F| must fall by this share of what a linear equation would lose
+NATURAL = 0.25  # the simplified Newton step by this share
+
+
+class Found(NamedTuple):
+    """Where an iteration ended."""
+
+    x: Tensor  # (..., m)
+    point: Point  # the equation at x, unless `mixed`
+    merit: Tensor  # (...) |F|
+    residual: Tensor  # (...) |J⁻¹F|
+    done: Tensor  # (...) converged, stalled at rounding or given up; without, the iterations ran out
+    iterations: int
+    healthy: bool  # one sample that is done, all numbers finite; False where that is not known
+    floor: Tensor | float = 0.0  # (...) see `Sizes`
+    J: Jacobian = None  # at x, or the old one that still serves
+    move: Tensor | None = None  # (..., m) −J⁻¹F, which was not taken any more
+    mixed: bool = False  # the samples' last trials are different ones, and `point` is that of none
+
+
+def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes) -> Found:
+    """Iterate from x (..., m), all samples at once."""
+    solver, length = rules.solver or solve, rules.length
+    point = equation(x, True)
+    J, delta = point.J, -solver(point.J, point.F)
+    merit, residual = largest(point.F), length(delta)
+    scale, floor = sizes(x, point, residual)
+    tiny, near = rules.tol * scale, NEAR * scale
+    # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
+    done = (residual <= tiny) | ~torch.isfinite(residual)
+    fraction: Tensor | None = None  # None: every sample takes full steps
+    slow: Tensor | None = None  # samples whose old Jacobian has served its time
+    mixed, iterations = False, 0
+    while iterations < rules.max_iterations and not bool(done.all()):
+        if not rules.natural or bool((residual > floor).any()):  # the last digits are not counted
+            iterations += 1
+        move = delta if fraction is None else fraction[..., None] * delta
+        trial = x + torch.where(done[..., None], 0.0, move)
+        fresh = ~done & (residual > near)  # at a trial that may be far off, the Jacobian is wanted as well
+        fresh = fresh if slow is None else fresh | slow
+        second = not rules.keep or bool(fresh.any())
+        point_trial, J_trial = equation(trial, second), J
+        if second:
+            J_trial = select(fresh, point_trial.J, J) if rules.keep else point_trial.J
+        delta_trial, merit_trial = -solver(J_trial, point_trial.F), largest(point_trial.F)
+        left = length(delta_trial)
+        settled = left <= tiny
+        whole = 1.0 if fraction is None else fraction
+        if rules.natural:
+            better = (length(solver(J, point_trial.F)) <= (1 - NATURAL * whole) * residual) | settled
+        else:
+            better = (merit_trial <= (1 - ARMIJO * whole) * merit) | settled
+        stalled = ~better & (residual <= floor)  # rounding, not a wrong direction
+        slow = None
+        if rules.keep:
+            slow = ~fresh & ~done & ~settled & (left > CONTRACTION * residual) & torch.isfinite(left)
+            better = better | (slow & ~stalled)
+        accept = better & ~done
+        done_next = done | settled | stalled
+        if rules.natural:  # this test may accept a trial where J is singular
+            done_next = done_next | (accept & ~torch.isfinite(left))
+        if bool((better | done).all()):  # a done sample's trial is its own x: nothing to select
+            x, J, delta, merit, residual = trial, J_trial, delta_trial, merit_trial, left
+            point, mixed = point_trial, False
+            if fraction is not None:
+                fraction = (2 * fraction).clamp(max=1.0) if rules.natural else torch.ones_like(merit)
+        else:
+            x, J, delta = (select(accept, new, old) for new, old in ((trial, x), (J_trial, J), (delta_trial, delta)))
+            merit, residual = torch.where(accept, merit_trial, merit), torch.where(accept, left, residual)
+            mixed = True  # the points of the samples are from different trials
+            before = torch.ones_like(merit) if fraction is None else fraction
+            after = (2 * before).clamp(max=1.0) if rules.natural else 1.0
+            fraction = torch.where(accept, after, before / 2)
+            done_next = done_next | (fraction < rules.shortest) if rules.shortest else done_next
+        done = done_next
+    return Found(x, point, merit, residual, done, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed)
+
+
+def select(mask: Tensor, a: Any, b: Any) -> Any:
+    """The tensor a, or each of a tuple, in the samples of the mask (...), b in the others."""
+    if isinstance(a, tuple):
+        return tuple(select(mask, *pair) for pair in zip(a, b, strict=True))
+    return torch.where(mask.reshape(mask.shape + (1,) * (a.ndim - mask.ndim)), a, b)
+
+
+MAX_ITERATIONS = 50
+SHORTEST = 1e-6
+
+
+@dataclass(frozen=True)
+class Root:
+    """The solution of an equation, sample by sample."""
+
+    x: Tensor  # (..., m)
+    converged: Tensor  # (...) bool
+    error: Tensor  # (...) last |J⁻¹F| in units of the scale; inf or nan where J is singular
+    iterations: int
+    J: Jacobian  # at x
+    move: Tensor  # (..., m) the next move, −J⁻¹F: x + move is exact to the square of the error
+
+    @property
+    def solved(self) -> Tensor:
+        """(..., m) x, NaN in the samples that did not converge."""
+        return torch.where(self.converged[..., None], self.x, torch.nan)
+
+
+def find_root(
+    equations: Callable[[Tensor], tuple[Tensor, Jacobian]],  # x (..., m) → F (..., m) and its Jacobian
+    guess: Tensor,  # (..., m)
+    scale: Tensor | None = None,  # (..., m) size of every unknown; default that of the largest at the start
+    solver: Solver | None = None,
+    iterations: int = MAX_ITERATIONS,
+    tol: float | None = None,  # default rounding
+) -> Root:
+    """Solve F(x) = 0 from `guess`, without a graph, to rounding; the test of a move is the natural one.
+
+    A sample has converged when it got to rounding, or no nearer from a move below eps^(2/3) of `scale`; one that is
+    singular, not finite or makes no progress is given up.
+    """
+    eps = torch.finfo(guess.dtype).eps
+    tol = 4 * eps if tol is None else tol
+    enough = max(eps ** (2 / 3), tol)
+    unit = None if scale is None else torch.where(scale > 0, scale, 1.0)
+
+    def sizes(x: Tensor, _: Point, left: Tensor) -> tuple[Tensor, Tensor]:
+        size = torch.ones_like(left)  # moves are measured in the scale
+        if unit is None:
+            size = torch.maximum(largest(x), torch.nan_to_num(left, nan=0.0, posinf=0.0))
+            size = torch.where(size > 0, size, 1.0)
+        return size, enough * size
+
+    length = largest if unit is None else lambda move: largest(move / unit)
+    rules = Rules(tol, iterations, natural=True, shortest=SHORTEST, solver=solver, length=length)
+    with torch.no_grad():
+        found = newton(lambda x, _: Point(*equations(x)), guess.detach(), rules, sizes)
+    error = found.residual * (enough / found.floor)
+    assert found.move is not None
+    return Root(found.x, found.done & (error <= enough), error, found.iterations, found.J, found.move)
