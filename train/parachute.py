@@ -60,8 +60,8 @@ def printed_map() -> tuple[dict, PrintedOrbit]:
         points = [{"k": k, "q": float(q[k, 0]), "p": float(p[k, 0]), "s": float(s[k])} for k in rows]
         found[name] = {"points": points, "dS": slopes[name], "last_finite_k": last}
     heights = np.array([x["q"] for x in found["printed"]["points"][: SHOWN + 1]])
-    drawn = [np.array(x) for x in (momenta["printed"], slopes["printed"], momenta["squared"], slopes["squared"])]
-    return found, PrintedOrbit(heights, *drawn, found["printed"]["last_finite_k"])
+    printed, squared = ((momenta[name], np.array(slopes[name])) for name in ("printed", "squared"))
+    return found, PrintedOrbit(heights, *printed, *squared, last=found["printed"]["last_finite_k"])
 
 
 def landing(q0: float, v0: float) -> tuple[float, float]:
