@@ -20,11 +20,12 @@ from torch import Tensor
 from herglotz.mechanics import (
     DiscreteLagrangian,
 )
+from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.partials_equation import End, PartialsEquation, Point, StepEquation
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 
 __all__ = ["End", "ModelEquation", "PartialsEquation", "Point", "StepEquation", "StepOfModel", "model_equation"]
 
