@@ -78,7 +78,7 @@ def test_normal_equations_match_finite_differences(level, n):
 
 
 def test_gradient_of_the_robust_loss():
-    # fails if Student's weights are not those of the loss, which bends within 1e-3: a shorter step (error 3e-12 to 8e-12)
+    # fails if Student's weights are not those of the loss; it bends within 1e-3: a shorter step, off by 3e-12 to 8e-12
     problem, x = problem_of(freedom=4.0)
     _, _, b = problem.normal_equations(x)
     slopes = [slope(lambda t, e=e: problem.cost(x + t * e), 5e-5) for e in torch.eye(len(x)).to(x)]
