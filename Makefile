@@ -20,8 +20,9 @@ lint: .venv/installed
 	$(PY) -m ruff check .
 	$(PY) -m pyright
 
-# Before a commit: the folders of unit tests that are quick.
-QUICK := tests/unit/*.py tests/unit/data
+# Before a commit: under two minutes on two cores. Processor time, measured on an AMD EPYC: pyright 46 s, then QUICK
+# 86 s (1507 tests) over two workers. Folders left out: theory 48 s, plots 38 s, cli 83 s, export 194 s, and longer ones.
+QUICK := tests/unit/*.py tests/unit/data tests/unit/mechanics tests/unit/models tests/golden tests/contracts
 check: lint
 	$(ENV) $(PY) -m pytest -q -n $(WORKERS) $(QUICK)
 

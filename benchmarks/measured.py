@@ -23,22 +23,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
-from benchmarks.measured_sets import (
-    AHEAD,
-    AIR_TRACK,
-    DFKI,
-    LEVELS,
-    NOMINAL,
-    PENDULUM,
-    SEEN,
-    coverage_real,
-    coverage_simulated,
-    disturbed,
-    driven_pendulum,
-    extrapolation,
-    noise,
-    outliers,
-)
+from benchmarks import measured_sets as sets
 from herglotz.plots import style
 
 COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept
@@ -55,15 +40,15 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
     ("coverage_real", "ensemble_measured"): COVERED,
 }
 ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] = {
-    "noise": ((), noise),
-    "one_trajectory": ((), partial(noise, trajectories=1)),
-    "outliers": ((), outliers),
-    "disturbed": ((), disturbed),
-    "real_pendulum": ((PENDULUM,), extrapolation(PENDULUM)),
-    "air_track": ((AIR_TRACK,), extrapolation(AIR_TRACK)),
-    "driven_pendulum": (DFKI, driven_pendulum),
-    "coverage_simulated": ((), coverage_simulated),
-    "coverage_real": ((PENDULUM,), coverage_real),
+    "noise": ((), sets.noise),
+    "one_trajectory": ((), partial(sets.noise, trajectories=1)),
+    "outliers": ((), sets.outliers),
+    "disturbed": ((), sets.disturbed),
+    "real_pendulum": ((sets.PENDULUM,), sets.extrapolation(sets.PENDULUM)),
+    "air_track": ((sets.AIR_TRACK,), sets.extrapolation(sets.AIR_TRACK)),
+    "driven_pendulum": (sets.DFKI, sets.driven_pendulum),
+    "coverage_simulated": ((), sets.coverage_simulated),
+    "coverage_real": ((sets.PENDULUM,), sets.coverage_real),
 }
 CURVES = {
     "simulated, Laplace": ("coverage_simulated", "laplace_measured"),
@@ -102,28 +87,28 @@ def draw(rows: dict[str, Any], path: Path) -> None:
         grid = figure.add_gridspec(2, 2, width_ratios=(1.5, 1), height_ratios=(1, 1))
         top = figure.add_subplot(grid[0, 0])
         bottom, right = figure.add_subplot(grid[1, 0], sharex=top), figure.add_subplot(grid[:, 1])
-        begun = float(t[SEEN - 1] + t[SEEN]) / 2
+        begun = float(t[sets.SEEN - 1] + t[sets.SEEN]) / 2
         for ax in (top, bottom):
             ax.axvspan(begun, float(t[-1]), color=style.SHADE, lw=0, zorder=0)
         top.plot(t, model, color=style.MODEL, zorder=2)
         top.plot(t, q, ".", color=style.INK, ms=3, zorder=3)
-        top.set(ylabel="angle (rad)", title=f"An unseen start: {SEEN} noisy samples, then {AHEAD} predicted")
+        top.set(ylabel="angle (rad)", title=f"An unseen start: {sets.SEEN} noisy samples, then {sets.AHEAD} predicted")
         bottom.fill_between(t, -1e3 * measured, 1e3 * measured, color=style.MODEL, alpha=0.18, lw=0)
         bottom.fill_between(t, -1645 * std, 1645 * std, color=style.MODEL, alpha=0.45, lw=0)
         bottom.plot(t, 1e3 * (q - model), ".", color=style.UNSEEN, ms=3)
         bottom.set(ylabel="measured − model (mrad)", xlabel="time (s)", xlim=(0, float(t[-1])))
         style.captions(bottom, [("dark: model", style.MODEL), ("light: with a sample's noise", style.MUTED)])
         right.plot([0.45, 1], [0.45, 1], color=style.MUTED, lw=0.8)
-        right.plot([NOMINAL] * 2, COVERED, color=style.ACCENT, lw=7, alpha=0.3)
+        right.plot([sets.NOMINAL] * 2, COVERED, color=style.ACCENT, lw=7, alpha=0.3)
         entries = []
         for (name, key), color in zip(CURVES.items(), style.SERIES, strict=False):
             for k, seed in enumerate(rows.get(key[0], {"seeds": []})["seeds"]):
-                right.plot(LEVELS, seed["curves"][key[1]], "-o", ms=2.5, lw=0.8, color=color, alpha=0.75)
+                right.plot(sets.LEVELS, seed["curves"][key[1]], "-o", ms=2.5, lw=0.8, color=color, alpha=0.75)
                 entries += [(name, color)] if k == 0 else []
         for line, entry in enumerate(entries):
             style.captions(right, [entry], row=line)
         below: dict[str, Any] = {"ha": "center", "va": "top", "xytext": (0, -4)}
-        style.label(right, NOMINAL, COVERED[0], f"target at {NOMINAL:g}", style.ACCENT, **below)
+        style.label(right, sets.NOMINAL, COVERED[0], f"target at {sets.NOMINAL:g}", style.ACCENT, **below)
         right.set(xlabel="nominal", ylabel="share of held-out samples inside", title="Every line a seed")
         harness.picture(figure, path)
 

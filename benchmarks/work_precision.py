@@ -239,7 +239,7 @@ def study(name: str, seeds: int, quick: bool, say: Callable[[str], None]) -> dic
         say(f"seed {seed}")
         case = prepare(setup, quick, seed)
         mine = kicks(case, quick) + equation(case, quick) + neural(case, quick)
-        timed += [Timed({**t.point, "seed": seed}, t.run, t.time, t.idle) for t in mine]
+        timed += [replace(t, point={**t.point, "seed": seed}) for t in mine]
         seconds.append(case.seconds)
         if seed == 0:
             timed += classical(case, quick)

@@ -22,13 +22,16 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
+from benchmarks.harness import seconds
 from benchmarks.peers.rollouts import rk4
-from benchmarks.work_precision_ways import CHECKS, TIMED, Case, Setup, Timed, judged, repeated
+from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
 from herglotz.data import simulate
 from herglotz.export.c_wrapper import FLAGS, compiler
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt
+from herglotz.tune.cost import Timed as Timing
 
+TIMED, PER = 16, 4e-3  # motions and seconds of one timing, at least: far above the resolution of the clock
 SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1, "damped_oscillator": 2, "parachute": 3, "kepler": 4, "chain": 5,
            "driven_pendulum": 6, "rigid_body": 7}  # fmt: skip
 NETWORK = 9
@@ -122,6 +125,18 @@ class Native:
             ctypes.c_double(x), ctypes.c_double(0.0), _pointer(u), _pointer(y), _pointer(out),
         )  # fmt: skip
         return lambda keep=(y, u, out): self.library.motions(*arguments)  # noqa: ARG005
+
+    def timing(self, y: Tensor, T: float, checks: int, method: str, x: float, u: Tensor | None = None) -> Timing:
+        """Some of the motions, as often as makes the call long enough to time; a step is one motion."""
+        call = self.call(y[:TIMED], T, checks, method, x, u)
+        call()
+        times = max(1, round(PER / max(1e-7, seconds(call, time.perf_counter))))
+
+        def run() -> None:
+            for _ in range(times):
+                call()
+
+        return Timing(run, times * len(y[:TIMED]))
 
 
 def _pointer(x: Tensor | None) -> ctypes.c_void_p:
@@ -278,12 +293,10 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
     if u is not None and method != "DOP853":
         x = max(1, round(x * CHECKS / segments))
     q, count = library.motions(y, setup.T, segments, method, x, u)
-    few = y[:TIMED]
-    call, times = repeated(library.call(few, setup.T, segments, method, x, u))
     each = count / len(y) / setup.T
     more = {"evaluations_per_time": each, "flops_per_time": each * flops, "artefact": "C"}
     errors = judged(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
-    return Timed({**point, **errors, **more}, call, times * len(few) * setup.T)
+    return Timed({**point, **errors, **more}, library.timing(y, setup.T, segments, method, x, u), setup.T)
 
 
 def neural(case: Case, quick: bool) -> list[Timed]:
@@ -329,14 +342,10 @@ def equation(case: Case, _quick: bool) -> list[Timed]:
         library = Native(setup.name, dtype, dof=2, constants=constants)
         for method, sizes in (("RK4", (4, 5, 6, 7, 8, 10, 12, 16)), ("DOP853 fixed", (2, 3, 4))):
             for x in sizes:
-                q, count = library.motions(y, setup.T, CHECKS, method, x)
-                call, times = repeated(library.call(y[:TIMED], setup.T, CHECKS, method, x))
-                h, each = setup.T / CHECKS / x, count / len(y) / setup.T
                 words = {"RK4": "RK4", "DOP853 fixed": "DOP853, equal steps"}[method]
-                point = {"kind": "learned equation", "setting": f"{words}, h {h:.3g}, C {dtype}", "dtype": dtype}
-                work = {"evaluations_per_time": each, "flops_per_time": each * FLOPS[setup.name], "h": h}
-                one = {**point, **judged(q, case.truth), **work, "artefact": "C"}
-                found.append(Timed(one, call, times * TIMED * setup.T))
+                label = f"{words}, h {setup.T / CHECKS / x:.3g}, C {dtype}"
+                point = {"kind": "learned equation", "setting": label, "dtype": dtype, "h": setup.T / CHECKS / x}
+                found.append(_classic(point, library, case, y, method, x, FLOPS[setup.name]))
     return found
 
 

@@ -1,6 +1,6 @@
 """The ways to step that `work_precision.py` compares, without the rivals: scenes, fits, and how each way is timed.
 
-A way is a `Timed`: a point of the plot with its errors, and a call that makes so much simulated time. Learned steppers
+A way is a `Timed`: a point of the plot with its errors, and what `herglotz.tune.cost` times. Learned steppers
 come in every form, at the step of the data and at larger ones, with terms more and less; rules, compositions and the
 knobs of Newton on the true Lagrangian are timed in PyTorch.
 """
@@ -11,7 +11,7 @@ import copy
 import math
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,6 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from benchmarks.harness import seconds
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_aoti, export_onnx, load_onnx, load_pt2
@@ -28,7 +27,8 @@ from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper, kahan_li, suzuki, yoshida
 from herglotz.stepping.guess import EQUAL
 from herglotz.training import FitConfig, Run, fit
-from herglotz.tune.cost import timed_stepping
+from herglotz.tune.cost import Timed as Timing
+from herglotz.tune.cost import measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
 from herglotz.tune.kick_composition import can_kick, fit_kicks
 from herglotz.tune.kick_composition_c import CompiledKicks
@@ -36,10 +36,8 @@ from herglotz.tune.reference import JITTER, draw_starts, record
 
 CHECKS = 4  # times at which errors are taken
 COUNT = 192  # motions whose errors are taken: half to choose a setting by, half to judge it
-TIMED = 16  # of them are timed
 RULE_MOTIONS = 4  # motions of a rule in PyTorch, which share their time
 PATIENCE = 1.5  # seconds of a rule after which no finer step of it is tried
-PER = 4e-3  # seconds of one timing of C, at least: the clock's resolution is far below
 # What a user knows of two links.
 TOLD = {"features": ("pendulums",), "order": 4, "correction_width": 0, "mass_width": 0}
 
@@ -163,12 +161,17 @@ def judged(q: Tensor, truth: Tensor) -> dict[str, float | None]:
 
 @dataclass(frozen=True)
 class Timed:
-    """A point of the plot and how to time it: `run` makes `time` units of simulated time; `idle` what surrounds it."""
+    """A point of the plot and how to time it: one step of the timing makes `h` units of simulated time."""
 
     point: dict
-    run: Callable[[], Any]
-    time: float
-    idle: Callable[[], Any] | None = None
+    timing: Timing
+    h: float
+
+
+def costs(timed: list[Timed], rounds: int) -> list[dict]:
+    """The points with their costs: the least of all rounds, in turn, and how far the middle one lies above it."""
+    measured = zip(timed, measure_costs([one.timing for one in timed], rounds), strict=True)
+    return [{**t.point, "us_per_time": c.step_us / t.h, "spread": c.spread_us / t.h} for t, c in measured]
 
 
 @dataclass(frozen=True)
@@ -246,37 +249,6 @@ def motions_of(case: Case) -> State:
     anywhere = draw_starts(run, 40, case.seed + 5)
     starts = State(*(torch.cat([a.reshape(len(a), -1), b]) for a, b in zip(anywhere, first, strict=True)))
     return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T, "own").states
-
-
-def repeated(call: Callable[[], Any], keep: Any = None) -> tuple[Callable[[], Any], int]:
-    """The call as often as makes it long enough to time; `keep` lives as long as the call."""
-    call()
-    times = max(1, round(PER / max(1e-7, seconds(call, time.perf_counter))))
-
-    def run(keep: Any = keep) -> None:  # noqa: ARG001
-        for _ in range(times):
-            call()
-
-    return run, times
-
-
-def costs(timed: list[Timed], rounds: int) -> list[dict]:
-    """Processor time of each, in turn: the least of all rounds, and how far the middle one lies above it."""
-    times = torch.zeros(2, len(timed), rounds, dtype=torch.float64)
-    for k in range(-1, rounds):
-        for i, one in enumerate(timed):
-            for j, call in enumerate((one.run, one.idle)):
-                if call is None:
-                    continue
-                began = time.process_time_ns()
-                call()
-                times[j, i, max(k, 0)] = (time.process_time_ns() - began) * 1e-3
-    found = []
-    for i, one in enumerate(timed):
-        best, middle = float(times[0, i].min()), float(times[0, i].median())
-        idle = min(float(times[1, i].min()), best / 2)
-        found.append({**one.point, "us_per_time": (best - idle) / one.time, "spread": (middle - best) / one.time})
-    return found
 
 
 ORDERS = {"left": 1, "right": 1, "midpoint": 2, "midpoint_heun": 2, "trapezoid_heun": 2, "strang": 2, "lobatto4": 4,
@@ -404,69 +376,55 @@ def _evaluations(model: Any, case: Case, h: float) -> tuple[float, float]:
     return each / h, each / h * 2 * weights * (1 + n if explicit else 1 + n + n * (n + 1) / 2)
 
 
-def _forms(case: Case, model: Any, h: float, kind: str, label: str) -> list[Timed]:
-    """A model as compiled C, in both precisions."""
+def _timed(
+    case: Case, stepper: Any, h: float, kind: str, setting: str, artefact: str = "C", dtype: str = "float64"
+) -> Timed:
+    """A stepper with its errors, to be timed."""
+    number = getattr(torch, dtype)
+    point = {"kind": kind, "setting": setting, "h": h, "dtype": dtype, "artefact": artefact}
+    start = State(*(x.to(number).contiguous() for x in case.entry))
+    timing = timed_stepping(stepper, start, h, round(case.setup.T / h))
+    return Timed({**point, **rolled(case, stepper, h, number)}, timing, h)
+
+
+def _forms(
+    case: Case, model: Any, h: float, kind: str, label: str, dtypes: Sequence[str] = ("float64", "float32")
+) -> list[Timed]:
+    """A model as compiled C, with its work counted."""
     evaluations, flops = _evaluations(model, case, h)
     found = []
-    for dtype in ("float64", "float32"):
+    for dtype in dtypes:
         stepper = compile_c(model, h=h, dtype=dtype)
-        number = getattr(torch, dtype)
-        more = {"h": h, "dtype": dtype, "artefact": "C", "evaluations_per_time": evaluations, "flops_per_time": flops}
-        error = rolled(case, stepper, h, number)
-        point = {"kind": kind, "setting": f"{label}, h {h:.4g}, C {dtype}", **error, **more}
-        found.append(_native(point, stepper, case, h, number))
+        one = _timed(case, stepper, h, kind, f"{label}, h {h:.4g}, C {dtype}", dtype=dtype)
+        one.point.update(evaluations_per_time=evaluations, flops_per_time=flops)
+        found.append(one)
     return found
 
 
-def _native(point: dict, stepper: Any, case: Case, h: float, number: torch.dtype) -> Timed:
-    start = State(*(x.to(number).contiguous() for x in case.entry))
-    one = timed_stepping(stepper, start, h, round(case.setup.T / h))
-    return Timed(point, one.run, one.steps * h, one.idle)
-
-
 def _own(case: Case, quick: bool) -> list[Timed]:
-    """The run's own model: C, eager, weights rounded to bfloat16, loose Newton in C, ONNX."""
+    """The run's own model: C, eager, weights rounded to bfloat16, loose Newton in C, ONNX and AOTInductor."""
     model, h = case.run.model, case.setup.h
     found = _forms(case, model, h, "learned", "own model")
-    u, plain = case.setup.inputs(), {"h": h, "artefact": "eager", "dtype": "float64"}
-    tolerances = (None,) if model.linear_in_q1 else (None, 1e-4)
-    for tol in tolerances:
-        eager = Stepper(model, tol=tol)
-        point = {"kind": "learned, eager", "setting": f"own model, eager{'' if tol is None else f', tol {tol:g}'}"}
-        found.append(_eager({**point, **rolled(case, eager, h), **plain}, eager, case, h, u))
-        if tol is not None:
-            loose = compile_c(model, h=h, tolerance=tol)
-            point = {"kind": "learned, Newton tolerance", "setting": f"own model, C float64, tol {tol:g}", **plain}
-            found.append(_native({**point, **rolled(case, loose, h), "artefact": "C"}, loose, case, h, torch.float64))
+    found.append(_timed(case, Stepper(model), h, "learned, eager", "own model, eager", "eager"))
+    if not model.linear_in_q1:
+        label, loose = "own model, eager, tol 0.0001", Stepper(model, tol=1e-4)
+        found.append(_timed(case, loose, h, "learned, eager", label, "eager"))
+        loose = compile_c(model, h=h, tolerance=1e-4)
+        found.append(_timed(case, loose, h, "learned, Newton tolerance", "own model, C float64, tol 0.0001"))
     rounded = copy.deepcopy(model)
     with torch.no_grad():
         for parameter in rounded.parameters():
             parameter.copy_(parameter.bfloat16())
-    found += [
-        t for t in _forms(case, rounded, h, "learned, bf16 weights", "bf16 weights") if "float32" in t.point["setting"]
-    ]
+    found += _forms(case, rounded, h, "learned, bf16 weights", "bf16 weights", ("float32",))
     formats = (("ONNX", "a.onnx", export_onnx, load_onnx), ("AOTInductor", "a.pt2", export_aoti, load_pt2))
     for name, file, write, read in formats[:1] if quick else formats:  # AOTInductor compiles for a minute
         try:
             with tempfile.TemporaryDirectory() as folder:
                 stepper = read(write(model, Path(folder) / file, h=h))
-            point = {"kind": f"learned, {name}", "setting": f"own model, {name}", **plain, "artefact": name}
-            found.append(_eager({**point, **rolled(case, stepper, h)}, stepper, case, h, inputs_of(case)))
+            found.append(_timed(case, stepper, h, f"learned, {name}", f"own model, {name}", name))
         except (InputError, RuntimeError) as error:
             print(f"{name}, {case.setup.name}: {error}")
     return found
-
-
-def _eager(point: dict, stepper: Any, case: Case, h: float, u: Tensor | None) -> Timed:
-    steps = min(24, round(case.setup.T / h))
-    start = State(*(x[:1] for x in case.entry))
-    options = {} if u is None else {"inputs": u[:steps]}
-
-    def run() -> None:
-        with torch.no_grad():
-            stepper.rollout(*start, h=h, steps=steps, **options)
-
-    return Timed(point, run, steps * h)
 
 
 def _distilled(case: Case, quick: bool) -> list[Timed]:
@@ -501,11 +459,9 @@ def _other_terms(case: Case, quick: bool) -> list[Timed]:
         other = replace(case, run=run, entry=entered(setup, run, first, case.start))
         kind = f"learned, {label}"
         try:
-            found += [t for t in _forms(other, run.model, setup.h, kind, label) if "64" in t.point["dtype"]]
+            found += _forms(other, run.model, setup.h, kind, label, ("float64",))
         except InputError:  # no C for these terms: PyTorch
-            eager = Stepper(run.model)
-            form = {"kind": kind, "setting": f"{label}, eager", "h": setup.h, "artefact": "eager", "dtype": "float64"}
-            found.append(_eager({**form, **rolled(other, eager, setup.h)}, eager, other, setup.h, inputs_of(other)))
+            found.append(_timed(other, Stepper(run.model), setup.h, kind, f"{label}, eager", "eager"))
     return found
 
 
@@ -524,14 +480,9 @@ def kicks(case: Case, quick: bool) -> list[Timed]:
         for count in range(least, least + (1 if quick else 5 if m > 3 else 4)):
             stepper = fit_kicks(case.run.model, before, after, h, kicks=count, iterations=30 if quick else 150)
             for dtype in ("float64", "float32"):
-                compiled, number = CompiledKicks(stepper, dtype), getattr(torch, dtype)
-                point = {"kind": "learned kicks", "setting": f"{count} kicks, h {h:.4g}, C {dtype}", "dtype": dtype}
-                work = {"evaluations_per_time": count / h, "flops_per_time": count * 70 / h, "h": h, "artefact": "C"}
-                steps = round(setup.T / h)
-                start = State(*(x[:TIMED].to(number) for x in case.entry))
-                outputs = [torch.empty(len(start.s), steps + 1, dtype=number) for _ in range(3)]
-                call, times = repeated(compiled.call(start, steps, outputs), keep=outputs)
-                one = {**point, **rolled(case, compiled, h, number), **work}
-                found.append(Timed(one, call, times * len(start.s) * setup.T))
+                label = f"{count} kicks, h {h:.4g}, C {dtype}"
+                one = _timed(case, CompiledKicks(stepper, dtype), h, "learned kicks", label, dtype=dtype)
+                one.point.update(evaluations_per_time=count / h, flops_per_time=count * 70 / h)
+                found.append(one)
     case.seconds["kicks"] = time.process_time() - began
     return found

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import shutil
 import sys
 import time
@@ -17,14 +18,17 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-from zoo_systems.drawing import draw
-from zoo_systems.judging import outcome, relative, score
-from zoo_systems.ours import fit_ours, plain
-from zoo_systems.prediction import MechanismModel, own_predictions
-from zoo_systems.report import commit, report, shares
-from zoo_systems.sindy import fit_sindy
-from zoo_systems.systems import ZooSystem
+import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.harness import commit
+from benchmarks.zoo_systems.drawing import draw
+from benchmarks.zoo_systems.judging import Predictions, outcome, relative, score
+from benchmarks.zoo_systems.ours import fit_ours, plain
+from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
+from benchmarks.zoo_systems.report import report, shares, shown
+from benchmarks.zoo_systems.sindy import fit_sindy
+from benchmarks.zoo_systems.systems import ZooSystem
 from herglotz.data.files import write_atomically
 
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
@@ -32,25 +36,39 @@ KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", 
 
 def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     """One row of the results."""
-    row = of.facts()
+    row = of.facts() | {"beyond": beyond(of)}
     for name, fit in (("known", lambda of: MechanismModel(of.fitted)), ("sindy", fit_sindy)):
         began = time.process_time()
         found = own_predictions(of, fit(of))
-        row[name] = {"score": score(of, found), "relative": relative(of, found), "cpu_s": time.process_time() - began}
+        row[name] = {**numbers(of, found), "cpu_s": time.process_time() - began}
     ours = fit_ours(of, folder, limit)
-    numbers = {"score": float("inf"), "relative": float("inf")}
-    if ours.predictions is not None:
-        numbers = {"score": score(of, ours.predictions), "relative": relative(of, ours.predictions)}
-    row["ours"] = {**numbers, "cpu_s": ours.cpu, "said": ours.said, **plain(ours.metrics, KEPT)}
-    row["outcome"] = outcome(numbers["score"], numbers["relative"], bool(ours.said))
-    row["ahead_of_sindy"] = numbers["score"] <= max(row["sindy"]["score"], 1.0)
+    row["ours"] = {**numbers(of, ours.predictions), "cpu_s": ours.cpu, "said": ours.said, **plain(ours.metrics, KEPT)}
+    mine, theirs = (math.inf if row[name]["score"] is None else row[name]["score"] for name in ("ours", "sindy"))
+    size = math.inf if row["ours"]["relative"] is None else row["ours"]["relative"]
+    row["outcome"] = outcome(mine, size, bool(ours.said))
+    row["ahead_of_sindy"] = math.isfinite(mine) and mine <= max(theirs, 1.0)
     return row
+
+
+def beyond(of: ZooSystem) -> float:
+    """How far the unseen recordings leave the range of the training positions, over the size of the motion."""
+    seen = of.train.truth[:, : trained(of.train)].reshape(-1, of.mechanism.n)
+    out = np.maximum(of.test.truth - seen.max(0), seen.min(0) - of.test.truth) / of.size
+    return round(max(0.0, float(out.max())), 4)
+
+
+def numbers(of: ZooSystem, found: Predictions | None) -> dict[str, float | None]:
+    """Errors over the noise, of each part too, and over the size of the motion; None where a sample was not reached."""
+    pair = (math.inf, math.inf) if found is None else (score(of, found), relative(of, found))
+    values = dict(zip(("score", "relative"), pair, strict=True))
+    values |= {f"score_{part}": score(of, {part: pairs}) for part, pairs in (found or {}).items()}
+    return {name: x if math.isfinite(x) else None for name, x in values.items()}
 
 
 def line(row: dict[str, Any]) -> str:
     """A row for people."""
-    numbers = "  ".join(f"{name} {row[name]['score']:8.3g}" for name in ("ours", "sindy", "known"))
-    return f"{row['index']:3d}  {row['outcome']:<15} {numbers}  {row['ours']['cpu_s']:5.0f} s  {row['name']}"
+    errors = "  ".join(f"{name} {shown(row[name]['score']):>11}" for name in ("ours", "sindy", "known"))
+    return f"{row['index']:3d}  {row['outcome']:<15} {errors}  {row['ours']['cpu_s']:5.0f} s  {row['name']}"
 
 
 def main() -> None:

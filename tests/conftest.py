@@ -37,4 +37,4 @@ def pytest_configure():
 
     for name, module in list(sys.modules.items()):
         if name.startswith("herglotz") and getattr(module, "fit", None) is fit:
-            module.fit = fit_shaken
+            setattr(module, "fit", fit_shaken)  # noqa: B010  a module has no such attribute to type checkers

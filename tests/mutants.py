@@ -91,8 +91,8 @@ MUTANTS = [
     ("models/friction.py", "before, after = (c * h / 2)[..., None]", "before, after = (h / 2)[..., None]", "tests/contracts/test_model_contract.py"),
     ("models/mass.py", "self.network(x) - at_zero", "self.network(x)", "tests/unit/models"),
     # stepping
-    ("stepping/engine.py", "x = x - solve(J, F - F.detach())", "x = x + solve(J, F - F.detach())", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
-    ("stepping/state.py", "sigma=factors.cumprod(-1)", "sigma=factors", f"{T}/test_boundary_value.py::test_the_cauchy_problem"),
+    ("mechanics/newton.py", "return x - solve(J, F - F.detach())", "return x + solve(J, F - F.detach())", f"{M}/test_partials.py::test_step_derivative_is_the_derivative_of_the_step"),
+    ("stepping/rollout.py", "sigma = step.state, sigma * step.c", "sigma = step.state, step.c", f"{T}/test_boundary_value.py::test_the_cauchy_problem"),
     ("theory/evolution.py", "split(x0 + 0.5 * delta)", "split(x0)", f"{T}/test_evolution.py::test_order_two_on_a_nonlinear_damped_problem"),
     ("theory/evolution.py", "mean = 0.5 * (H(x0) + H(x1))", "mean = H(x0)", f"{T}/test_evolution.py::test_H_shrinks_by_c_along_the_contact_field"),
     ("stepping/composition.py", "c * part.c", "part.c", f"{K}/test_composition.py"),

@@ -51,24 +51,17 @@ def printed_slopes(step: PrintedParachute, k: int) -> GeneratingFunction:
 
 def printed_map() -> tuple[dict, PrintedOrbit]:
     """The orbit as printed and with s², as far as floats go, and D2S^k of both."""
-    found, slopes, momenta = {}, {}, {}
+    found, momenta, slopes = {}, {}, {}
     for name, step in (("printed", PrintedParachute()), ("squared", PrintedParachute(squared=True))):
-        (q, p, s), last = step.orbit(*start(), steps=12)
+        (q, p, s), last = step.orbit(*start(), steps=SHOWN + 6)
         slopes[name] = [float(printed_slopes(step, k).D2) for k in range(1, SHOWN + 1)]
-        momenta[name] = p[: SHOWN + 1, 0]
+        momenta[name] = p[: SHOWN + 1, 0].numpy()
         rows = range(min(last, 9) + 1)
         points = [{"k": k, "q": float(q[k, 0]), "p": float(p[k, 0]), "s": float(s[k])} for k in rows]
         found[name] = {"points": points, "dS": slopes[name], "last_finite_k": last}
-    (q, p, _), last = PrintedParachute().orbit(*start(), steps=SHOWN + 6)
-    orbit = PrintedOrbit(
-        q[: SHOWN + 1, 0].numpy(),
-        p[: SHOWN + 1, 0].numpy(),
-        np.array(slopes["printed"]),
-        momenta["squared"].numpy(),
-        np.array(slopes["squared"]),
-        last,
-    )
-    return found, orbit
+    heights = np.array([x["q"] for x in found["printed"]["points"][: SHOWN + 1]])
+    printed, squared = ((momenta[name], np.array(slopes[name])) for name in ("printed", "squared"))
+    return found, PrintedOrbit(heights, *printed, *squared, last=found["printed"]["last_finite_k"])
 
 
 def landing(q0: float, v0: float) -> tuple[float, float]:
@@ -159,20 +152,17 @@ def main() -> int:
 
 def report(printed: dict, fall: dict) -> None:
     """What a reader should see first."""
-    points = printed["printed"]["points"]
-    slopes = [[None, *printed[name]["dS"]] for name in ("printed", "squared")]
+    points, squared = printed["printed"]["points"], printed["squared"]["points"]
+    slopes, slopes_squared = printed["printed"]["dS"], printed["squared"]["dS"]
     print("the map as printed, λ = −0.01, from (100, 1, 1)")
     print(f"{'k':>2} {'q':>22} {'p':>22} {'s':>22} {'D2S^k(q_k)':>22}")
-    for x in points:
-        dS = slopes[0][x["k"]] if 0 < x["k"] <= SHOWN else ""
+    for x, dS in zip(points, ["", *slopes, *[""] * len(points)], strict=False):
         print(f"{x['k']:2} {x['q']:22.16g} {x['p']:22.16g} {x['s']:22.16g} {dS:>22}")
     last = printed["printed"]["last_finite_k"]
-    print(
-        f"   k = {last + 1} overflows float64; with s² in the s-line s_2 = {printed['squared']['points'][2]['s']:.14g}"
-    )
-    together = [abs(a - b["p"]) for a, b in zip(slopes[1][1:], printed["squared"]["points"][1:], strict=False)]
-    apart = abs(slopes[0][3] - points[3]["p"])
-    print(f"   D2S^k = p_k to {max(together):.0e} with s²; as printed they are {apart:.3g} apart at k = 3")
+    print(f"   k = {last + 1} overflows float64; with s² in the s-line s_2 = {squared[2]['s']:.14g}")
+    together = max(abs(a - b["p"]) for a, b in zip(slopes_squared, squared[1:], strict=False))
+    apart = abs(slopes[2] - points[3]["p"])
+    print(f"   D2S^k = p_k to {together:.0e} with s²; as printed they are {apart:.3g} apart at k = 3")
     print("\nthe fall, λ = +0.01, same start")
     for name in ("landing_time", "landing_velocity"):
         for how, value in fall[name].items():

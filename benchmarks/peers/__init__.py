@@ -12,34 +12,21 @@ from .known_equation import train_known_equation
 from .packages import train_ours, train_phlearn, train_sindy
 from .rollouts import Predictor
 
-Train = Callable[..., Predictor]
-
 
 @dataclass(frozen=True)
 class Peer:
     """One method.
 
-    Parameters
-    ----------
-    title
-        As the table says it.
-    train
-        (samples, seed, budget) → predictor.
-    needs
-        What a sample must hold by the method's definition: "positions" or "velocities". The latter are differences of
-        the positions, and where the data are simulated there is a second row with the exact ones. "either": positions
-        will do, and there is the second row all the same.
-    source
-        Where it comes from and what is fitted.
-    package
-        A package that must be installed.
+    By its definition it needs positions or velocities. Velocities are differences of the positions, and where the data
+    are simulated there is a second row with the exact ones. "either": positions will do, and there is the second row
+    all the same.
     """
 
-    title: str
-    train: Train
-    needs: str
-    source: str
-    package: str | None = None
+    title: str  # as the table says it
+    train: Callable[..., Predictor]  # (samples, seed, budget) → predictor
+    needs: str  # "positions", "velocities" or "either"
+    source: str  # where it comes from and what is fitted
+    package: str | None = None  # a package that must be installed
 
     @property
     def installed(self) -> bool:
@@ -48,63 +35,32 @@ class Peer:
 
 
 PEERS = {
-    "ours": Peer(
-        "herglotz, no flag changed",
-        train_ours,
-        "positions",
-        "`herglotz.training.fit` with its defaults; stops by itself",
-    ),
-    "neural_ode": Peer(
-        "neural ODE",
-        train_neural_ode,
-        "either",
-        "Chen et al. 2018: v̇ = net(q, v) by torchdiffeq (rk4), error over windows of 9 samples; without velocities the "
-        "one at the start of each window is trained",
-    ),
-    "mlp": Peer("MLP step map", train_mlp, "positions", "net of (q1, (q1 − q0)/h) for the second difference, one step"),
+    "ours": Peer("herglotz, no flag changed", train_ours, "positions",
+                 "`herglotz.training.fit` with its defaults; stops by itself"),
+    "neural_ode": Peer("neural ODE", train_neural_ode, "either",
+                       "Chen et al. 2018: v̇ = net(q, v) by torchdiffeq (rk4), error over windows of 9 samples; without "
+                       "velocities the one at the start of each window is trained"),
+    "mlp": Peer("MLP step map", train_mlp, "positions",
+                "net of (q1, (q1 − q0)/h) for the second difference, one step"),
     "hnn": Peer("HNN", train_hnn, "velocities", "Greydanus et al. 2019: net H(q, p), rates; cannot dissipate"),
-    "dissipative_hnn": Peer(
-        "dissipative HNN", train_dissipative_hnn, "velocities", "Sosanya & Greydanus 2022: nets H and D, rates"
-    ),
-    "lnn": Peer(
-        "LNN", train_lnn, "velocities", "Cranmer et al. 2020: net L(q, v) on top of ½v·v, accelerations; no friction"
-    ),
-    "delan": Peer(
-        "DeLaN with friction",
-        train_delan,
-        "velocities",
-        "Lutter et al. 2019: nets M(q), V(q) and a viscous friction, accelerations",
-    ),
-    "discrete_lagrangian": Peer(
-        "discrete Lagrangian net",
-        train_discrete_lagrangian,
-        "positions",
-        "Lishkova et al. 2023, base point of Offen 2024: net L_d(q0, q1), residual; cannot dissipate",
-    ),
-    "forced_discrete_lagrangian": Peer(
-        "discrete forced Lagrangian net",
-        train_forced_discrete_lagrangian,
-        "positions",
-        "Hansen, Celledoni & Tapley 2025: nets L and F at midpoints, residual, penalty (log det)² on 128 pairs",
-    ),
-    "phlearn": Peer(
-        "phlearn",
-        train_phlearn,
-        "velocities",
-        "Eidnes et al. 2023, the package: its network, its `train` (srk4, batches of 64), friction of the momenta",
-        "phlearn",
-    ),
-    "sindy": Peer(
-        "SINDy (pysindy)",
-        train_sindy,
-        "velocities",
-        "Brunton et al. 2016, the package's STLSQ; for pendulums its terms hold the true equation",
-        "pysindy",
-    ),
-    "known_equation": Peer(
-        "known equation, fitted",
-        train_known_equation,
-        "positions",
-        "the floor: the true equation with 2 (two joints: 6) unknown numbers, and all starts",
-    ),
-}
+    "dissipative_hnn": Peer("dissipative HNN", train_dissipative_hnn, "velocities",
+                            "Sosanya & Greydanus 2022: nets H and D, rates"),
+    "lnn": Peer("LNN", train_lnn, "velocities",
+                "Cranmer et al. 2020: net L(q, v) on top of ½v·v, accelerations; no friction"),
+    "delan": Peer("DeLaN with friction", train_delan, "velocities",
+                  "Lutter et al. 2019: nets M(q), V(q) and a viscous friction, accelerations"),
+    "discrete_lagrangian": Peer("discrete Lagrangian net", train_discrete_lagrangian, "positions",
+                                "Lishkova et al. 2023, base point of Offen 2024: net L_d(q0, q1), residual; cannot "
+                                "dissipate"),
+    "forced_discrete_lagrangian": Peer("discrete forced Lagrangian net", train_forced_discrete_lagrangian, "positions",
+                                       "Hansen, Celledoni & Tapley 2025: nets L and F at midpoints, residual, penalty "
+                                       "(log det)² on 128 pairs"),
+    "phlearn": Peer("phlearn", train_phlearn, "velocities",
+                    "Eidnes et al. 2023, the package: its network, its `train` (srk4, batches of 64), friction of the "
+                    "momenta", "phlearn"),
+    "sindy": Peer("SINDy (pysindy)", train_sindy, "velocities",
+                  "Brunton et al. 2016, the package's STLSQ; for pendulums its terms hold the true equation",
+                  "pysindy"),
+    "known_equation": Peer("known equation, fitted", train_known_equation, "positions",
+                           "the floor: the true equation with 2 (two joints: 6) unknown numbers, and all starts"),
+}  # fmt: skip

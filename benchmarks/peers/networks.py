@@ -95,45 +95,55 @@ def count(parameters: Sequence[Tensor]) -> int:
     return sum(x.numel() for x in parameters)
 
 
+class _Best:
+    """The weights of the least validation loss so far, and the part of the budget that is used."""
+
+    def __init__(self, parameters: Sequence[Tensor], judge: Callable[[], Tensor], budget: float):
+        self.parameters, self.judge, self.budget, self.began = parameters, judge, budget, time.process_time()
+        self.value, self.at, self.weights = math.inf, 0.0, [x.detach().clone() for x in parameters]
+
+    def used(self) -> float:
+        return (time.process_time() - self.began) / self.budget
+
+    def look(self) -> bool:
+        """Keep the weights if they are the best; whether to go on."""
+        value = float(self.judge().detach())
+        if value < self.value:
+            self.value, self.at, self.weights = value, self.used(), [x.detach().clone() for x in self.parameters]
+        return self.used() < 1.0 and self.used() - self.at < PATIENCE
+
+    def restore(self) -> None:
+        with torch.no_grad():
+            for x, value in zip(self.parameters, self.weights, strict=True):
+                x.copy_(value)
+        self.at = self.used()
+
+
 def train(
     loss: Callable[[Tensor], Tensor],  # of these rows of the training data
     rows: int,
-    validation: Callable[[], Tensor] | None,
+    validation: Callable[[], Tensor],
     parameters: Sequence[Tensor],
     generator: torch.Generator,
     budget: float,  # seconds of processor time
 ) -> None:
     """Adam with minibatches and a falling rate, then L-BFGS; the weights of the best validation loss are kept."""
-    began, parameters = time.process_time(), list(parameters)
-    best, kept, best_at = math.inf, [x.detach().clone() for x in parameters], 0.0
-
-    def used() -> float:
-        return (time.process_time() - began) / budget
-
-    def judge() -> bool:
-        """Whether to go on."""
-        nonlocal best, kept, best_at
-        value = float((validation() if validation else loss(fixed)).detach())
-        if value < best:
-            best, best_at, kept = value, used(), [x.detach().clone() for x in parameters]
-        return used() < 1.0 and used() - best_at < PATIENCE
-
+    parameters = list(parameters)
+    best = _Best(parameters, validation, budget)
     fixed = torch.randperm(rows, generator=generator)[:ROWS]
-    optimiser = torch.optim.Adam(parameters, lr=LEARNING_RATE)
-    step, going = 0, True
-    while going and used() < ADAM_PART:
+    optimiser, step, going = torch.optim.Adam(parameters, lr=LEARNING_RATE), 0, True
+    while going and (used := best.used()) < ADAM_PART:
         for group in optimiser.param_groups:
-            group["lr"] = LEARNING_RATE * (0.5 + 0.5 * math.cos(math.pi * used() / ADAM_PART)) + 1e-6
+            group["lr"] = LEARNING_RATE * (0.5 + 0.5 * math.cos(math.pi * used / ADAM_PART)) + 1e-6
         optimiser.zero_grad()
         loss(torch.randint(rows, (min(BATCH, rows),), generator=generator)).backward()
         nn.utils.clip_grad_norm_(parameters, 10.0)
         optimiser.step()
         step += 1
         if step % 50 == 0:
-            going = judge()
-    judge()
-    _restore(parameters, kept)
-    best_at = used()
+            going = best.look()
+    best.look()
+    best.restore()
     polish = torch.optim.LBFGS(parameters, max_iter=10, history_size=50, line_search_fn="strong_wolfe")
 
     def closure() -> Tensor:
@@ -142,17 +152,11 @@ def train(
         value.backward()
         return value
 
-    going = used() < 1.0
+    going = best.used() < 1.0
     while going:
         value = polish.step(closure)  # type: ignore[arg-type]
-        going = bool(torch.isfinite(value)) and judge()
-    _restore(parameters, kept)
-
-
-def _restore(parameters: Sequence[Tensor], values: Sequence[Tensor]) -> None:
-    with torch.no_grad():
-        for x, value in zip(parameters, values, strict=True):
-            x.copy_(value)
+        going = bool(torch.isfinite(value)) and best.look()
+    best.restore()
 
 
 def split(rows: int, generator: torch.Generator, part: float = 0.12) -> tuple[Tensor, Tensor]:

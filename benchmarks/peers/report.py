@@ -117,6 +117,8 @@ def draw(result: dict[str, Any], path: Path) -> None:
     shown = [data for data in PROBLEMS if rows_of(result["cells"], data)]
     peers = [p for p in PEERS if any(key.split("/")[1] == p for key in result["cells"])]
     place = {p: len(peers) - 1 - k for k, p in enumerate(peers)}
+    if not shown:
+        return
     columns = min(4, len(shown))
     lines = -(-len(shown) // columns)
     with styled():

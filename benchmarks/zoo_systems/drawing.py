@@ -12,12 +12,13 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.random import Generator
-from zoo_systems.judging import score
-from zoo_systems.known import fit_known
-from zoo_systems.mechanisms import Array, Mechanism, Values
-from zoo_systems.motion import exact_motion
-from zoo_systems.prediction import MechanismModel, own_predictions
-from zoo_systems.systems import Recording, ZooSystem
+
+from benchmarks.zoo_systems.judging import score
+from benchmarks.zoo_systems.known import fit_known
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism, Values
+from benchmarks.zoo_systems.motion import exact_motion
+from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions
+from benchmarks.zoo_systems.systems import Recording, ZooSystem
 
 KINDS = {
     "spring": 0.30, "pendulum": 0.18, "axis": 0.12, "chain": 0.12, "pendulums": 0.08, "double_pendulum": 0.08,

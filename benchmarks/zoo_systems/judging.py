@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from zoo_systems.mechanisms import Array
-from zoo_systems.systems import ZooSystem
+
+from benchmarks.zoo_systems.mechanisms import Array
+from benchmarks.zoo_systems.systems import ZooSystem
 
 AT_NOISE = 1.5  # times the noise: RMS of the free run against noisy samples, where a perfect model has 1
 USABLE = 0.1  # of the size of the motion

@@ -7,9 +7,10 @@ implicit dry friction, Jacobian by differences, all columns stepped as one batch
 from __future__ import annotations
 
 import numpy as np
-from zoo_systems.mechanisms import Array, Mechanism
-from zoo_systems.prediction import MechanismModel, roll, start_states, trained
-from zoo_systems.systems import ZooSystem
+
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism
+from benchmarks.zoo_systems.prediction import MechanismModel, roll, start_states, trained
+from benchmarks.zoo_systems.systems import ZooSystem
 
 ITERATIONS = 8
 OFFSET = 1e-5  # of finite differences, relative to 1 for numbers of the mechanism, to the noise for states

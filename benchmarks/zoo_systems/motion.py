@@ -9,7 +9,8 @@ A fine step of 1/500 of the natural period leaves an error of about 1e-9 of the 
 from __future__ import annotations
 
 import numpy as np
-from zoo_systems.mechanisms import Array, Mechanism
+
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism
 
 FINE = 2 * np.pi / 500  # longest fine step, in natural units
 BISECTIONS = 50  # of the time of an event, in a fine step

@@ -13,10 +13,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from zoo_systems.mechanisms import Array
-from zoo_systems.prediction import trained
-from zoo_systems.systems import Recording, ZooSystem
 
+from benchmarks.zoo_systems.mechanisms import Array
+from benchmarks.zoo_systems.prediction import trained
+from benchmarks.zoo_systems.systems import Recording, ZooSystem
 from herglotz.data import Trajectories, save
 from herglotz.training import load_run
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
-from zoo_systems.mechanisms import Array, Mechanism
-from zoo_systems.systems import TRAIN, Recording, ZooSystem
+
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism
+from benchmarks.zoo_systems.systems import TRAIN, Recording, ZooSystem
 
 SMOOTH, DRY = 2 * np.pi / 60, 2 * np.pi / 250  # longest inner step, natural units; dry friction is split, of order 2
 LOST = 1e6  # a motion beyond this has diverged

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import statistics
-import subprocess
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
-from zoo_systems.judging import OUTCOMES, SILENT
+from benchmarks.zoo_systems.judging import OUTCOMES, SILENT
 
 Row = dict[str, Any]
+METHODS = ("ours", "sindy", "known")
 
 
-def commit() -> str:
-    """The commit of this repository, or "unknown" outside of one."""
-    found = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, cwd=Path(__file__).parent, check=False
-    )
-    return found.stdout.strip() or "unknown"
+def shown(score: float | None) -> str:
+    """An error for people."""
+    return "not reached" if score is None else f"{score:.3g}"
 
 
 def shares(rows: Sequence[Row]) -> dict[str, float]:
@@ -30,7 +26,9 @@ def shares(rows: Sequence[Row]) -> dict[str, float]:
 def report(rows: Sequence[Row], seed: int, limit: float) -> str:
     """Markdown."""
     commits = ", ".join(sorted({row["commit"] for row in rows}))
-    medians = {name: statistics.median(row[name]["score"] for row in rows) for name in ("ours", "sindy", "known")}
+    medians = {
+        name: statistics.median(_number(row[name]["score"]) for row in rows) for name in ("ours", "sindy", "known")
+    }
     cpu = statistics.median(row["ours"]["cpu_s"] for row in rows)
     lines = [
         f"# The zoo: {len(rows)} systems drawn by seed {seed}",
@@ -57,8 +55,12 @@ def report(rows: Sequence[Row], seed: int, limit: float) -> str:
         cells = [
             row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
             f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
-            *(f"{row[name]['score']:.3g} ({row[name]['relative']:.2g})" for name in ("ours", "sindy", "known")),
+            *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in METHODS),
             f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip().replace("|", "/"),
         ]  # fmt: skip
         lines.append(f"| {' | '.join(map(str, cells))} |")
     return "\n".join([*lines, ""])
+
+
+def _number(score: float | None) -> float:
+    return float("inf") if score is None else score

@@ -9,9 +9,10 @@ Source: S. L. Brunton, J. L. Proctor and J. N. Kutz, PNAS 113 (2016) 3932.
 from __future__ import annotations
 
 import numpy as np
-from zoo_systems.mechanisms import Array
-from zoo_systems.prediction import SMOOTH, rk4, roll, start_states, trained
-from zoo_systems.systems import ZooSystem
+
+from benchmarks.zoo_systems.mechanisms import Array
+from benchmarks.zoo_systems.prediction import SMOOTH, rk4, roll, start_states, trained
+from benchmarks.zoo_systems.systems import ZooSystem
 
 HALF_WIDTHS = (0.02, 0.05, 0.1, 0.2)  # of the smoothing window, in natural periods; two samples at the least
 THRESHOLDS = (0.0, 0.003, 0.01, 0.03, 0.1)  # of a term's share in the acceleration, relative to its RMS

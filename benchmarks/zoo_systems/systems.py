@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from zoo_systems.mechanisms import Array, Mechanism
+
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism
 
 EXACT = 1e-4  # of the size of a motion: what "at the noise" means where there is no noise
 TRAIN = 0.667  # of each training recording, in samples: the default of `fit`

@@ -8,8 +8,8 @@ import torch
 from extreme_cases import build, starts
 from torch.utils._python_dispatch import TorchDispatchMode
 
-import herglotz.stepping.engine as engine
-import herglotz.stepping.newton as newton
+import herglotz.mechanics.newton as newton
+import herglotz.stepping.single_step as engine
 from herglotz.models.action import ActionFlow
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential

@@ -13,7 +13,8 @@ ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 CODE = {p: p.read_text(encoding="utf-8") for room in ("src", "tests", "train", "benchmarks", "tools")
         for p in sorted((ROOT / room).rglob("*.py")) if p != Path(__file__).resolve()}  # fmt: skip
-EVERYTHING = " ".join([*map(str, CODE), *CODE.values()])
+RUNTIME = [p.read_text(encoding="utf-8") for p in sorted((ROOT / "src").rglob("*.h"))]  # of the generated C
+EVERYTHING = " ".join([*map(str, CODE), *CODE.values(), *RUNTIME])
 # Names of the generated C stand behind a prefix there.
 WORDS = set(re.findall(r"\w+", EVERYTHING)) | set(re.findall(r"(?<=_)[A-Za-z]\w+", EVERYTHING))
 FILES = [p.relative_to(ROOT) for room in ("src", "tests", "train", "benchmarks", "tools", "docs", "data")
@@ -84,12 +85,17 @@ def test_links_lead_somewhere(path):
 
 
 def resolve(name):
-    """The object that a dotted name means; raises where there is none."""
-    module, parts = importlib.import_module("herglotz"), name.split(".")[1:]
-    for i, part in enumerate(parts):
-        if not hasattr(module, part):
-            importlib.import_module(".".join(["herglotz", *parts[: i + 1]]))
-        module = getattr(module, part)
+    """The object that a dotted name means; raises where there is none. A module may share its name with a function."""
+    parts = re.sub(r"^hz\b", "herglotz", name).split(".")
+    for i in range(len(parts), 0, -1):
+        try:
+            value = importlib.import_module(".".join(parts[:i]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[i:]:
+            value = getattr(value, part)
+        return
+    raise ModuleNotFoundError(name)
 
 
 @by_page

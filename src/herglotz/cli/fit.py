@@ -19,10 +19,12 @@ ROBUST = ("auto", "on", "off")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
+NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
-(*.png).
+(*.png). The last line is the verdict: "fits to the noise", "fits, worse than the noise by ...", or "does not fit: ..."
+with what to try; then the exit code is 3.
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q) or a
 Schmidt & Lipson .txt. Steps may differ and samples may be missing.
@@ -67,8 +69,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--restarts", type=count, metavar="R",
-        help="draws of the weights that race for a part of the one-step fit's iterations (default: 4 for a correction "
-        "of one layer, else 1)",
+        help="random initialisations of the one-step fit; the best after 30 iterations is kept (default: 4 for a "
+        "correction of one layer, else 1)",
     )  # fmt: skip
     parser.add_argument(
         "--every", type=count, default=1, metavar="M",
@@ -140,11 +142,13 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(result.metrics)
     else:
         report(result, out, drawn)
-    return 0
+    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
 
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:
     """Print what was reached, for people, and what to do next."""
+    from herglotz.training import Plan
+
     m, data = result.metrics, result.data
     unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
     kept, total = sum(result.train_lengths), data.samples
@@ -158,11 +162,15 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         ("damping rate", _show(m.get("rate"), f"per {'unit of time' if data.time_unit == '1' else data.time_unit}")),
         ("time", _show(m.get("seconds"), "s")),
     ]
+    print("Plan (what was decided, and why):")
+    print(Plan.from_dict(m["plan"]).table())
+    print("Result:")
     print_table([row for row in rows if not row[1].startswith("None")])
     if m.get("extrapolation_status") not in (None, "ok"):
         print(f"Note: {m['extrapolation_status']}")
     if drawn:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
+    print(f"Verdict: {m['verdict']}")
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 

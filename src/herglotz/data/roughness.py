@@ -7,10 +7,11 @@ import torch
 from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
+DEGREES = (3, 5, 7)  # of `precision`: noise leaves the same at each, coarsely sampled motion leaves less at the higher
 MOST = 4000  # windows at most, evenly spread: more do not change an RMS
 
 
-def roughness(data: Trajectories) -> float:
+def roughness(data: Trajectories, degree: int = DEGREE) -> float:
     """Return the RMS residual of polynomials in time through nine samples in a row, in units of q.
 
     Infinite where no trajectory has nine samples.
@@ -29,6 +30,14 @@ def roughness(data: Trajectories) -> float:
     rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
     t, q = data.t[rows].double().cpu(), data.q[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
-    Q = torch.linalg.qr(torch.stack([x**k for k in range(DEGREE + 1)], -1)).Q
+    Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
     r = q - Q @ (Q.mT @ q)
-    return float((r.square().mean() * SAMPLES / (SAMPLES - DEGREE - 1)).sqrt())
+    return float((r.square().mean() * SAMPLES / (SAMPLES - degree - 1)).sqrt())
+
+
+def precision(data: Trajectories) -> float:
+    """Standard deviation of the noise of q as the data show it without a model; an upper bound where they are coarse.
+
+    inf where no trajectory has nine samples.
+    """
+    return min(roughness(data, degree) for degree in DEGREES)

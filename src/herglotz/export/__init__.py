@@ -1,16 +1,17 @@
 """Models as files that step on their own: `.pt2`, ONNX, machine code and C; loaded, and compared with eager."""
 
-from herglotz.export.aoti import export_aoti
 from herglotz.export.c_compile import compile
 from herglotz.export.c_header import export_c
 from herglotz.export.c_stepper import CompiledStepper, compile_c, load_c
 from herglotz.export.compare import compare
 from herglotz.export.differences import DifferencedStepper
-from herglotz.export.loader import ExportedStepper, load_exported, load_pt2
+from herglotz.export.exported import ExportedStepper
+from herglotz.export.load import load_exported, load_onnx, load_pt2
+from herglotz.export.lower.aoti import export_aoti
+from herglotz.export.lower.onnx import export_onnx
+from herglotz.export.lower.pt2 import export_pt2
 from herglotz.export.metadata import weights_digest
 from herglotz.export.module import StepModule
-from herglotz.export.onnx_file import export_onnx, load_onnx
-from herglotz.export.pt2 import export_pt2
 
 __all__ = [
     "CompiledStepper",

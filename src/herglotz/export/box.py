@@ -1,4 +1,4 @@
-"""Where a model was fitted: the box of states, and the range of steps."""
+"""Where a model was fitted (the box of states, the range of steps), and what steps report of themselves."""
 
 from __future__ import annotations
 
@@ -8,7 +8,9 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor, nn
 
+from herglotz.export.equation import dense
 from herglotz.models import ContactLagrangian
+from herglotz.stepping import Status
 
 
 class Box(nn.Module):
@@ -46,34 +48,40 @@ class Box(nn.Module):
         """The box of a model, if there is one."""
         return None if box is None else cls(box, model.config.angles, next(model.parameters()).dtype, h_range)
 
-    @property
-    def bounds(self) -> tuple[Tensor, ...]:
-        """What a loop takes as operands."""
-        span = self.span
-        return self.low, self.high, self.turn, self.inverse, *((span,) if isinstance(span, Tensor) else ())
-
     def forward(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """(...) True where a state lies outside, or is not a number."""
-        return beyond((q, p, s), self.bounds)
+        x = torch.cat([q, p, s[..., None]], -1)
+        x = x - self.turn * torch.round((x - (self.low + self.high) / 2) * self.inverse)
+        return ~((x >= self.low) & (x <= self.high)).all(-1)
+
+    def flags(self, h: Tensor, before: tuple[Tensor, ...], after: tuple[Tensor, ...]) -> Tensor:
+        """(...) uint8: 1 where a step starts or ends outside, plus 2 where h is beyond its range."""
+        flags = (self(*before) | self(*after)).to(torch.uint8)
+        span = self.span
+        if not isinstance(span, Tensor):
+            return flags
+        return torch.where((h >= span[0]) & (h <= span[1]), flags, flags + 2)
 
 
-def beyond(state: tuple[Tensor, ...], bounds: tuple[Tensor, ...]) -> Tensor:
-    """(...) True where a state lies outside bounds, or is not a number."""
-    q, p, s = state
-    low, high, turn, inverse = bounds[:4]
-    x = torch.cat([q, p, s[..., None]], -1)
-    x = x - turn * torch.round((x - (low + high) / 2) * inverse)
-    return ~((x >= low) & (x <= high)).all(-1)
+class Report(nn.Module):
+    """What a step says of itself: its status, NaN where it failed, and the box."""
 
+    def __init__(self, box: Box | None):
+        super().__init__()
+        self.box = box
 
-def outside(
-    bounds: tuple[Tensor, ...], h: Tensor, before: tuple[Tensor, ...], after: tuple[Tensor, ...]
-) -> tuple[Tensor, ...]:
-    """(outside,) where there are bounds, uint8: 1 where the step starts or ends beyond them, and 2 where h does."""
-    if not bounds:
-        return ()
-    flags = (beyond(before, bounds) | beyond(after, bounds)).to(torch.uint8)
-    if len(bounds) > 4:
-        span = bounds[4]
-        flags = torch.where((h >= span[0]) & (h <= span[1]), flags, flags + 2)
-    return (flags,)
+    def forward(
+        self, h: Tensor, q: Tensor, p: Tensor, s: Tensor, q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, *solved: Tensor
+    ) -> tuple[Tensor, ...]:
+        """q1, p1, s1, c, residual, status[, outside]; `solved` is the residual and status of steps that iterate."""
+        residual, said = solved or (0.0 * c, None)
+        sound = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
+        status = torch.where(sound, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
+        if said is not None:
+            status = torch.where(said != int(Status.CONVERGED), said, status)
+        status = torch.where(c == 0, int(Status.SINGULAR), status)
+        status = torch.where((h > 0) & torch.isfinite(h), status, int(Status.BAD_INPUT)).to(torch.uint8)
+        nan = torch.where(status == int(Status.CONVERGED), 0.0, torch.nan).to(q1.dtype)
+        new = (q1 + nan[:, None], p1 + nan[:, None], s1 + nan)
+        outside = () if self.box is None else (self.box.flags(h, (q, p, s), new),)
+        return tuple(dense(x) for x in (*new, c + nan, residual, status, *outside))

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import copy
+import hashlib
 import json
 import re
 from collections.abc import Mapping, Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -13,95 +15,84 @@ import torch
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
-from herglotz.export.c_api import API, BATCHES
-from herglotz.export.c_arithmetic import activations, number_tests
-from herglotz.export.c_batch import BATCH
-from herglotz.export.c_model import activations_of, constants_source, flags_of, functions_source, legendre_plus_source
-from herglotz.export.c_network import PRODUCT, WIDE_PRODUCT
-from herglotz.export.c_solver import ADVANCE, ELIMINATION
-from herglotz.export.c_template import fill, finish, number, numbers, render, text_constant, widen
+from herglotz.export.c_numbers import number, numbers, text_constant, written
+from herglotz.export.equation import Equations
+from herglotz.export.lower.c import StepInC, model_source
 from herglotz.export.metadata import describe
+from herglotz.export.step_parts import pushed
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
 MAX_ITERATIONS = 30
+MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
+MAX_WIDE = 24  # coordinates; with more, registers of n x n matrices outgrow the stack that some threads have
 
-_TOP = """\
-/* @NAME@: the time stepper of a learned contact Lagrangian. C99 (and C++11), <math.h> only, no allocation.
+TOP = """\
+/* hz_: the time stepper of a learned contact Lagrangian. C99 (and C++11), <math.h> only, no allocation.
 
-   Written by herglotz @VERSION@; do not edit. One step (q, p, s) -> (q1, p1, s1) solves D1 L_d + c p = 0 for q1.
+   Written by herglotz {version}; do not edit. One step (q, p, s) -> (q1, p1, s1) solves D1 L_d + c p = 0 for q1.
 
    #include <stdio.h>
-   #include "@FILE@"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
+   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
 
-   int main(void) {
-     NAME_real q0[NAME_N] = {0}, q1[NAME_N] = {0}, left;
-     NAME_state x;
+   int main(void) {{
+     hz_real q0[hz_N] = {{0}}, q1[hz_N] = {{0}}, left;
+     hz_state x;
      int k, status;
-     q1[0] = (NAME_real)0.01;  // two measured positions, h apart
-     status = NAME_init(q0, q1, 0, NAME_h, {%if inputs}0, {%end}&x);
-     for (k = 0; k < 100 && !(status & 15); k++) {
-       status = NAME_step(&x, NAME_h, {%if inputs}0, {%end}&left);
+     q1[0] = (hz_real)0.01;  // two measured positions, h apart
+     status = hz_init(q0, q1, 0, hz_h, {no_u}&x);
+     for (k = 0; k < 100 && !(status & 15); k++) {{
+       status = hz_step(&x, hz_h, {no_u}&left);
        printf("%d %g %g\\n", k, (double)x.q[0], (double)left);
-     }
+     }}
      if (status & 15)  // the state is the last good one
        fprintf(stderr, "step %d failed with status %d\\n", k, status);
-     if (status & NAME_OUTSIDE_BOX)
+     if (status & hz_OUTSIDE_BOX)
        fprintf(stderr, "outside the data the model was fitted to\\n");
      return status & 15;
-   }
+   }}
 
-   @MARK@@METADATA@
+   {mark}{comment}
 */
-#ifndef NAME_HEADER
-#define NAME_HEADER
+#ifdef hz_HEADER
+#if hz_HEADER != {guard}
+#error "two different models have the prefix hz_: export one of them under another name"
+#endif
+#else
+#define hz_HEADER {guard}
 
 #include <math.h>
 
-#ifdef __cplusplus
-#define NAME_RESTRICT
-#else
-#define NAME_RESTRICT restrict
-#endif
+/* What the model is made of, for the preprocessor. */
+#define hz_N {n} /* coordinates */
+#define hz_M {m} /* inputs */
+#define hz_INPUTS {inputs}
+#define hz_SINGLE {single} /* float, not double */
+#define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
+#define hz_BOXED {boxed} /* a box of the fitted data is recorded */
+#define hz_DERIVATIVES {derivatives} /* hz_step_jacobian is there */
+#define hz_WIDE {wide} /* batches go by registers of samples */
 
-typedef @REAL@ NAME_real;
-enum { NAME_N = @N@, NAME_M = @M@ };  /* coordinates, inputs */
-
-/* What a step returns. */
-enum {
-  NAME_CONVERGED = 0,
-  NAME_MAX_ITERATIONS = 1,
-  NAME_SINGULAR = 2,      /* det J = 0 or c = 0: the step is not defined there */
-  NAME_DIVERGED = 3,      /* a value stopped being finite */
-  NAME_BAD_INPUT = 5,     /* h <= 0, or a number that is not finite */
-  NAME_OUTSIDE_BOX = 16,  /* a separate bit: a state outside the box of the fitted data; the step is done */
-  NAME_OUTSIDE_H = 32     /* a separate bit: h outside [NAME_h_low, NAME_h_high]; the step is done */
-};
-
-/* `status & 15` is 0 where a step succeeded; the bits above are flags.
-
-   A state. q in NAME_units; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
-   steps so far (start it at 1). */
-typedef struct {
-  real q[NAME_N], p[NAME_N], s, sigma;
-} NAME_state;
-
+typedef {real} hz_real;
+"""
+CONSTANTS = """
 /* What the model is. */
-static const char NAME_weights_sha256[] = @SHA@;
-static const char NAME_level[] = @LEVEL@;
-static const char NAME_dtype[] = @DTYPE@;
-static const char NAME_versions[] = @VERSIONS@;
-static const char *const NAME_units[] = {@UNIT_LIST@};
-static const int NAME_is_angle[NAME_N] = {@ANGLES@};
-static const real NAME_h = @H@;  /* typical step: recorded, not imposed */
-static const real NAME_h_low = @H_LOW@, NAME_h_high = @H_HIGH@;  /* steps it was fitted for */
-static const real NAME_tolerance = @TOLERANCE@;  /* of Newton, relative to the size of q */
-static const real NAME_floor = @FLOOR@;  /* rounding that no iteration removes */
-static const real NAME_top_speed = @TOP_SPEED@;  /* the networks' rounding is relative to h times this, even at rest */
-static const real NAME_near = R(0.01);  /* moves below this, relative, keep the last J */
-enum { NAME_max_iterations = @MAX_ITERATIONS@, NAME_BOXED = @BOXED@ };
-@BOX@"""
+static const char hz_weights_sha256[] = {sha};
+static const char hz_level[] = {level};
+static const char hz_dtype[] = {dtype};
+static const char hz_versions[] = {versions};
+static const char *const hz_units[] = {{{units}}};
+static const int hz_is_angle[hz_N] = {{{angles}}};
+static const hz_real hz_h = {h}; /* typical step: recorded, not imposed */
+static const hz_real hz_h_low = {h_low}, hz_h_high = {h_high}; /* steps it was fitted for */
+static const hz_real hz_tolerance = {tolerance}; /* of Newton, relative to the size of q */
+static const hz_real hz_floor = {floor}; /* rounding that no iteration removes */
+static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is relative to h times this, even at rest */
+static const hz_real hz_near = {near}; /* moves below this, relative, keep the last J */
+enum {{ hz_max_iterations = {max_iterations} }};
+{box}"""
+RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "step.h", "batch.h", "api.h")
 
 
 def export_c(
@@ -111,7 +102,7 @@ def export_c(
     h: float,
     box: Mapping[str, Sequence[float]] | None = None,
     units: Sequence[str] = (),
-    name: str = "herglotz_stepper",
+    name: str | None = None,
     dtype: str = "float64",
     h_range: tuple[float, float] | None = None,
     tolerance: float | None = None,
@@ -119,8 +110,9 @@ def export_c(
 ) -> Path:
     """Write the model's flow as one C99 header: weights inside, no dependency but <math.h>, no allocation.
 
-    Its functions are `NAME_init` (state from two positions), `NAME_step`, `NAME_rollout` and their `_batch`es; an
-    example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md` has the rest.
+    Its functions are `NAME_init` (state from two positions), `NAME_step`, `NAME_step_jacobian`, `NAME_rollout` and
+    the `_batch`es; an example stands at the top of the file. Compile with `-O3 -march=native` for speed; `docs/c.md`
+    has the rest.
 
     Parameters
     ----------
@@ -135,7 +127,8 @@ def export_c(
     units
         Unit of each coordinate.
     name
-        Prefix of every name in the file, a C identifier.
+        Prefix of every name in the file, a C identifier; default that of the file. Headers of different prefixes can
+        be included in one program.
     dtype
         "float64" (C double) or "float32" (C float).
     h_range
@@ -158,57 +151,50 @@ def export_c(
         If an argument is not usable, a weight is not finite, or the file cannot be written.
     """
     path = Path(path)
-    entries = _entries(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
+    name = _identifier(path.stem) if name is None else name
+    entries = described(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
     write_atomically(path, c_source(model, entries, path.name).encode())
     return path
 
 
-def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True) -> str:
-    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two."""
-    model = copy.deepcopy(model).double().requires_grad_(False)  # rounded once, when the numbers are written
+def c_source(
+    model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True, derivatives: bool = True
+) -> str:
+    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two.
+
+    Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
+    """
+    derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
+    equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
+    step = StepInC(equations, explicit and model.capabilities.explicit)
+    emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
+    types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
-    flags = {**flags_of(model), "box": entries["box"] is not None}
-    flags["linear"] = flags["linear"] and explicit
-    flags["stiff"] = flags["linear"] and flags["friction"]  # the matrix of the step depends on h
-    versions = f"herglotz {entries['herglotz_version']}, torch {entries['torch_version']}"
+    parts = [
+        _top(entries, step.explicit, derivatives),
+        types,
+        _constants(model, entries),
+        number_tests,
+        functions,
+        products,
+    ]
+    parts += [emitted.tables, _inputs(model, dtype), emitted.scalars, run]
+    if emitted.lanes:
+        parts += ["#ifdef hz_LANE_BYTES\n#define hz_BATCHED", emitted.lanes, batch, "#endif\n"]
+    parts += [emitted.slopes, api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
-    eps = torch.finfo(getattr(torch, dtype)).eps
-    top = {
-        "MARK": MARK,
-        "REAL": "double" if dtype == "float64" else "float",
-        "N": str(entries["dof"]),
-        "M": str(entries["inputs"]),
-        "SHA": text_constant(entries["weights_sha256"]),
-        "LEVEL": text_constant(entries["level"]),
-        "DTYPE": text_constant(dtype),
-        "ANGLES": ", ".join(str(int(a)) for a in entries["angles"]),
-        "H": number(entries["h"], dtype),
-        "H_LOW": number((entries["h_range"] or [0.0])[0], dtype),
-        "H_HIGH": number((entries["h_range"] or [torch.finfo(getattr(torch, dtype)).max])[-1], dtype),
-        "BOXED": str(int(flags["box"])),
-        "TOLERANCE": number(entries["newton_tolerance"], dtype),
-        "FLOOR": number(1000 * eps, dtype),
-        "TOP_SPEED": number(max(model.config.speed), dtype),
-        "MAX_ITERATIONS": str(MAX_ITERATIONS),
-        "BOX": _box_constants(entries["box"], dtype),
-        "VERSIONS": text_constant(versions),
-    }
-    head = render(_TOP, top, flags)
-    functions, names = functions_source(model, dtype, flags), activations_of(model)
-    parts = [head, number_tests(dtype), constants_source(model, dtype), activations(names, dtype), PRODUCT, functions]
-    parts += [legendre_plus_source(flags), render(ELIMINATION + ADVANCE, None, flags)]
-    if flags["wide"]:
-        parts += ["\n#ifdef NAME_LANE_BYTES", WIDE_PRODUCT, widen(functions), render(BATCH, None, flags), "#endif\n"]
-    parts += [render(API + BATCHES, None, flags), "\n#undef NAME_RESTRICT\n#undef NAME_HIDDEN\n#endif\n"]
-    text = finish("".join(parts), entries["name"], dtype)
     last = {
-        "NAME": entries["name"],
-        "VERSION": entries["herglotz_version"],
-        "FILE": _plain(file),
-        "UNIT_LIST": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
         "METADATA": comment,
+        "FILE": re.sub(r"[^A-Za-z0-9_.-]", "_", file),
+        "UNITS": ", ".join(map(text_constant, entries["units"] or [""] * entries["dof"])),
     }
-    return fill(text, last)  # after `finish`, so that no user's text is taken for a template
+    return re.sub(r"@(\w+)@", lambda m: last.get(m[1], m[0]), text)  # last: a user's text is taken as it is
+
+
+def runtime(file: str) -> str:
+    """A file of the C runtime, which is package data."""
+    return resources.files("herglotz.export").joinpath("runtime", file).read_text(encoding="utf-8")
 
 
 def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
@@ -229,7 +215,7 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
     return entries
 
 
-def _entries(
+def described(
     model: ContactLagrangian,
     h: float,
     box: Mapping[str, Sequence[float]] | None,
@@ -240,6 +226,7 @@ def _entries(
     tolerance: float | None,
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
+    """The checked entries of the comment at the top, from the arguments of `export_c`."""
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
@@ -257,14 +244,74 @@ def _entries(
     return entries
 
 
+def _identifier(stem: str) -> str:
+    """A C identifier from the name of a file."""
+    name = re.sub(r"[^A-Za-z0-9_]", "_", stem)[:41]
+    return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
+
+
+def _top(entries: Mapping[str, Any], explicit: bool, derivatives: bool) -> str:
+    """The comment, the guard, and what the preprocessor decides by."""
+    inputs = entries["inputs"]
+    return TOP.format(
+        version=entries["herglotz_version"],
+        file="@FILE@",
+        no_u="0, " if inputs else "",
+        mark=MARK,
+        comment="@METADATA@",
+        guard=f"0x{hashlib.sha256(json.dumps(entries).encode()).hexdigest()[:8]}u",
+        n=entries["dof"],
+        m=inputs,
+        inputs=int(inputs > 0),
+        single=int(entries["dtype"] == "float32"),
+        explicit=int(explicit),
+        boxed=int(entries["box"] is not None),
+        derivatives=int(derivatives),
+        wide=int(entries["dof"] <= MAX_WIDE),
+        real="float" if entries["dtype"] == "float32" else "double",
+    )
+
+
+def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
+    """What the model is, as constants."""
+    dtype = entries["dtype"]
+    info = torch.finfo(getattr(torch, dtype))
+    span = entries["h_range"] or (0.0, info.max)
+    return CONSTANTS.format(
+        sha=text_constant(entries["weights_sha256"]),
+        level=text_constant(entries["level"]),
+        dtype=text_constant(dtype),
+        versions=text_constant(f"herglotz {entries['herglotz_version']}, torch {entries['torch_version']}"),
+        units="@UNITS@",
+        angles=", ".join(str(int(a)) for a in entries["angles"]),
+        h=number(entries["h"], dtype),
+        h_low=number(span[0], dtype),
+        h_high=number(span[-1], dtype),
+        tolerance=number(entries["newton_tolerance"], dtype),
+        floor=number(1000 * info.eps, dtype),
+        top_speed=number(max(model.config.speed), dtype),
+        near=number(0.01, dtype),
+        max_iterations=MAX_ITERATIONS,
+        box=_box_constants(entries["box"], dtype),
+    )
+
+
+def _inputs(model: ContactLagrangian, dtype: str) -> str:
+    """The matrix G of the inputs and −G u₀, where the model takes some."""
+    if not model.config.inputs or model.friction is None:
+        return ""
+    map_, offset = (
+        numbers(x.detach().cpu().double().reshape(-1).tolist(), dtype)
+        for x in (model.friction.input_map, model.friction.offset())
+    )
+    lines = ["/* The forces of inputs u are input_map u + input_offset. */"]
+    lines.append(f"static const hz_real hz_input_map[hz_N * hz_M] = {{{map_}}};")
+    return "\n".join([*lines, f"static const hz_real hz_input_offset[hz_N] = {{{offset}}};\n"])
+
+
 def _box_constants(box: Mapping[str, list[float]] | None, dtype: str) -> str:
     if box is None:
         return "/* No box was recorded. */\n"
-    lines = [f"static const real NAME_{k}[NAME_N] = {{{numbers(v, dtype)}}};" for k, v in box.items() if k[0] != "s"]
-    lines += [f"static const real NAME_{k} = {number(box[k][0], dtype)};" for k in ("s_low", "s_high")]
+    lines = [f"static const hz_real hz_{k}[hz_N] = {{{numbers(v, dtype)}}};" for k, v in box.items() if k[0] != "s"]
+    lines += [f"static const hz_real hz_{k} = {number(box[k][0], dtype)};" for k in ("s_low", "s_high")]
     return "/* The box the model was fitted in. */\n" + "\n".join(lines) + "\n"
-
-
-def _plain(file: str) -> str:
-    """A file name that can stand in a comment."""
-    return re.sub(r"[^A-Za-z0-9_.-]", "_", file)

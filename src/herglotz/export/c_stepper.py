@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
-import tempfile
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -13,17 +12,17 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_ITERATIONS, export_c, read_metadata
+from herglotz.export.c_header import MAX_DERIVATIVES, MAX_ITERATIONS, c_source, described, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Rollout, State, Status, Step, step_sizes
+from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
 
 
 class CompiledStepper:
     """The flow Φ̃ of a generated header, sample by sample on one thread.
 
-    Results are those of `Stepper`, without derivatives.
+    Results are those of `Stepper`; `linearise` gives their derivatives, autograd does not see them.
 
     Parameters
     ----------
@@ -31,6 +30,8 @@ class CompiledStepper:
         What `export_c` wrote.
     path
         Where it came from, for messages.
+    whole
+        Gives the header with derivatives, where this one has none.
 
     Raises
     ------
@@ -38,15 +39,16 @@ class CompiledStepper:
         If the text is not such a header, or no C compiler is there to compile it.
     """
 
-    def __init__(self, header: str, path: PathLike = "header"):
+    def __init__(self, header: str, path: PathLike = "header", whole: Callable[[], str] | None = None):
         self.metadata = read_metadata(header, path)
         self.path = str(path)
         self.dof: int = self.metadata["dof"]
         self.dtype: torch.dtype = getattr(torch, self.metadata["dtype"])
         self.h: float = self.metadata["h"]
         self.inputs: int = self.metadata["inputs"]
-        name, dtype = self.metadata["name"], self.metadata["dtype"]
-        self._library = build(header, name, dtype, inputs=self.inputs > 0)
+        self._library = build(header, self.metadata["name"])
+        self._whole = whole
+        self._differentiates = self._library if whole is None else None
 
     def init(
         self,
@@ -99,6 +101,39 @@ class CompiledStepper:
         out = self._rollout(q, p, s, h, None if u is None else u.expand(*s.shape, u.shape[-1])[..., None, :])
         outside = None if out.outside is None else out.outside[..., 0]
         return Step(out.final, out.sigma[..., 1], out.status[..., 0], out.residual[..., 0], MAX_ITERATIONS, outside)
+
+    def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
+        """One step with its derivatives, as `Stepper.linearise`; NaN where the step failed.
+
+        Parameters
+        ----------
+        state, h, u
+            As in `step`.
+
+        Raises
+        ------
+        InputError
+            As `step`, and beyond 8 coordinates.
+        """
+        if self.dof > MAX_DERIVATIVES:
+            raise InputError(f"C has no derivatives beyond {MAX_DERIVATIVES} coordinates; use Stepper.linearise")
+        q, p, s = state
+        self._check(q, p, s)
+        batch, size = s.shape, 2 * self.dof + 1
+        h = spread_h(self._checked_h(h), s).contiguous()
+        u = self._inputs(None if u is None else u.expand(*batch, u.shape[-1]), batch)
+        new = lambda *shape: torch.full((*batch, *shape), torch.nan, dtype=self.dtype)  # noqa: E731
+        after, sigma, residual = State(new(self.dof), new(self.dof), new()), new(), new()
+        status = torch.full(batch, int(Status.DIVERGED), dtype=torch.uint8)
+        by_state, by_input, by_h = new(size, size), new(size, self.inputs), new(size)
+        starts = (x.contiguous() for x in state)
+        outputs = (*after, sigma, status, residual, by_state, by_input, by_h)
+        if self._differentiates is None:  # built on first use: most steppers are not differentiated
+            assert self._whole is not None
+            self._differentiates = build(self._whole(), self.metadata["name"])
+        self._call("herglotz_jacobians", s.numel(), *starts, h, u, *outputs, library=self._differentiates)
+        step = Step(after, sigma, status, residual, MAX_ITERATIONS)
+        return Linearised(step, by_state, by_h, by_input if u is not None else None)
 
     def rollout(
         self,
@@ -197,12 +232,12 @@ class CompiledStepper:
         check_range(h, self.metadata["h_range"])
         return h
 
-    def _call(self, function: str, *arguments: Tensor | int | None) -> None:
+    def _call(self, function: str, *arguments: Tensor | int | None, library: ctypes.CDLL | None = None) -> None:
         converted = (
             ctypes.c_long(x) if isinstance(x, int) else ctypes.c_void_p(None if x is None else x.data_ptr())
             for x in arguments
         )
-        getattr(self._library, function)(*converted)
+        getattr(library or self._library, function)(*converted)
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor, finite: bool = True) -> None:
         check_state(q, p, s, self.dof, self.dtype, finite=finite)
@@ -263,11 +298,12 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, the source is not usable, or a term of the model has no C yet.
+        If there is no compiler, or the source is not usable.
     """
     if not isinstance(source, ContactLagrangian):
         return load_c(source)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
-    with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        path = export_c(source, Path(folder, "stepper.h"), h=h, box=box, units=units, dtype=dtype, tolerance=tolerance)
-        return CompiledStepper(path.read_text(), "compiled model")
+    entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
+    kept = copy.deepcopy(source)  # the model may be trained on
+    header = c_source(kept, entries, "stepper.h", derivatives=False)
+    return CompiledStepper(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

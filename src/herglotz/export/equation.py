@@ -13,18 +13,10 @@ from torch import Tensor, nn
 
 from herglotz.export.trace import Graph, example_batch, traced
 from herglotz.models import ContactLagrangian
-from herglotz.models.feature_kinetic import FeatureKinetic
-from herglotz.models.jet import Jet
-from herglotz.models.mass import PositionKinetic
-from herglotz.models.terms import Potential
 from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
-from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
 
-Start = tuple[Tensor, Tensor, Tensor, Tensor]  # q0, p0, s0, h
-Ends = tuple[Field, Field]  # the potential at q0 and q1
-Parts = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # what `StepParts` gives
 LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
 # u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
@@ -113,110 +105,6 @@ class StepJacobian(nn.Module):
         return dense(step_jacobian(step_functions(self.model), q, p, s, h, delta, u[0] if u else None))
 
 
-class GivenPotential(nn.Module):
-    """Stands in for a model's potential where its values at q0 and q1 are inputs: no second derivative is asked for."""
-
-    def __init__(self, potential: Potential, ends: tuple[Field, Field]):
-        super().__init__()
-        self.features = potential.features
-        self.ends = ends
-
-    def forward(self, q: Tensor, order: int) -> Jet:
-        """The jets at (q0, q1), (2, B, n)."""
-        n = q.shape[-1]
-        rows = [torch.stack([end.V for end in self.ends])[None]]
-        rows.append(torch.stack([end.slope for end in self.ends]).movedim(-1, 0))
-        if order == 2:
-            rows.append(q.new_zeros(n * (n + 1) // 2, *q.shape[:-1]))
-        return Jet(torch.cat(rows), n, order)
-
-
-class StepParts(nn.Module):
-    """Everything that a step is made of, for a format that cuts it into pieces itself (`herglotz.export.lower.c`).
-
-    Parameters
-    ----------
-    model
-        Not changed.
-    explicit
-        Whether the step needs no iteration: then F and J are zeros, and the guess is the solution.
-    """
-
-    def __init__(self, model: ContactLagrangian, explicit: bool):
-        super().__init__()
-        self.model, self.explicit = model, explicit
-
-    def forward(
-        self,
-        q: Tensor,  # (B, n)
-        p: Tensor,  # (B, n)
-        s: Tensor,  # (B,)
-        h: Tensor,  # (B,)
-        V0: Tensor,  # (B,)
-        slope0: Tensor,  # (B, n)
-        delta: Tensor,  # (B, n) a trial q1 − q0
-        x: Tensor,  # (B, n) the exact q1 − q0, near by
-        V1: Tensor,  # (B,)
-        slope1: Tensor,  # (B, n)
-        *u: Tensor,  # (B, m)
-    ) -> tuple[Tensor, ...]:
-        """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1."""
-        ends = Field(V0, slope0), Field(V1, slope1)
-        form = self._explicit if self.explicit else self._by_jets
-        if not self.explicit and model_equation(self.model) is not None:
-            form = self._by_terms
-        guess, F, J, dp, L, E = form((q, p, s, h), ends, delta, x, u)
-        return guess.clone(), F.clone(), J.clone(), dp.clone(), L.clone(), E.expand(s.shape).clone()
-
-    def _explicit(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        q, _, _, h = start
-        frog = Leapfrog(self.model, inverse, lambda _: ends[1])
-        move = frog(*start, ends[0], u[0] if u else None, True)
-        assert move.dp is not None
-        zero = torch.zeros_like(q)
-        return move.delta, zero, zero[..., None] * zero[..., None, :], move.dp, move.L, frog.constants(h).c_minus_1
-
-    def _by_terms(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        maker = model_equation(self.model, fold=False)
-        assert maker is not None
-        maker.field = lambda _: ends[1]  # pyright: ignore[reportAttributeAccessIssue]
-        form = maker.at(*start, u[0] if u else None, True, ends[0])
-        point = form(delta, True)
-        v, mv, N, damping, force = form.at(x, point).rest
-        if self.model.friction is not None:  # dry friction near rest is steep: it is taken at the exact velocity
-            force = self.model.friction.value_and_slope(v, u[0] if u else None)[0]
-        end = form.end(x, Point(point.F, point.J, (v, mv, N, damping, force)))
-        E = form.constants.c_minus_1 if damping is None else damping[1]
-        assert point.J is not None
-        return form.leap(), point.F, point.J, end.p1 - start[1] if end.dp is None else end.dp, end.L, E
-
-    def _by_jets(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        model, potential = self.model, self.model.potential
-        L_d: Any = model.at(*u) if u else model
-        model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
-        try:
-            form = PartialsEquation(L_d, *start, 1, True)
-            point = form(delta, True)
-        finally:
-            model.potential = potential
-        end = form.end(delta, point)
-        dp = (end.p1 + point.F) - start[1]  # F is not quite 0: what x adds to p1 is what it takes from F
-        assert point.J is not None
-        return self._leap(*start, ends[0]), point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3
-
-    def _leap(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, here: Field) -> Tensor:
-        """The step with the mass at q = 0 and no network of (q̄, v): a guess."""
-        model = self.model
-        if not model.config.baseline:
-            return torch.zeros_like(q)
-        kinetic: Any = model.kinetic
-        kinetic = kinetic.base if isinstance(kinetic, FeatureKinetic) else kinetic
-        mass = (kinetic.constant if isinstance(kinetic, PositionKinetic) else kinetic).mass()
-        root = torch.ones_like(h) if model.damping is None else (-model.damping.rate * h / 2).exp()
-        push = p - (h / 2)[..., None] * here.slope
-        return (push @ torch.linalg.inv_ex(mass)[0]) * (h * root)[..., None]
-
-
 class FieldAt(nn.Module):
     """V and V′ at a position."""
 
@@ -264,18 +152,6 @@ class Equations:
         return self._traced(FirstOrder(self.model))
 
     @cached_property
-    def potential(self) -> Graph | None:
-        """`FieldAt`, for every model that has a potential."""
-        return traced(FieldAt(self.model), example(self.model, 0.1)[:1]) if self.model.config.baseline else None
-
-    def step_parts(self, explicit: bool) -> Graph:
-        """`StepParts`."""
-        q, p, s, h, *u = example(self.model, 0.1)
-        V, slope = _field_like(q)
-        more = (V, slope, 0.1 * p, 0.2 * p, V + 1, slope + 1)
-        return traced(StepParts(self.model, explicit), (q, p, s, h, *more, *u))
-
-    @cached_property
     def jacobian(self) -> Graph:
         """`StepJacobian`."""
         q, p, s, h, *u = example(self.model, 0.1)
@@ -286,10 +162,10 @@ class Equations:
         return traced(module, (q, p, s, h, 0.1 * p, *self._here(q), *u))
 
     def _here(self, q: Tensor) -> tuple[Tensor, ...]:
-        return _field_like(q) if self.model.capabilities.by_terms else ()
+        return field_like(q) if self.model.capabilities.by_terms else ()
 
 
-def _field_like(q: Tensor) -> tuple[Tensor, Tensor]:
+def field_like(q: Tensor) -> tuple[Tensor, Tensor]:
     """Stand-ins for V and V′ at q."""
     return 0.3 * q.sum(-1), 0.3 * q
 

@@ -15,8 +15,10 @@ from herglotz.errors import InputError
 from herglotz.export.equation import input_count
 from herglotz.models import ContactLagrangian
 
-FORMAT = 2  # 1 held a single step; 2 adds rollouts and starts from positions
-METADATA = "metadata.json"
+FORMAT = 3  # 1 held a single step; 2 added rollouts and starts from positions, 3 the Jacobian of a step
+METADATA = "metadata.json"  # of our entries in a .pt2 archive
+KEY = "herglotz"  # of our entries among the metadata of an ONNX or compiled model
+AOTI = {"rollout": "model", "init": "init"}  # our names of the programs in a compiled package, and the package's
 BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
 REQUIRED = ("format", "dof", "dtype", "h", "box", "newton_iterations", "newton_tolerance")
 TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up

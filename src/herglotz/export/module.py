@@ -1,4 +1,4 @@
-"""Steps, rollouts and starts of the flow Φ̃ as modules of plain tensor operations: what exported files contain."""
+"""Steps, rollouts and starts of the flow Φ̃ as modules: the loops around the functions of `herglotz.export.step`."""
 
 from __future__ import annotations
 
@@ -8,113 +8,48 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 from torch._higher_order_ops.scan import scan_op
+from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.errors import InputError
-from herglotz.export.attempt import Plan
-from herglotz.export.box import Box
-from herglotz.export.equation import Equations, eliminate, inverse, length
-from herglotz.export.newton import ITERATIONS, Newton, Values, status_of
-from herglotz.export.one_step import OneStep, Report, SafeStep, safe_step
+from herglotz.export.equation import Equations, dense
+from herglotz.export.newton import CONVERGED, ITERATIONS, Values, unfinished
+from herglotz.export.step import STATE, StepGraphs
+from herglotz.export.trace import Graph
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.explicit import Leapfrog
+from herglotz.stepping.linearise import eliminate
 
 
-class StepModule(nn.Module):
-    """(q, p, s, h[, u]) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state.
+def solved(
+    graphs: StepGraphs, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor], constants: Sequence[Values]
+) -> Values:
+    """Newton's last carry: begin, then iterate to the end; `constants` are those of `begin` and of `iterate`."""
+    state, here, (trail,), _ = graphs.layout.split(carry)
+    first = tuple(dense(x) for x in graphs.begin.call(h, trail, *constants[0]))
+    fixed: Any = (*state, h, *here, *u, *constants[1])
+    ends = len(first), len(first) + STATE + 1
 
-    The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J from
-    the last accepted iteration. A step in closed form is differentiated as it stands.
+    def turn(*x: Tensor) -> Values:
+        return graphs.iterate.call(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
 
-    Parameters
-    ----------
-    model
-        The discrete Lagrangian, copied; or its equations.
-    iterations
-        Bound on the Newton iterations, at least 2.
-    box, h_range
-        Add the output `outside`, uint8: 1 where the step starts or ends outside the box, and 2 where h is outside.
-    """
-
-    def __init__(
-        self,
-        model: ContactLagrangian | Equations,
-        iterations: int = ITERATIONS,
-        box: Mapping[str, Sequence[float]] | None = None,
-        h_range: Sequence[float] | None = None,
-    ):
-        super().__init__()
-        if iterations < 2:
-            raise InputError(f"newton_iterations must be at least 2, got {iterations}; {ITERATIONS} suits most models")
-        equations = Equations.of(model)
-        self.model, self.field = equations.model, equations.field
-        if not self.model.capabilities.explicit:
-            top = max(self.model.config.speed)
-            self.newton, self.first_order = Newton(equations.slopes, iterations, top), equations.first_order
-        self.report = Report(Box.of(box, equations.model, h_range))
-
-    def forward(
-        self,
-        q: Tensor,  # (B, n)
-        p: Tensor,  # (B, n)
-        s: Tensor,  # (B,)
-        h: Tensor,  # (B,)
-        *u: Tensor,  # (B, m) where the model takes inputs
-    ) -> Values:
-        """One step: guess → solve → attach the derivative → momentum and action.
-
-        Returns
-        -------
-        tuple of Tensor
-            q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a
-            box, outside (B,) uint8. NaN in the samples whose status is not `Status.CONVERGED`.
-        """
-        if self.model.capabilities.explicit:
-            move = Leapfrog(self.model, inverse)(q, p, s, h, u=u[0] if u else None)
-            return self.report(h, (q, p, s), (move.q1, move.p1, s + move.L), move.c.clone(), 0.0 * s, None)
-        here = () if self.field is None else self.field(q)
-        problem = tuple(x.detach() for x in (q, p, s, h, *here, *u))
-        carry = self.newton.start(problem[0], problem[2], torch.zeros_like(problem[0]), with_J=True)
-        delta, step, merit, done, _, L, c, J = self.newton(problem, carry, self.newton.equation.constants)
-        residual = length(step)
-        status = status_of(h, merit, residual, done, L, c)
-        F = self.first_order(q, p, s, h, delta, *here, *u)[0]
-        delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]  # the same value
-        _, p1, L, c = self.first_order(q, p, s, h, delta, *here, *u)
-        q1 = q + delta
-        if self.field is not None:
-            V, slope = self.field(q1)
-            L, p1 = L - h / 2 * V, p1 - (h / 2)[..., None] * slope
-        return self.report(h, (q, p, s), (q1, p1, s + L), c, residual, status)
+    # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
+    carried: Any = first
+    return while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
 
 
 class RolloutModule(nn.Module):
-    """(q, p, s, h[, u]) → K steps, h of shape (K, B): all loops are inside the graph.
+    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside.
 
     Parameters
     ----------
-    model
-        The discrete Lagrangian, copied; or its equations.
+    graphs
+        The functions of a step.
     iterations
         Bound on the Newton iterations of a step.
-    box, h_range
-        As in `StepModule`.
-    plan
-        Of the attempt that Newton's loop stands behind.
     """
 
-    def __init__(
-        self,
-        model: ContactLagrangian | Equations,
-        iterations: int = ITERATIONS,
-        box: Mapping[str, Sequence[float]] | None = None,
-        plan: Plan | None = None,
-        h_range: Sequence[float] | None = None,
-    ):
+    def __init__(self, graphs: StepGraphs, iterations: int = ITERATIONS):
         super().__init__()
-        equations = Equations.of(model)
-        self.one = OneStep(equations, iterations, plan)
-        self.safe = SafeStep(equations.model)
-        self.report = Report(Box.of(box, equations.model, h_range))
+        self.graphs, self.iterations = graphs, iterations
 
     def forward(
         self,
@@ -132,10 +67,10 @@ class RolloutModule(nn.Module):
             q, p (K, B, n), s, c, residual (K, B), status (K, B) uint8 and, with a box, outside (K, B) uint8: what step
             k = 1 … K gives. NaN from a failed step on.
         """
-        carry = self.one.start(q, p, s)
-        operands = self.one.operands
-        counts = [len(constants) for constants in operands]
-        edges = len(self.report.bounds)
+        graphs = self.graphs
+        carry = [dense(x) for x in graphs.start(q, p, s)]
+        used = (*((graphs.begin, graphs.iterate) if graphs.layout.iterates else ()), graphs.finish, graphs.report)
+        counts = [len(graph.constants) for graph in used]
         ends = len(carry), len(carry) + 1 + len(u)
 
         def step(*x: Any) -> list[Tensor]:
@@ -143,14 +78,117 @@ class RolloutModule(nn.Module):
             # The sum keeps the batch size a symbol of this graph, which inductor needs to allocate the outputs.
             h = h + torch.zeros(size, dtype=h.dtype, device=h.device)
             constants = [tuple(fixed[sum(counts[:i]) : sum(counts[: i + 1])]) for i in range(len(counts))]
-            before = (*carry[:2], carry[2][:, 0])
-            gamma, bounds = tuple(fixed[sum(counts) : len(fixed) - edges]), tuple(fixed[len(fixed) - edges :])
-            carry, out, status = self.one.forward(carry, safe_step(h, gamma), tuple(u), constants)
-            *after, c, residual = out
-            return [*carry, *self.report.forward(h, before, tuple(after), c, residual, status, bounds)]
+            found = solved(graphs, self.iterations, h, tuple(u), carry, constants) if graphs.layout.iterates else ()
+            new = graphs.finish.call(h, *u, *carry, *found, *constants[-2])
+            said = graphs.report.call(h, *carry[:STATE], *new[:STATE], *new[len(carry) :], *constants[-1])
+            return [dense(y) for y in (*new[: len(carry)], *said)]
 
-        fixed = (*(x for constants in operands for x in constants), *self.safe.rate, *self.report.bounds)
-        return tuple(scan_op(step, list(carry), [h, *u], (s.shape[0], *fixed))[len(carry) :])
+        fixed = (s.shape[0], *(x for graph in used for x in graph.constants))
+        # Nothing may follow the scan: inductor of torch 2.13 gives the names of its buffers twice then.
+        return tuple(scan_op(step, carry, [h, *u], fixed)[len(carry) :])
+
+
+class StepModule(nn.Module):
+    """(q, p, s, h[, u]) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state.
+
+    The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J at the
+    solution. A step in closed form is differentiated as it stands.
+
+    Parameters
+    ----------
+    model
+        The discrete Lagrangian, copied; or its equations.
+    iterations
+        Bound on the Newton iterations, at least 2.
+    box, h_range
+        Add the output `outside`, uint8: 1 where the step starts or ends outside the box, and 2 where h is outside.
+    graphs
+        The functions of a step, where they are made already.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian | Equations,
+        iterations: int = ITERATIONS,
+        box: Mapping[str, Sequence[float]] | None = None,
+        h_range: Sequence[float] | None = None,
+        graphs: StepGraphs | None = None,
+    ):
+        super().__init__()
+        if iterations < 2:
+            raise InputError(f"newton_iterations must be at least 2, got {iterations}; {ITERATIONS} suits most models")
+        equations = Equations.of(model)
+        self.graphs = StepGraphs(equations.model, box, h_range) if graphs is None else graphs
+        if self.graphs.layout.iterates:
+            self.iterations = iterations
+            self.slopes, self.first_order = equations.slopes, equations.first_order
+
+    def forward(
+        self,
+        q: Tensor,  # (B, n)
+        p: Tensor,  # (B, n)
+        s: Tensor,  # (B,)
+        h: Tensor,  # (B,)
+        *u: Tensor,  # (B, m) where the model takes inputs
+    ) -> Values:
+        """One step: guess → solve → attach the derivative → momentum and action.
+
+        Returns
+        -------
+        tuple of Tensor
+            q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a
+            box, outside (B,) uint8. NaN in the samples whose status is not `Status.CONVERGED`.
+        """
+        graphs = self.graphs
+        carry, found = graphs.start(q, p, s), ()
+        if graphs.layout.iterates:
+            fixed = [x.detach() for x in (h, *u, *carry)]
+            constants = graphs.begin.constants, graphs.iterate.constants
+            split = 1 + len(u)
+            found = solved(graphs, self.iterations, fixed[0], tuple(fixed[1:split]), fixed[split:], constants)
+            found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
+        new = graphs.finish(h, *u, *carry, *found)
+        return graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+
+    def _attached(self, problem: Values, more: Values, found: Values) -> Values:
+        """Newton's last carry, with Δ, p1, L and c as functions of the problem."""
+        delta = found[2]
+        fixed = (x.detach() for x in more)
+        J = self.slopes(*(x.detach() for x in problem), delta, *fixed)[-1]
+        F = self.first_order(*problem, delta, *more)[0]
+        delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]  # the same value
+        _, *values = self.first_order(*problem, delta, *more)
+        return (*found[:2], delta, *found[3:7], *values)
+
+
+class LinearisedModule(nn.Module):
+    """(q, p, s, h[, u]) → the outputs of a step, then d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m).
+
+    Parameters
+    ----------
+    graphs
+        The functions of a step.
+    jacobian
+        The derivative of a solved step, traced.
+    iterations
+        Bound on the Newton iterations.
+    """
+
+    def __init__(self, graphs: StepGraphs, jacobian: Graph, iterations: int = ITERATIONS):
+        super().__init__()
+        self.graphs, self.jacobian, self.iterations = graphs, jacobian, iterations
+
+    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
+        """One step and its derivative; NaN in the samples whose status is not `Status.CONVERGED`."""
+        graphs = self.graphs
+        carry, found = graphs.start(q, p, s), ()
+        if graphs.layout.iterates:
+            constants = graphs.begin.constants, graphs.iterate.constants
+            found = solved(graphs, self.iterations, h, u, carry, constants)
+        new = graphs.finish(h, *u, *carry, *found)
+        said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)
+        return *said, torch.where((said[5] == CONVERGED)[:, None, None], J, torch.nan)
 
 
 class InitModule(nn.Module):

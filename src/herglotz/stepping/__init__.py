@@ -5,6 +5,7 @@ from herglotz.stepping.composition import Composition, adjoint_pair, kahan_li, s
 from herglotz.stepping.events import Event
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised
+from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.newton import Solution, solve_step
 from herglotz.stepping.state import Status
 from herglotz.stepping.stepper import Crossings, Rollout, State, Step, StepError, Stepper, step_sizes
@@ -14,6 +15,7 @@ __all__ = [
     "Crossings",
     "Event",
     "Linearised",
+    "OneStepMethod",
     "Rollout",
     "Solution",
     "State",

@@ -14,16 +14,14 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.stepping.engine import Engine
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.single_step import SingleStep
 from herglotz.stepping.state import (
-    Rollout,
     State,
     Status,
     Step,
-    StepError,
     check_h,
     check_state,
-    step_sizes,
     throw_failure,
 )
 
@@ -41,7 +39,7 @@ Method = DiscreteLagrangian | Substeps
 MAX_ITERATIONS = 30
 
 
-class Composition:
+class Composition(OneStepMethod):
     """A stepper that applies several methods one after the other, each over its fraction of the step.
 
     Parameters
@@ -62,13 +60,13 @@ class Composition:
         total = sum(fraction for _, fraction in stages)
         if not abs(total - 1.0) < 1e-12:
             raise InputError(f"the fractions of a composition must sum to 1, got {total:.15g}")
-        engines: dict[int, Engine] = {}
+        single_steps: dict[int, SingleStep] = {}
         for method, _ in stages:
             if not isinstance(method, Substeps):
-                engines[id(method)] = Engine(method, None, MAX_ITERATIONS, False)
-        self.stages, self.throw, self._engines = tuple(stages), throw, engines
+                single_steps[id(method)] = SingleStep(method, None, MAX_ITERATIONS, False)
+        self.stages, self.throw, self._single_steps = tuple(stages), throw, single_steps
 
-    def step(self, state: State, h: Tensor | float) -> Step:
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
         """One step of h > 0, scalar or (...): all stages. The status is that of the first stage that failed.
 
         Raises
@@ -95,31 +93,10 @@ class Composition:
             status = torch.where(first, part.status, status)
         return Step(state, c, status, residual, iterations)
 
-    def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
-    ) -> Rollout:
-        """Step K times from (q, p, s); h is a scalar with `steps`, (K,) or (..., K). s defaults to 0.
-
-        Raises
-        ------
-        InputError
-            If h is not positive or its length and `steps` disagree.
-        """
-        state = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
-        h_all = step_sizes(check_h(h, q), steps)
-        states, results = [state], []
-        for k in range(h_all.shape[-1]):
-            try:
-                results.append(self.step(states[-1], h_all[..., k]))
-            except StepError as error:
-                raise StepError(f"step {k}: {error}") from None
-            states.append(results[-1].state)
-        return Rollout.of(states, results)
-
     def _part(self, method: Method, state: State, h: Tensor) -> Step:
         if isinstance(method, Substeps):
             return method.substep(state, h)
-        return self._engines[id(method)](state, h, state.q)[0]
+        return self._single_steps[id(method)](state, h, state.q)[0]
 
 
 def yoshida(method: Method, order: int = 4, *, throw: bool = False) -> Composition:

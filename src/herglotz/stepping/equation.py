@@ -20,13 +20,14 @@ from torch import Tensor
 from herglotz.mechanics import (
     DiscreteLagrangian,
 )
+from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.partials_equation import End, Equation, PartialsEquation, Point
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 
-__all__ = ["End", "Equation", "ModelEquation", "PartialsEquation", "Point", "StepOfModel", "model_equation"]
+__all__ = ["End", "ModelEquation", "PartialsEquation", "Point", "StepEquation", "StepOfModel", "model_equation"]
 
 
 class _Frame(NamedTuple):
@@ -155,7 +156,7 @@ class StepOfModel:
         self.A = s0 - constants.half[..., 0] * self.here.V
 
     def __call__(self, x: Tensor, second: bool) -> Point:
-        """See `Equation`."""
+        """See `StepEquation`."""
         k, maker = self.constants, self.maker
         v = (x if self.increments else x - self.q0) * k.rate
         mv = v if v.shape[-1] == 1 else v @ maker.mass  # C₁₁ = 1
@@ -177,12 +178,12 @@ class StepOfModel:
         return Point(F, J, (v, mv, N, damping, force))
 
     def push(self, point: Point) -> Tensor:
-        """See `Equation`."""
+        """See `StepEquation`."""
         damping = point.rest[3]
         return (self.constants.c if damping is None else damping[0])[..., None] * self.p0
 
     def end(self, x: Tensor, point: Point) -> End:
-        """See `Equation`."""
+        """See `StepEquation`."""
         there = self.there = self.maker.field(self.q0 + x if self.increments else x)
         p1, L, c, _ = self.end_without_field(point)
         half = self.constants.half
@@ -190,7 +191,7 @@ class StepOfModel:
         return End(p1, L, c, self._gained(point, there) if self.increments else None)
 
     def typical_increment(self) -> Tensor:
-        """See `Equation`."""
+        """See `StepEquation`."""
         return self.maker.model.typical_increment(self.constants.h).expand(self.s0.shape)
 
     def _gained(self, point: Point, there: Field) -> Tensor | None:

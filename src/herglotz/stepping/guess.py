@@ -33,16 +33,15 @@ def extrapolation_weights(h: Tensor, count: int) -> Tensor:
 class Extrapolation:
     """The guesses of one rollout; the weights are constants for equal steps and made once, all of them, for others."""
 
-    def __init__(self, h: Tensor, wanted: bool = True):
+    def __init__(self, h: Tensor):
         self.equal = h.stride(-1) == 0 or h.shape[-1] == 1  # a scalar h, expanded
         self.h = h.detach()
-        self.wanted = wanted
         self._weights: dict[int, Tensor] = {}
 
     def __call__(self, trail: tuple[Tensor, ...], k: int) -> Tensor:
         """The guess for the end of step k from the positions (..., n) that led to its start, at most `LENGTH`."""
         count = len(trail)
-        if count == 1 or not self.wanted:
+        if count == 1:
             return trail[-1]
         if self.equal:
             weights = EQUAL[count]

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.engine import driven_by
 from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import State, Step
 
 # (q0, p0, s0, h, Δ, u) → F (..., n), p1 (..., n), L (...)
@@ -149,6 +149,10 @@ def eliminate(A: Tensor, b: Tensor) -> Tensor:
     n = b.shape[-2]
     if n == 1:
         return b / A
+    if n == 2:  # Cramer's rule: half of the operations
+        (a, c), (d, e) = ((A[..., i, :1], A[..., i, 1:]) for i in range(2))
+        (f, g), rate = b.unbind(-2), 1 / (a * e - c * d)
+        return torch.stack([(e * f - c * g) * rate, (a * g - d * f) * rate], -2)
     rows = [torch.cat([A[..., i, :], b[..., i, :]], -1) for i in range(n)]
     for k in range(n):
         for i in range(k + 1, n):

@@ -12,7 +12,7 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solve
 from herglotz.mechanics.newton_one import newton_one, newton_step, norm
-from herglotz.stepping.partials_equation import End, Equation, PartialsEquation
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import Status
 from herglotz.stepping.stick_slip import stick_slip
 
@@ -77,7 +77,7 @@ def solve_step(
 
 
 def find_root(
-    equation: Equation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
+    equation: StepEquation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
 ) -> Found:
     """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
     sticky = stick_slip(equation)
@@ -99,7 +99,7 @@ def find_root(
 class _Sizes:
     """The size that steps are compared with: of the positions or, in increments, of the increment; and of rounding."""
 
-    equation: Equation
+    equation: StepEquation
     q0: Tensor
     increments: bool
 

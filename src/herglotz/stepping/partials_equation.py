@@ -27,7 +27,7 @@ class End(NamedTuple):
     dp: Tensor | None = None  # (..., n) p1 − p0, made without that difference, where it is known
 
 
-class Equation(Protocol):
+class StepEquation(Protocol):
     """The step equation in the unknown x: q1 or, in increments, Δ = q1 − q0."""
 
     def __call__(self, x: Tensor, second: bool) -> Point:
@@ -57,7 +57,7 @@ class PartialsEquation:
         self.order, self.increments = order, increments
 
     def __call__(self, x: Tensor, second: bool) -> Point:
-        """See `Equation`."""
+        """See `StepEquation`."""
         order = 2 if second else self.order
         if self.increments:
             form: Any = self.L_d  # `solve_step` checked
@@ -67,15 +67,15 @@ class PartialsEquation:
         return Point(momentum_residual(P, self.p0), momentum_jacobian(P, self.p0) if order == 2 else None, P)
 
     def push(self, point: Point) -> Tensor:
-        """See `Equation`."""
+        """See `StepEquation`."""
         return point.rest.c[..., None] * self.p0
 
     def end(self, x: Tensor, point: Point) -> End:  # noqa: ARG002  one signature for all
-        """See `Equation`."""
+        """See `StepEquation`."""
         return End(momentum_plus(point.rest), point.rest.L, point.rest.c)
 
     def typical_increment(self) -> Tensor:
-        """See `Equation`."""
+        """See `StepEquation`."""
         of_model = getattr(self.L_d, "typical_increment", None)
         h = self.h.expand(self.s0.shape)
         return torch.zeros_like(h) if of_model is None else of_model(h)

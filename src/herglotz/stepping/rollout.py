@@ -1,6 +1,6 @@
 """Many steps: inputs, decimation, events, and memory that does not grow with the number of steps.
 
-A rollout is a chain of segments. A segment steps `Walk` to `Walk` and returns the block of states it keeps. Without
+A rollout is a chain of segments. A segment steps `Carry` to `Carry` and returns the block of states it keeps. Without
 gradients a block is written into buffers made beforehand; with `checkpoint` a segment saves its start only and is run
 again by the backward pass.
 """
@@ -10,8 +10,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from time import perf_counter
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,32 +21,42 @@ from torch.utils.checkpoint import checkpoint as save_start_only
 from herglotz.errors import InputError
 from herglotz.stepping.events import Watch
 from herglotz.stepping.guess import LENGTH, Extrapolation
-from herglotz.stepping.state import Rollout, State, Step
+from herglotz.stepping.state import Crossings, Step, StepError
 
 PROGRESS_AFTER = 2.0  # seconds
 
 
-class Walk(NamedTuple):
+class Carry(NamedTuple):
     """What one step hands to the next."""
 
-    state: State
+    state: Any  # `State`, or another named tuple of tensors whose first entry is the position
     trail: tuple[Tensor, ...]  # the last positions, for the guess
     sigma: Tensor  # (...)
-    low: State | None  # what rounding took from the state so far (compensated sums), where increments are known
+    low: Any  # what rounding took from the state so far (compensated sums), where increments are known
 
 
 class Block(NamedTuple):
     """The kept entries of a segment of steps, time first: a step then is one contiguous piece of a buffer."""
 
-    q: Tensor  # (N, ..., n)
-    p: Tensor  # (N, ..., n)
-    s: Tensor  # (N, ...)
+    states: tuple[Tensor, ...]  # (N, ..., *) each
     sigma: Tensor  # (N, ...)
     status: Tensor  # (N, ...)
     residual: Tensor  # (N, ...)
 
 
-Advance = Callable[[int, Walk, Tensor], tuple[Step, State | None]]  # (k, walk, guess) → the step and its `low`
+class Track(NamedTuple):
+    """All that a rollout keeps; time is the first axis after those of the batch."""
+
+    states: tuple[Tensor, ...]  # (..., K+1, *) each
+    sigma: Tensor  # (..., K+1)
+    status: Tensor  # (..., K)
+    residual: Tensor  # (..., K)
+    events: tuple[Crossings, ...]
+
+
+# (state, h, guess, u, low) → the step and its `low`; a guess of None is the step's own.
+OneStep = Callable[[Any, Tensor, Tensor | None, Tensor | None, Any], tuple[Step, Any]]
+Check = Callable[[Step, Any, Tensor, Tensor | None], None]  # (step, state, h, u), raises `StepError`
 
 
 @dataclass(frozen=True)
@@ -73,97 +84,131 @@ class Plan:
         return (range(k, min(k + length, self.steps)) for k in range(0, self.steps, length))
 
 
-def roll_out(
-    start: State,
-    h: Tensor,
-    advance: Callable[[], Advance],
-    plan: Plan,
-    watch: Watch | None,
-    extrapolate: bool = True,
-) -> Rollout:
-    """Step from `start` through all of `plan`.
+@dataclass(frozen=True)
+class Drive:
+    """What is rolled out, and how.
 
     Parameters
     ----------
-    start
-        The first state.
+    single_step
+        Makes the function that takes one step; called once for each segment, whose steps may share work.
     h
         (..., K) all steps.
-    advance
-        Makes the function that takes one step; called once for each segment, which may keep what its steps share.
     plan
         Segments and decimation.
+    inputs
+        (..., K, m), or None.
     watch
         The events to look for, or None.
     extrapolate
-        Whether the steps iterate and want a good guess; without, it is the present position.
+        Whether the steps want a guess.
+    check
+        Looks at every step and raises, or None.
     """
-    guess, progress = Extrapolation(h, extrapolate), _Progress(plan.steps)
-    walk = Walk(start, (start.q.detach(),), torch.ones_like(start.s), None)
+
+    single_step: Callable[[], OneStep]
+    h: Tensor
+    plan: Plan
+    inputs: Tensor | None = None
+    watch: Watch | None = None
+    extrapolate: bool = True
+    check: Check | None = None
+
+    @cached_property
+    def guess(self) -> Extrapolation:
+        """Where iterations start."""
+        return Extrapolation(self.h)
+
+    @cached_property
+    def equal(self) -> Tensor | None:
+        """The step, where all are equal: one tensor, so that what depends on h alone is kept."""
+        return self.h[..., 0] if self.h.stride(-1) == 0 else None
+
+    def take(self, single: OneStep, k: int, carry: Carry) -> tuple[Step, Any]:
+        """Step k as the events leave it."""
+        state, low = carry.state, carry.low
+        h = self.h[..., k] if self.equal is None else self.equal
+        u = None if self.inputs is None else self.inputs[..., k, :]
+        guess = self.guess(carry.trail, k) if self.extrapolate and len(carry.trail) > 1 else None
+        try:
+            step, new_low = single(state, h, guess, u, low)
+            if self.watch is not None:
+                step = self.watch.after(k, state, step, h, lambda tau, guess: single(state, tau, guess, u, low)[0])
+            if self.check is not None:
+                self.check(step, state, h, u)
+        except StepError as error:
+            raise StepError(f"step {k}: {error}") from None
+        return step, new_low
+
+
+def roll_out(start: Any, drive: Drive) -> Track:
+    """Step from `start`, a named tuple of tensors, through the whole plan."""
+    plan, progress = drive.plan, _Progress(drive.plan.steps)
+    carry = Carry(start, (start[0].detach(),), torch.ones_like(start[-1]), None)
     graph = torch.is_grad_enabled()
     blocks: list[Block] = []
     for ks in plan.segments:
         if graph and plan.checkpoint is not None:
-            walk, block = save_start_only(
-                _segment, walk, ks, advance, guess, plan.every, use_reentrant=False, preserve_rng_state=False
-            )
+            carry, block = save_start_only(_segment, carry, ks, drive, use_reentrant=False, preserve_rng_state=False)
         else:
-            walk, block = _segment(walk, ks, advance, guess, plan.every, watch, progress)
+            carry, block = _segment(carry, ks, drive, progress)
         if graph or len(ks) == plan.steps:
             blocks.append(block)
         else:
             blocks = blocks or [_buffers(block, plan.steps // plan.every)]
             _write(blocks[0], block, ks.start // plan.every)
     progress.close()
-    joined = blocks[0] if len(blocks) == 1 else Block(*map(torch.cat, zip(*blocks, strict=True)))
-    events = () if watch is None else watch.crossings(walk.state)
-    q, p, s, sigma, status, residual = (x.movedim(0, -2 if i < 2 else -1) for i, x in enumerate(joined))
-    return Rollout(q, p, s, sigma, status, residual, events)
+    parts = [_flat(block) for block in blocks]
+    *states, sigma, status, residual = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
+    axis = sigma.ndim - 1  # behind those of the batch
+    events = () if drive.watch is None else drive.watch.crossings(carry.state)
+    move = lambda x: x.movedim(0, axis)  # noqa: E731
+    return Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
 
 
-def _segment(
-    walk: Walk,
-    ks: range,
-    advance: Callable[[], Advance],
-    guess: Extrapolation,
-    every: int,
-    watch: Watch | None = None,
-    progress: _Progress | None = None,
-) -> tuple[Walk, Block]:
+def _segment(carry: Carry, ks: range, drive: Drive, progress: _Progress | None = None) -> tuple[Carry, Block]:
     """Take the steps `ks`."""
-    take = advance()
-    kept = [walk] if ks.start == 0 else []
+    single, every, watch = drive.single_step(), drive.plan.every, drive.watch
+    kept = [(*carry.state, carry.sigma)] if ks.start == 0 else []
     results: list[tuple[Tensor, Tensor]] = []
-    state, trail, sigma, low = walk
     for k in ks:
+        state, trail, sigma, low = carry
         if watch is not None and bool(watch.stopped.all()):
             step = watch.hold(state)
         else:
-            step, low = take(k, Walk(state, trail, sigma, low), guess(trail, k))
+            step, low = drive.take(single, k, carry)
         state, sigma = step.state, sigma * step.c
-        trail = (*trail[1 - LENGTH :], state.q.detach() if state.q.requires_grad else state.q)
+        position = state[0]
+        trail = (*trail[1 - LENGTH :], position.detach() if position.requires_grad else position)
+        carry = Carry(state, trail, sigma, low)
         if k % every and results:
             status, residual = results[-1]
             results[-1] = torch.maximum(status, step.status), torch.maximum(residual, step.residual)
         else:
             results.append((step.status, step.residual))
         if (k + 1) % every == 0:
-            kept.append(Walk(state, (), sigma, None))
+            kept.append((*state, sigma))
         if progress is not None:
             progress.update()
-    states = [torch.stack(x) for x in zip(*((*w.state, w.sigma) for w in kept), strict=True)]
-    outcome = [torch.stack(x) for x in zip(*results, strict=True)]
-    return Walk(state, trail, sigma, low), Block(*states, *outcome)
+    *states, sigma = (torch.stack(x) for x in zip(*kept, strict=True))
+    return carry, Block(tuple(states), sigma, *(torch.stack(x) for x in zip(*results, strict=True)))
+
+
+def _flat(block: Block) -> tuple[Tensor, ...]:
+    return (*block.states, *block[1:])
 
 
 def _buffers(block: Block, entries: int) -> Block:
     """Room for a whole rollout."""
-    return Block(*(x.new_empty(entries + (i < 4), *x.shape[1:]) for i, x in enumerate(block)))
+    room = lambda x, count: x.new_empty(count, *x.shape[1:])  # noqa: E731
+    states = tuple(room(x, entries + 1) for x in block.states)
+    return Block(states, room(block.sigma, entries + 1), room(block.status, entries), room(block.residual, entries))
 
 
 def _write(buffers: Block, block: Block, start: int) -> None:
-    for i, (buffer, values) in enumerate(zip(buffers, block, strict=True)):
-        offset = start + (i < 4 and start > 0)  # states have the start in front
+    ahead = len(block.states) + 1  # states and σ have the start in front
+    for i, (buffer, values) in enumerate(zip(_flat(buffers), _flat(block), strict=True)):
+        offset = start + (i < ahead and start > 0)
         buffer[offset : offset + len(values)] = values
 
 

@@ -86,19 +86,6 @@ class Rollout:
     events: tuple[Crossings, ...] = ()  # one for each event asked for
     outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
 
-    @classmethod
-    def of(cls, states: list[State], steps: list[Step]) -> Rollout:
-        """Join K+1 states and the K steps between them."""
-        factors = torch.stack([torch.ones_like(states[0].s), *(step.c for step in steps)], -1)
-        return cls(
-            q=torch.stack([x.q for x in states], -2),
-            p=torch.stack([x.p for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=factors.cumprod(-1),
-            status=torch.stack([step.status for step in steps], -1),
-            residual=torch.stack([step.residual for step in steps], -1),
-        )
-
     @property
     def final(self) -> State:
         """The last state; for a sample that an event stopped, the state at the event."""

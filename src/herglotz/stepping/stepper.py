@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
 from herglotz.models import capabilities
-from herglotz.stepping.engine import Engine, driven_by
-from herglotz.stepping.events import Event, Watch
 from herglotz.stepping.explain import explain_step
 from herglotz.stepping.linearise import Linearised, linearise
-from herglotz.stepping.rollout import Advance, Plan, Walk, roll_out
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.single_step import SingleStep, driven_by
 from herglotz.stepping.state import (
     Crossings,
     Rollout,
@@ -30,7 +27,7 @@ from herglotz.stepping.state import (
 __all__ = ["Crossings", "Rollout", "State", "Step", "StepError", "Stepper", "step_sizes"]
 
 
-class Stepper:
+class Stepper(OneStepMethod):
     """The flow Φ̃ = FL⁺ ∘ (FL⁻)⁻¹ of a discrete Lagrangian.
 
     Parameters
@@ -106,9 +103,8 @@ class Stepper:
         """
         state = check_state(state, self.L_d)
         h = check_h(h, state.q)
-        step, _ = self._engine()(state, h, state.q if guess is None else guess, u)
-        if self.throw:
-            self._throw(step, state, h, u)
+        step, _ = self._single_step()(state, h, guess, u)
+        self._check_step(step, state, h, u)
         return step
 
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
@@ -141,105 +137,28 @@ class Stepper:
         step = self.step(state, h0 if h1 is None else h1, 2 * q1 - q0)
         return q1, step.state.q, state.s
 
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        inputs: Tensor | None = None,
-        every: int = 1,
-        events: Sequence[Event | Callable[[State], Tensor]] = (),
-        checkpoint: int | None = None,
-        chunk: int = 1024,
-    ) -> Rollout:
-        """Step K times from (q, p, s).
+    def _checked(self, state: State) -> State:
+        return check_state(state, self.L_d)
 
-        Parameters
-        ----------
-        q, p
-            (..., n).
-        s
-            (...); default 0.
-        h
-            A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
-        steps
-            K; needed for a scalar h without inputs only.
-        inputs
-            (K, m) or (..., K, m): u_k of each step, for an L_d with `at(u)`.
-        every
-            Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
-        events
-            `Event`s, or functions of the state that stop a sample where they change sign. A sample that stopped keeps
-            its state at the event, with `Status.STOPPED`. The time of an event is a constant for the gradient.
-        checkpoint
-            Length of the segments whose inner steps the backward pass computes again: with K steps, memory for about
-            K / length + length of them instead of K. Without gradients it does nothing.
-        chunk
-            Steps gathered before they are written into the result.
-
-        Returns
-        -------
-        Rollout
-            K/m + 1 states and K/m statuses.
-
-        Raises
-        ------
-        InputError
-            If h is not positive, lengths disagree, L_d takes no inputs, or options do not fit together.
-        """
-        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s), self.L_d)
-        if inputs is not None:
-            inputs = self._checked_inputs(inputs, q)
-            steps = inputs.shape[-2] if steps is None and torch.as_tensor(h).ndim == 0 else steps
-        h_all = step_sizes(check_h(h, q), steps)
-        if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
-            raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
-        if events and checkpoint is not None:
-            raise InputError("events and checkpoint exclude one another; leave one out")
-        watch = Watch(events, start) if events else None
-        plan = Plan(h_all.shape[-1], every, chunk, checkpoint)
-        of_model = capabilities(self.L_d)
-        iterates = not (self.explicit and of_model is not None and of_model.explicit)
-        return roll_out(start, h_all, lambda: self._advance(h_all, inputs, watch), plan, watch, iterates)
-
-    def _checked_inputs(self, inputs: Tensor, q: Tensor) -> Tensor:
-        inputs = torch.as_tensor(inputs, dtype=q.dtype, device=q.device)
+    def _check_inputs(self, inputs: Tensor) -> None:
         if inputs.ndim < 2:
             raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
         driven_by(self.L_d, inputs[..., 0, :])
-        return inputs
 
-    def _throw(self, step: Step, state: State, h: Tensor, u: Tensor | None) -> None:
-        """Raise `StepError` if a sample failed, with the condition that it failed on."""
+    @property
+    def _iterates(self) -> bool:
+        made_of = capabilities(self.L_d)
+        return not (self.explicit and made_of is not None and made_of.explicit)
+
+    def _check_step(self, step: Step, state: State, h: Tensor, u: Tensor | None) -> None:
+        """With `throw`, raise `StepError` if a sample failed, with the condition that it failed on."""
+        if not self.throw:
+            return
         try:
             throw_failure(step.status, step.residual)
         except StepError as error:
             lines = explain_step(driven_by(self.L_d, u), state, h, max_iterations=self.max_iterations)
             raise StepError("; ".join([str(error), *lines[:1]])) from None
 
-    def _engine(self) -> Engine:
-        return Engine(self.L_d, self.tol, self.max_iterations, self.explicit)
-
-    def _advance(self, h: Tensor, inputs: Tensor | None, watch: Watch | None) -> Advance:
-        """The function that takes step k of a rollout."""
-        engine = self._engine()
-        equal = h[..., 0] if h.stride(-1) == 0 else None  # one tensor, so that what depends on h alone is kept
-
-        def take(k: int, walk: Walk, guess: Tensor) -> tuple[Step, State | None]:
-            h_k = h[..., k] if equal is None else equal
-            u = None if inputs is None else inputs[..., k, :]
-            step, low = engine(walk.state, h_k, guess, u, walk.low)
-            if watch is not None:
-                by = lambda tau, guess: engine(walk.state, tau, guess, u, walk.low)[0]  # noqa: E731
-                step = watch.after(k, walk.state, step, h_k, by)
-            if self.throw:
-                try:
-                    self._throw(step, walk.state, h_k, u)
-                except StepError as error:
-                    raise StepError(f"step {k}: {error}") from None
-            return step, low
-
-        return take
+    def _single_step(self) -> SingleStep:
+        return SingleStep(self.L_d, self.tol, self.max_iterations, self.explicit)

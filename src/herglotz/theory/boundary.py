@@ -17,6 +17,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
 from herglotz.mechanics.newton import find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
+from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Rollout, State, Status, Step, StepError, step_sizes
 from herglotz.stepping.stepper import Stepper
 from herglotz.theory.action import curve_action, curve_partials
@@ -141,16 +142,14 @@ def initial_value(
     """
     h_all = step_sizes(torch.as_tensor(h, dtype=q0.dtype, device=q0.device), steps)
     P = partials(L_d, q0, q1, s0, h_all[..., 0])
-    ok = torch.zeros_like(P.L, dtype=torch.uint8)
-    states = [State(q0.expand(P.D1.shape), momentum_minus(P), s0.expand(P.L.shape))]
-    states.append(State(q1.expand(P.D1.shape), momentum_plus(P), s0 + P.L))
-    results = [Step(states[-1], P.c, ok, torch.zeros_like(P.L), 0)]
-    stepper = Stepper(L_d)
-    for k in range(1, h_all.shape[-1]):
-        guess = 2 * states[-1].q - states[-2].q
-        results.append(stepper.step(states[-1], h_all[..., k], guess))
-        states.append(results[-1].state)
-    return Rollout.of(states, results)
+    start = State(q0.expand(P.D1.shape), momentum_minus(P), s0.expand(P.L.shape))
+    end = State(q1.expand(P.D1.shape), momentum_plus(P), s0 + P.L)
+    first = Step(end, P.c, torch.zeros_like(P.L, dtype=torch.uint8), torch.zeros_like(P.L), 0)
+    later = Stepper(L_d)
+    single: OneStep = lambda state, h, guess, *_: (first if state is start else later.step(state, h, guess), None)  # noqa: E731
+    track = roll_out(start, Drive(lambda: single, h_all, Plan(h_all.shape[-1])))
+    q, p, s = track.states
+    return Rollout(q, p, s, track.sigma, track.status, track.residual)
 
 
 def straight_line(q_start: Tensor, q_end: Tensor, h: Tensor) -> Tensor:

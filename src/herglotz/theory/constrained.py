@@ -24,15 +24,13 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.mechanics.newton import Root, attached, find_root
-from herglotz.stepping.rollout import Plan, roll_out
+from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import (
-    Rollout,
     State,
     Step,
     check_h,
     check_state,
     status_of_root,
-    step_sizes,
     throw_failure,
 )
 from herglotz.theory.continuous import jacobian
@@ -43,7 +41,7 @@ Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)
 PROJECTIONS = 20  # Newton steps for μ at most
 
 
-class ConstrainedStepper:
+class ConstrainedStepper(OneStepMethod):
     """Φ̃ on the constraint manifold {g = 0, Dg·v = 0}.
 
     Parameters
@@ -123,27 +121,9 @@ class ConstrainedStepper:
         state = check_state(state)
         return self._solve(state, check_h(h, state.q), None)[1]
 
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        every: int = 1,
-    ) -> Rollout:
-        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
-        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
-        h_all = step_sizes(check_h(h, q), steps)
-        plan = Plan(h_all.shape[-1], every)
-        return roll_out(
-            start,
-            h_all,
-            lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess if k else None), None),
-            plan,
-            None,
-        )
+    @property
+    def _iterates(self) -> bool:
+        return True
 
     def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """G(q) and Dg(q), (..., m) and (..., m, n)."""

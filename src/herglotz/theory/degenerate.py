@@ -25,8 +25,8 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
-from herglotz.stepping.rollout import Plan, roll_out
-from herglotz.stepping.state import Rollout, State, Status, Step, check_h, check_state, step_sizes, throw_failure
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.state import State, Status, Step, check_h, check_state, throw_failure
 from herglotz.theory.continuous import jacobian
 from herglotz.theory.jacobi import Triple
 from herglotz.theory.legendrian import contact_product_point
@@ -49,7 +49,7 @@ def legendrian_relation(
     return contact_product_point((q0, momentum_minus(P), s0), (q1, momentum_plus(P), s0 + P.L), P.c)
 
 
-class LegendrianStepper:
+class LegendrianStepper(OneStepMethod):
     """Steps along the Legendrian relation of a discrete Lagrangian whose M may be singular.
 
     Parameters
@@ -146,28 +146,9 @@ class LegendrianStepper:
         nan = torch.where(status == Status.CONVERGED, torch.zeros_like(s0), torch.nan)
         return State(moved(y).q + nan[..., None], p0, s0)
 
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        every: int = 1,
-    ) -> Rollout:
-        """Step K times from (q, p, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
-        start = check_state(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
-        h_all = step_sizes(check_h(h, q), steps)
-        plan = Plan(h_all.shape[-1], every)
-        with torch.no_grad():
-            return roll_out(
-                start,
-                h_all,
-                lambda: lambda k, walk, guess: (self.step(walk.state, h_all[..., k], guess), None),
-                plan,
-                None,
-            )
+    @property
+    def _iterates(self) -> bool:
+        return True
 
     def _chain(self, state: State, h: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """All c_j p_j + D1 L_d(q_j, q_{j+1}, s_j) for x = (q1, q2, …), and the size of their terms."""

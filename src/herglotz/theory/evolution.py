@@ -13,15 +13,13 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
+from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import (
-    Rollout,
     State,
     Step,
-    StepError,
     check_h,
     check_state,
     status_of_root,
-    step_sizes,
     throw_failure,
 )
 from herglotz.theory.continuous import Hamiltonian, contact_vector_field, evolution_vector_field, square_jacobian
@@ -31,7 +29,7 @@ from herglotz.theory.jacobi import join, sharp_bivector, split
 FIELDS = {"evolution": evolution_vector_field, "contact": contact_vector_field}
 
 
-class EvolutionStepper:
+class EvolutionStepper(OneStepMethod):
     """Second-order, implicit steps of E_H or X_H by a discrete gradient.
 
     Parameters
@@ -72,7 +70,7 @@ class EvolutionStepper:
         self.max_iterations = max_iterations
         self.throw = throw
 
-    def step(self, state: State, h: Tensor | float) -> Step:
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """One step. Differentiable once with respect to the state, by the implicit-function theorem.
 
         Parameters
@@ -110,23 +108,6 @@ class EvolutionStepper:
             throw_failure(status, root.error)
         new, c = State(*split(x0 + delta)), (1 - h * rate / 2) / (1 + h * rate / 2)
         return Step.of(new, c, status, root.error, root.iterations)
-
-    def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
-    ) -> Rollout:
-        """Step K times from (q, p, s); arguments, result and errors as for `Stepper.rollout`."""
-        s = torch.zeros_like(q[..., 0]) if s is None else s
-        h_all = step_sizes(torch.as_tensor(h, dtype=q.dtype, device=q.device), steps)
-        states: list[State] = [State(q, p, s)]
-        results: list[Step] = []
-        for k in range(h_all.shape[-1]):
-            try:
-                out = self.step(states[-1], h_all[..., k])
-            except StepError as error:
-                raise StepError(f"step {k}: {error}") from None
-            results.append(out)
-            states.append(out.state)
-        return Rollout.of(states, results)
 
     def _equation(self, x0: Tensor, delta: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
         """Δ − h (B(x̄)∇̄H − H̄∂_s), whose zero is the step x1 = x0 + Δ, and ∇̄_sH."""

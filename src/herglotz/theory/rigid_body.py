@@ -21,6 +21,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
+from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
 from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes, throw_failure
 from herglotz.theory.rotations import cayley, hat
 
@@ -121,25 +122,22 @@ class RigidBodyStepper:
         return Step.of(new, c, status, residual, iterations)
 
     def rollout(
-        self, R: Tensor, M: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
+        self,
+        R: Tensor,
+        M: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        every: int = 1,
     ) -> BodyRollout:
-        """Step K times from (R, M, s); s defaults to 0. h is a scalar with `steps`, or (K,), or (..., K)."""
+        """Step K times from (R, M, s), s = 0 by default; see `Stepper.rollout` for h, steps and every."""
         state = _checked(BodyState(R, M, torch.zeros_like(M[..., 0]) if s is None else s))
-        states, results = [state], []
-        for h_k in step_sizes(check_h(h, M), steps).unbind(-1):
-            result = self.step(state, h_k)
-            state = result.state
-            states.append(state)
-            results.append(result)
-        factors = torch.stack([torch.ones_like(state.s), *(x.c for x in results)], -1)
-        return BodyRollout(
-            R=torch.stack([x.R for x in states], -3),
-            M=torch.stack([x.M for x in states], -2),
-            s=torch.stack([x.s for x in states], -1),
-            sigma=factors.cumprod(-1),
-            status=torch.stack([x.status for x in results], -1),
-            residual=torch.stack([x.residual for x in results], -1),
-        )
+        h_all = step_sizes(check_h(h, M), steps)
+        single: OneStep = lambda state, h, *_: (self.step(state, h), None)  # noqa: E731
+        track = roll_out(state, Drive(lambda: single, h_all, Plan(h_all.shape[-1], every), extrapolate=False))
+        R, M, s = track.states
+        return BodyRollout(R, M, s, track.sigma, track.status, track.residual)
 
     def _times(self, f: Tensor) -> Tensor:
         return f @ self.inertia.to(f)

@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.stepping.composition import Composition
-from herglotz.stepping.state import Rollout, State, Status, Step
+from herglotz.stepping.method import OneStepMethod
+from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.theory.continuous import gradient
 
 Scalar = Callable[[Tensor], Tensor]  # (..., n) → (...)
@@ -30,7 +30,7 @@ def linear_damping(gamma: float) -> Damping:
     return damp
 
 
-class ContactSplitting:
+class ContactSplitting(OneStepMethod):
     """The explicit stepper of order 2 for H = |p|²/2m + V(q) + f(s); its own adjoint, so `suzuki` and others raise it.
 
     Parameters
@@ -59,7 +59,6 @@ class ContactSplitting:
         self.potential, self.m = potential, m
         self.damp = damping if callable(damping) else linear_damping(damping)
         self.force = force if force is not None else lambda q: -gradient(potential, q)[1]
-        self._alone = Composition([(self, 1.0)])
 
     def L_d(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
         """The discrete Lagrangian of the step: ψ(ψ(s0) + m|Δ|²/2h − (h/2)(V0 + V1)) − s0 with ψ = ψ_{h/2}."""
@@ -80,12 +79,7 @@ class ContactSplitting:
         status = torch.where(finite, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
         return Step.of(State(q1, p, s), c0 * c1, status, torch.zeros_like(s), 0)
 
-    def step(self, state: State, h: Tensor | float) -> Step:
-        """One step of h > 0, scalar or (...)."""
-        return self._alone.step(state, h)
-
-    def rollout(
-        self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int | None = None
-    ) -> Rollout:
-        """Step K times from (q, p, s); h is a scalar with `steps`, (K,) or (..., K). s defaults to 0."""
-        return self._alone.rollout(q, p, s, h=h, steps=steps)
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """One step of h > 0, scalar or (...); nothing is guessed."""
+        state = check_state(state)
+        return self.substep(state, check_h(h, state.q))

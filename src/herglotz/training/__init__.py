@@ -1,25 +1,30 @@
 """Objectives, optimisers and the fit."""
 
-from herglotz.training.adam import adam
+from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.fit import fit
 from herglotz.training.identifiability import Trade, traded
-from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
-from herglotz.training.prior import Prior
-from herglotz.training.residual import ResidualProblem
+from herglotz.training.look import Look, look
+from herglotz.training.plan import Plan
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.prior import Prior
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.problems.smoothing import SmoothingProblem
+from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.run import Run, load_run, save_run
 from herglotz.training.selection import Selection, select
-from herglotz.training.shooting import ShootingProblem
 from herglotz.training.smoother import Smoothed, smooth
-from herglotz.training.smoothing import SmoothingProblem
-from herglotz.training.supervision import SupervisedProblem
+from herglotz.training.solvers.adam import adam
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.uncertainty import Bands, Laplace, ensemble_bands, laplace
 
 __all__ = [
     "Bands",
     "FitConfig",
     "Laplace",
+    "Look",
     "OptimiserResult",
+    "Plan",
     "Prior",
     "ResidualProblem",
     "Run",
@@ -30,11 +35,13 @@ __all__ = [
     "SupervisedProblem",
     "Trade",
     "adam",
+    "choose",
     "ensemble_bands",
     "fit",
     "laplace",
     "levenberg_marquardt",
     "load_run",
+    "look",
     "save_run",
     "select",
     "smooth",

@@ -1,4 +1,4 @@
-"""A first look at the data: sizes, a typical step and the baseline's starting values, by linear least squares."""
+"""Sizes of the data, a typical step and starting values of the baseline, by linear least squares."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
 from herglotz.data.windows import Triples
 from herglotz.errors import InputError
-from herglotz.training.robust import FREEDOM, root_weights, scale_of
+from herglotz.training.problems.robust import FREEDOM, root_weights, scale_of
 
-ROUNDS = 10  # of re-weighting
-JITTER = 1.05  # steps longer than the typical one by less than this are crossed in as many model steps
-PULLED = 3.0  # ratio of scales beyond which least squares follow the outliers
-NEGLIGIBLE = 1e-3  # of the RMS acceleration: a bulk that is missed by less is at rest, or exact
-GROSS = 30.0  # robust standard deviations of an acceleration that no smooth motion misses the baseline by
+ROUNDS = 10  # iterations of re-weighting for Student's t
+JITTER = 1.05  # a step up to this factor longer than the typical one is crossed in as many model steps
+PULLED = 3.0  # ratio of the least-squares misfit to that of Student's t above which outliers pull least squares
+NEGLIGIBLE = 1e-3  # a misfit of the bulk below this share of the RMS acceleration means rest or exact data
+GROSS = 30.0  # residual, in robust standard deviations of the acceleration, that no smooth motion reaches
 
 
 @dataclass(frozen=True)
 class Baseline:
-    """What the data look like, as plain numbers a `ModelConfig` can hold."""
+    """Sizes and starting values of the data, as plain numbers for `ModelConfig`."""
 
     angles: tuple[bool, ...]
     scale: tuple[float, ...]  # largest |q|
@@ -52,8 +52,8 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     constant V acts there as a force dV, so that the weight of one coordinate, −b, starts as V = −b/d.
 
     Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
-    Student's t takes the place of least squares (`herglotz.training.robust`), and rows that miss grossly set no size.
-    A recorded step is crossed in `substeps` model steps by trajectory fitting.
+    Student's t takes the place of least squares (`problems.robust`), and rows that miss grossly set no size. A recorded
+    step is crossed in `substeps` model steps by trajectory fitting.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         q, v = t.q1[good.to(q.device)], v[good.to(q.device)]
     else:
         x = torch.linalg.lstsq(columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()).solution[:, 0].tolist()
-    # An angle that turns over and over is no larger than half a turn.
+    # The size of an angle that turns over and over is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
     for name, moved in zip(data.names, speed, strict=True):
@@ -101,7 +101,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
 
 
 def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
-    """Whether outliers that are no lone spikes pull the least-squares start away from all else.
+    """Return whether outliers that are no lone spikes pull the least-squares start away from the other samples.
 
     All needed: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a period),
     and least squares miss their bulk, by more than rounding, three times as far as Student's t does.
@@ -118,7 +118,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
 
 
 def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:
-    """Longest step, triples (T), velocities (T, n), accelerations (T, n), and what each coefficient adds (T, n, k)."""
+    """Return longest step, triples (T), velocities (T, n), accelerations (T, n), and their columns (T, n, k)."""
     max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
     t = data.triples(max_step)
     if len(t) == 0:
@@ -142,7 +142,7 @@ def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor
 
 
 def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:
-    """Solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which of the T rows it believes, (T,) bool."""
+    """Return the solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which rows are no outliers, (T,) bool."""
     rows, right = A.reshape(-1, A.shape[-1]), a.reshape(-1, 1)
     x = torch.linalg.lstsq(rows, right).solution
     for _ in range(ROUNDS):

@@ -1,4 +1,4 @@
-"""Motions of the fitted baseline, as triples where there are no data: what is expected there.
+"""Motions of the fitted baseline, as triples where there are no data.
 
 The correction is free wherever no triple has been: in a hole of the data, near a separatrix say, it errs most, and a
 rollout that crosses it never recovers. Where q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ (angles; −kᵢ qᵢ − bᵢ − γ q̇ᵢ for others)
@@ -20,9 +20,9 @@ from herglotz.data.windows import Triples
 from herglotz.training.baseline import Baseline
 
 ROUNDS = 12  # Gauss–Newton iterations
-TURN = 0.02  # radians of the fastest motion a Runge–Kutta step: an error of about 1e-10 a triple
-BEYOND = 1.2  # times the energy and the speed of the data
-STARTS = 256  # triples a coordinate
+TURN = 0.02  # phase of the fastest motion in one Runge–Kutta step, rad: an error of about 1e-10 a triple
+BEYOND = 1.2  # factor by which energy and speed may exceed those of the data
+STARTS = 256  # number of triples for each coordinate
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class BaselineMotion:
     error: float
 
     def triples(self, data: Trajectories, base: Baseline) -> Triples:
-        """Triples about quasi-random states of the data's range and a little beyond."""
+        """Return triples from quasi-random states in the range of the data and a little beyond."""
         recorded = data.triples(base.max_step)
         columns = [self._states(i, recorded) for i in range(data.dof)]
         count = min(len(q) for q, _ in columns)
@@ -58,7 +58,7 @@ class BaselineMotion:
         return Triples(q0, q1, q2, h0, h1, recorded.trajectory[like], recorded.index[like])
 
     def _states(self, i: int, recorded: Triples) -> tuple[Tensor, Tensor]:
-        """Positions and velocities of coordinate i: none has `BEYOND` times more energy than the data."""
+        """Return positions and velocities of coordinate i with at most `BEYOND` times the energy of the data."""
         q, v = recorded.q1[:, i], _slopes(recorded)[:, i]
         low, high = float(q.min()), float(q.max())
         middle, half = (low + high) / 2, (high - low) / 2 * BEYOND**2
@@ -70,13 +70,13 @@ class BaselineMotion:
         return q1[inside][: STARTS * self.angles.numel()], v1[inside][: STARTS * self.angles.numel()]
 
     def _energy(self, i: int, q: Tensor, v: Tensor) -> Tensor:
-        """½v² + V of coordinate i."""
+        """Return ½v² + V of coordinate i."""
         k, b, _ = self.parameters[:, i]
         return v.square() / 2 + (b * q.sin() - k * q.cos() if self.angles[i] else k * q.square() / 2 + b * q)
 
 
 def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> BaselineMotion | None:
-    """Least squares over the data's triples; None where the error that is left exceeds `worst`."""
+    """Fit by least squares to the triples of the data; return None where the remaining error exceeds `worst`."""
     t, n = data.triples(base.max_step), data.dof
     angles = torch.tensor(base.angles, device=data.t.device)
     parameters = t.q0.new_tensor([base.stiffness, base.tilt, (base.rate,) * n])

@@ -1,4 +1,4 @@
-"""What a fit is asked to do: plain values, stored beside the result."""
+"""Settings of a fit, stored beside its result."""
 
 from __future__ import annotations
 
@@ -50,8 +50,8 @@ class FitConfig:
         Bound on the iterations of the residual objectives (Adam takes 20 times as many); each stage of trajectory
         fitting takes 40 at the most.
     restarts
-        Draws of the initial weights that the one-step objective races for a part of its iterations; the one ahead goes
-        on. None: 4 where the correction is a single layer (`baseline_motion`), else 1.
+        Random initialisations of the one-step objective; the best after 30 iterations is kept. None: 4 where the
+        correction is a single layer (`baseline_motion`), else 1.
     departures
         Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
         value fixes it.

@@ -1,18 +1,40 @@
-"""How well a fitted trajectory predicts blocks of time it was not fitted to, without fitting again."""
+"""Errors of a fitted trajectory over held-out blocks of time, without fitting again."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.training.lifted import Path
-from herglotz.training.shooting import ShootingProblem
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import Path
 
-FOLDS = 5
-MARGIN = 1.05  # an error lower by less than this factor is no reason for a weaker prior or a richer level
+FOLDS = 5  # held-out blocks: fifths of every trajectory, in time
+MARGIN = 1.05  # a weaker prior or a richer level must lower the error by more than this factor
+
+
+class Judged(Protocol):
+    """A fit that knows its errors over held-out blocks of time."""
+
+    def held_out_errors(self) -> Tensor:
+        """Return the RMS of every fold, (FOLDS,), in units of q."""
+        ...
+
+
+F = TypeVar("F", bound=Judged)
+
+
+@dataclass(frozen=True)
+class Chosen(Generic[F]):
+    """The fit with the strength of the prior that held-out blocks chose, and the errors of all strengths."""
+
+    fit: F
+    departure: float
+    held_out: dict[float, Tensor]  # (FOLDS,) in units of q
 
 
 def held_out_errors(
@@ -21,7 +43,7 @@ def held_out_errors(
     theta: Tensor,  # (P,)
     A: Tensor,  # JᵀJ of the whole problem at the fit, prior included
 ) -> Tensor:
-    """RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
+    """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
     Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
     there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
@@ -51,7 +73,7 @@ def left_out_errors(
 
 
 def beaten(errors: Tensor, best: Tensor) -> bool:
-    """Whether held-out errors of blocks of time, (blocks,), are higher than the best ones beyond their spread.
+    """Return whether held-out errors of blocks of time, (blocks,), exceed the best ones beyond their spread.
 
     Spread: the standard error over blocks of the difference of their squared errors (the one-standard-error rule of
     Breiman et al. 1984). An error lower by less than a twentieth beats nothing, however certain: a weaker prior, or a
@@ -63,6 +85,23 @@ def beaten(errors: Tensor, best: Tensor) -> bool:
 
 
 def simplest_not_beaten(errors: dict[float, Tensor]) -> float:
-    """The smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
+    """Return the smallest key (the strongest prior) whose held-out errors the best ones do not beat."""
     best = min(errors, key=lambda k: float(errors[k].square().mean()))
     return next(key for key in sorted(errors) if key == best or not beaten(errors[key], errors[best]))
+
+
+def strongest_not_beaten(departures: Sequence[float], fit: Callable[[float], F | None]) -> Chosen[F] | None:
+    """Fit every strength of the prior, the weakest first, and keep the strongest that the best one does not beat.
+
+    None where none could be fitted.
+    """
+    fits: dict[float, F] = {}
+    held_out: dict[float, Tensor] = {}
+    for departure in sorted(departures, reverse=True):
+        found = fit(departure)
+        if found is not None:
+            fits[departure], held_out[departure] = found, found.held_out_errors()
+    if not fits:
+        return None
+    chosen = simplest_not_beaten(held_out)
+    return Chosen(fits[chosen], chosen, held_out)

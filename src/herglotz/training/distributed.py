@@ -1,4 +1,4 @@
-"""Normal equations and gradients shared by the processes of `torchrun`; nothing at all in a single process.
+"""Normal equations and gradients summed over the processes of `torchrun`; a single process is not affected.
 
 Every process holds the data and runs the same optimiser. The work that grows with the data (Jacobians of chunks of
 triples or steps) is dealt out and the sums are all-reduced. The last bits of what a process computes by itself depend
@@ -16,7 +16,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-PARTS, LEAST = 8, 512  # rows are dealt out in up to so many parts, none smaller than this
+PARTS, LEAST = 8, 512  # rows are divided into at most PARTS parts of at least LEAST rows
 LANES = 2
 
 

@@ -1,4 +1,4 @@
-"""States at the beginnings of segments, read from the samples there."""
+"""States read from samples: at the beginnings of segments, and everywhere for a model that follows no data."""
 
 from __future__ import annotations
 
@@ -6,23 +6,44 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.mechanics import legendre_minus
-from herglotz.training.robust import FREEDOM, MAD, root_weights
-from herglotz.training.shooting import ShootingProblem
+from herglotz.mechanics import legendre_minus, legendre_plus
+from herglotz.models import ContactLagrangian
+from herglotz.training.inputs import step_inputs
+from herglotz.training.problems.robust import FREEDOM, MAD, root_weights
+from herglotz.training.problems.shooting import ShootingProblem
 
-START = 8  # samples that a robust start state is read from
+START = 8  # samples that a robust start state is estimated from
 
 
 def first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
-    """Segment states from the first two samples of each, p by FL⁻; from a robust cubic where one may be an outlier."""
+    """Return segment states from the first two samples, p by FL⁻; from a robust cubic beside outliers."""
     i, data = problem.grid.start_sample, problem.data
     q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
     with torch.no_grad():
         s = torch.zeros_like(data.t[i]) if problem.s is None else problem.s[i]
         u = None if problem.u is None else problem.u[:, 0]
-        L_d = problem.flat.at(theta, u)
+        L_d = problem.parameters.at(theta, u)
         q, p, _ = legendre_minus(L_d, q0, q1, s, data.t[i + 1] - data.t[i])
     return problem.states(q, p, s)
+
+
+def states_of_pairs(model: ContactLagrangian, data: Trajectories) -> Tensor:
+    """The recorded positions with the momenta that FL⁺ gives each pair and s = 0, for a model that follows no data."""
+    out = data.q.new_zeros(data.samples, 2 * data.dof + 1)
+    steps, u = data.steps(), step_inputs(model, data)
+    i, zero = steps.index, torch.zeros_like(steps.h)
+    with torch.no_grad():
+        L_d = model if u is None else model.at(u[i])
+        _, p, _ = legendre_plus(L_d, data.q[i], data.q[i + 1], zero, steps.h)
+        first = torch.tensor(data.offsets, device=i.device)
+        h = data.t[first + 1] - data.t[first]
+        L_d = model if u is None else model.at(u[first])
+        _, p_first, _ = legendre_minus(L_d, data.q[first], data.q[first + 1], torch.zeros_like(h), h)
+    n = data.dof
+    out[:, :n] = data.q
+    out[i + 1, n : 2 * n] = p
+    out[first, n : 2 * n] = p_first
+    return out
 
 
 def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:

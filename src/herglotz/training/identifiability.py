@@ -1,4 +1,4 @@
-"""What the data leave open among the parameters that have a meaning: combinations that can be traded for one another.
+"""Combinations of physical parameters that the data do not determine, because one can replace another.
 
 With A = JᵀJ of the fit, prior included, the information that the data hold on the parameters φ of interest, whatever
 the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Scaled to a
@@ -19,9 +19,9 @@ from herglotz.training.uncertainty import Laplace
 
 PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag",
             "friction.")  # fmt: skip
-HARMFUL = 30.0  # condition index from which parameters count as traded
-LARGEST = 1e7  # condition index that rounding leaves of an exact null direction
-PART = 0.05  # least share of a combination that is named
+HARMFUL = 30.0  # condition index above which parameters are not determined one by one (Belsley, Kuh & Welsch 1980)
+LARGEST = 1e7  # condition index of an exact null direction, up to rounding
+PART = 0.05  # a parameter with a smaller share of a combination is not named
 # Eigenvalues of the scaled information closer than this (of the largest) count as equal: rounding moves them by some
 # 1e-15, which turns eigenvectors across a gap g by 1e-15/g, so that names stay below PART by a margin of 1e4.
 EQUAL = 1e-10

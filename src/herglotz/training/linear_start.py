@@ -1,4 +1,4 @@
-"""Where a dictionary of features starts: the coefficients of L_d from one linear problem, without a search.
+"""Starting values of a dictionary of features: the coefficients of L_d from one linear problem.
 
 L_d is linear in the coefficients x of its masses, features and friction, and so are the discrete Herglotz residual R
 and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (gauge), and a small L_d has a small R: so
@@ -24,7 +24,7 @@ from herglotz.data.windows import Triples
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.jet import pairs
-from herglotz.training.flat import FlatModel
+from herglotz.training.parameter_vector import ParameterVector
 
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous")  # fmt: skip
@@ -33,7 +33,7 @@ ROUNDS = 3
 
 @dataclass(frozen=True)
 class LinearFit:
-    """A dictionary's residuals over a set of triples, and what they say of its coefficients."""
+    """Residuals of a dictionary over a set of triples, and the coefficients that they determine."""
 
     R: Tensor  # (T, n, F) of each column of coefficient 1
     J: Tensor  # (T, n, n, F)
@@ -48,18 +48,21 @@ class LinearFit:
             ModelConfig(angles=tuple(angles), level="forced", coupled=True, features=tuple(features), potential_width=0,
                         stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=(1.0,) * n, rate=0.0)
         ).to(t.q0)  # fmt: skip
-        flat = FlatModel(model)
-        which = [name for name in LINEAR if name in flat.names]
-        columns = torch.cat([flat.index(name) for name in which])
+        parameters = ParameterVector(model)
+        which = [name for name in LINEAR if name in parameters.names]
+        columns = torch.cat([parameters.index(name) for name in which])
 
         def both(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor) -> tuple[Tensor, Tensor]:
             zero = torch.zeros_like(h0)
-            before, after = flat.partials(theta, q0, q1, zero, h0, 2), flat.partials(theta, q1, q2, zero, h1, 2)
+            before, after = (
+                parameters.partials(theta, q0, q1, zero, h0, 2),
+                parameters.partials(theta, q1, q2, zero, h1, 2),
+            )
             p = momentum_plus(before)
             return momentum_residual(after, p), momentum_jacobian(after, p)
 
         derivatives = vmap(jacrev(both), (None, *(0,) * 5))
-        R, J = derivatives(flat.get(), t.q0, t.q1, t.q2, t.h0, t.h1)
+        R, J = derivatives(parameters.get(), t.q0, t.q1, t.q2, t.h0, t.h1)
         i, j = pairs(n, t.q0.device)
         eye = torch.eye(n, dtype=t.q0.dtype, device=t.q0.device)
         unit = eye[:, i, None] * eye[:, j].T[None]  # (n, pairs, n), then symmetric
@@ -68,7 +71,7 @@ class LinearFit:
         R = torch.cat([torch.einsum("apb,tb->tap", unit, kick), R[..., columns]], -1)
         own = -unit.movedim(1, 2) / t.h1[:, None, None, None]
         J = torch.cat([own, J[..., columns]], -1)
-        sizes = dict(zip(flat.names, flat.sizes, strict=True))
+        sizes = dict(zip(parameters.names, parameters.sizes, strict=True))
         return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in range(sizes[name])))
 
     def rows(self, which: Tensor) -> LinearFit:

@@ -12,18 +12,18 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
-from herglotz.training.grid import SegmentGrid, segment_grid
 from herglotz.training.inputs import step_inputs
-from herglotz.training.levenberg_marquardt import levenberg_marquardt
-from herglotz.training.smoothing import DAMPING, SmoothingProblem
-from herglotz.training.trajectory_fit import StatesOnly
+from herglotz.training.problems.grid import SegmentGrid, segment_grid
+from herglotz.training.problems.least_squares import StatesOnly
+from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 WARMUP = 20  # samples from which the state is estimated
-BELIEVED = 0.1  # noise of a step relative to the data's in the warm-up, as in `smooth`: the model is believed
+BELIEVED = 0.1  # noise of a step over that of the data in the warm-up, as in `smooth`: the states follow the model
 
 
 class Trained(Protocol):
-    """What `predict` needs of a run."""
+    """The attributes of a run that `predict` uses."""
 
     @property
     def model(self) -> ContactLagrangian: ...  # noqa: D102

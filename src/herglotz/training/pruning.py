@@ -1,4 +1,4 @@
-"""Which features the data need: the others are left out one after the other, by what the fit would lose."""
+"""Selection of features: the one that the fit loses least without is removed, one after the other."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class Run:
         return self.states.q
 
     def states_at_end(self) -> State:
-        """The state at the last sample of every trajectory, (B, n), (B, n), (B,): where to go on from."""
+        """Return the state at the last sample of every trajectory, (B, n), (B, n), (B,), to continue from."""
         last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
         return State(*(x[last] for x in self.states))
 
@@ -67,7 +67,7 @@ class Run:
 
     @property
     def setting(self) -> dict[str, Any]:
-        """What `herglotz tune` chose for a run that it wrote: artefact, dtype, tol, …; empty for any other."""
+        """Return the setting of a run that `herglotz tune` wrote (artefact, dtype, tol, …); empty for any other run."""
         return (self.metrics.get("tuned") or {}).get("chosen", {})
 
     @property

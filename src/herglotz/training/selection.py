@@ -19,12 +19,12 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
-from herglotz.training.structure import nothing_told
+from herglotz.training.structure import structure_is_free
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
-LADDER = (*LEVELS, "auto")  # what `fit` does where no level is told comes last: it is the richest
-BLOCKS = 5  # the held-out time of all trajectories falls into at least this many blocks
+LADDER = (*LEVELS, "auto")  # "auto", which `fit` takes without a level, is the richest and comes last
+BLOCKS = 5  # least number of blocks that the held-out time of all trajectories is divided into
 TIMED_STEPS = 20
 
 
@@ -54,7 +54,7 @@ class Candidate:
 
     @property
     def best(self) -> Run:
-        """The run of the median seed: representative, not lucky."""
+        """Return the run of the median seed, which is representative."""
         return self.runs[self.median_seed]
 
     @property
@@ -77,7 +77,7 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """The ladder's table and what it says."""
+    """The table of the ladder, and the chosen level."""
 
     candidates: tuple[Candidate, ...]
     chosen: Candidate
@@ -180,7 +180,7 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
         return ("forced", "auto")
     if config.coulomb or config.coupled or config.input_map:
         return ("forced",)
-    return (*CANDIDATES, "auto") if nothing_told(data, replace(config, level="auto")) else CANDIDATES
+    return (*CANDIDATES, "auto") if structure_is_free(data, replace(config, level="auto")) else CANDIDATES
 
 
 def block_errors(run: Run) -> Tensor:

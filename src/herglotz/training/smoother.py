@@ -1,4 +1,4 @@
-"""Smoothed states with their standard errors, the model held."""
+"""Smoothed states of a fixed model, with their standard errors."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
-from herglotz.training.grid import segment_grid
-from herglotz.training.levenberg_marquardt import levenberg_marquardt
-from herglotz.training.smoothing import DAMPING, SmoothingProblem
-from herglotz.training.trajectory_fit import StatesOnly
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.least_squares import StatesOnly
+from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class Smoothed:
 
 
 def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, process: float = 0.1) -> Smoothed:
-    """Smoothed states of each trajectory, the model held.
+    """Return the smoothed states of each trajectory for a fixed model.
 
     Parameters
     ----------

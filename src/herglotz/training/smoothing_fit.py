@@ -14,35 +14,33 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
-from herglotz.training.baseline import Baseline
-from herglotz.training.bordered import Bordered
-from herglotz.training.cross_validation import left_out_errors, simplest_not_beaten
-from herglotz.training.grid import segment_grid
-from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
-from herglotz.training.robust import FREEDOM, heavy_tailed, root_weights
-from herglotz.training.smoothing import DAMPING, SmoothingProblem
-from herglotz.training.stages import Stages
-from herglotz.training.trajectory_fit import LOST, make_prior
+from herglotz.training.cross_validation import Chosen, left_out_errors, strongest_not_beaten
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.robust import FREEDOM, heavy_tailed
+from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.solvers.bordered import Bordered
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
+from herglotz.training.task import Task
+from herglotz.training.trajectory_fit import LOST, STAGE
 
-ROUNDS = 8  # in which both noises are found; at first the steps' is taken as large as the data's
-FALL = 10.0  # factor by which the steps' noise falls in a round, at the most
-SETTLED = 0.1  # change of its logarithm that ends the rounds
-SMOOTHED = 20_000  # numbers in q at the most: a held-out fifth of them is solved for at once (1.3 GB, a few times)
-LEAST = 1e-2  # of the steps' noise relative to the data's: with less the states are a motion of the model
+ROUNDS = 8  # rounds of the estimate of both noises, which starts with steps as noisy as the data
+FALL = 10.0  # largest factor by which the noise of the steps falls in a round: a poor model explains too little
+SETTLED = 0.1  # the rounds end where the logarithm of that noise changes by less
+SMOOTHED = 20_000  # most numbers in q: a held-out fifth of them is solved for at once (1.3 GB, a few times)
+LEAST = 1e-2  # least noise of the steps over that of the data: below, the states are a motion of the model
+FLOOR = 1e-8  # least σ relative to the largest |q|: rounding
 
 
 @dataclass(frozen=True)
 class SmoothingFit:
-    """The chosen fit."""
+    """A fit of parameters and all states at one noise of the steps and one strength of the prior."""
 
     x: Tensor  # unknowns of the problem: parameters, then states
     problem: SmoothingProblem
-    departure: float | None  # prior strength, where the model has a potential network
-    held_out: dict[float, Tensor]  # error of every fold, for every strength tried
     result: OptimiserResult
 
     @property
@@ -56,23 +54,25 @@ class SmoothingFit:
         n, grid, first = problem.n, problem.grid, states[:, 0]
         s = first[:, 2 * n] if problem.d > 2 * n else torch.zeros_like(first[:, 0])
         with torch.no_grad():
-            stepper = Stepper(problem.flat.at(self.theta))
+            stepper = Stepper(problem.parameters.at(self.theta))
             out = stepper.rollout(first[:, :n], first[:, n : 2 * n], s, h=grid.h, inputs=problem.u)
         miss = out.q.flatten(0, 1)[problem.node] - problem.data.q
         return float(miss.square().mean().sqrt()) <= LOST * problem.sigma
 
+    def held_out_errors(self) -> Tensor:
+        """Of every fold, in units of q; see `cross_validation`."""
+        problem, (_, matrix, _) = self.problem, self.problem.normal_equations(self.x)
+        r = problem.misfit(self.x) / problem.sigma
+        by = problem.root_weights(r)
+        rows = (problem.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
 
-def fit_smoothing(
-    model: ContactLagrangian,
-    data: Trajectories,
-    base: Baseline,
-    sigma: float,
-    departures: tuple[float, ...],
-    iterations: int,
-    stages: Stages,
-    *,
-    robust: str = "auto",
-) -> SmoothingFit | None:
+        def hat(own: Tensor) -> Tensor:
+            return _hat(matrix, rows[own], by.flatten()[own] / problem.sigma)
+
+        return left_out_errors((by * r).flatten(), problem.data, hat) * problem.sigma
+
+
+def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[SmoothingFit] | None:
     """Fit parameters and all states to positions, and find both noises, the steps' from as much as the data's on.
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
@@ -81,34 +81,34 @@ def fit_smoothing(
 
     Returns
     -------
-    SmoothingFit or None
+    Chosen or None
         None where a step near the data has no solution.
     """
-    if model.potential.network is None:
-        departures = departures[:1]
-    grid = segment_grid(data, data.samples, base.model_step)
-    floor = 1e-8 * max(base.scale)
-    freedom = FREEDOM if robust == "on" else None
+    config = task.config
+    departures = config.departures if model.potential.network is not None else config.departures[:1]
+    grid = segment_grid(task.data, task.data.samples, task.base.model_step)
+    freedom = FREEDOM if config.robust == "on" else None
 
     def stage(name: str, x: Tensor | None, departure: float, process: float) -> SmoothingFit | None:
-        prior = make_prior(model, base, departure)
+        prior = prior_of(model, task.base, departure)
         problem = SmoothingProblem(
-            model, data, grid, sigma=max(sigma, floor), process=process, prior=prior, freedom=freedom
+            model, task.data, grid, sigma=max(sigma, FLOOR * task.size), process=process, prior=prior, freedom=freedom
         )
-        start, most = problem.start() if x is None else x, min(iterations, 40)
-        result = stages.run(
+        start, most = problem.start() if x is None else x, min(config.iterations, STAGE)
+        result = task.stages.run(
             name, start, most,
             lambda x, callback: levenberg_marquardt(
                 problem, x, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING, callback=callback
             ),
         )  # fmt: skip
-        return SmoothingFit(result.x, problem, departure, {}, result) if math.isfinite(result.cost) else None
+        return SmoothingFit(result.x, problem, result) if math.isfinite(result.cost) else None
 
     weakest = max(departures)
-    last = stage("smoothing", None, weakest, 1.0)
-    if last is None:
+    first = stage("smoothing", None, weakest, 1.0)
+    if first is None:
         return None
-    if robust == "auto" and heavy_tailed(last.problem.misfit(last.x)):
+    last = first
+    if config.robust == "auto" and heavy_tailed(last.problem.misfit(last.x)):
         freedom = FREEDOM
         last = stage("smoothing, robust", None, weakest, 1.0) or last
     for k in range(ROUNDS):
@@ -118,18 +118,16 @@ def fit_smoothing(
         last = stage(f"smoothing, noise {k + 1}", last.x, weakest, process) or last
         if abs(math.log(process / before)) < SETTLED:
             break
-    (sigma, process), held_out, fits = _noises(last), {}, []
-    for departure in sorted(departures, reverse=True):
+    sigma, process = _noises(last)
+
+    def fit(departure: float) -> SmoothingFit | None:
+        nonlocal last
         found = stage(f"smoothing, prior {departure:g}", last.x, departure, process)
-        if found is not None:
-            fits.append(found)
-            held_out[departure] = _held_out_errors(found)
-            last = found
-    if not fits:
-        return last
-    chosen = simplest_not_beaten(held_out)
-    best = next(f for f in fits if f.departure == chosen)
-    return SmoothingFit(best.x, best.problem, chosen, held_out, best.result)
+        last = found or last
+        return found
+
+    found = strongest_not_beaten(departures, fit)
+    return found or Chosen(last, weakest, {})
 
 
 def _noises(fit: SmoothingFit) -> tuple[float, float]:
@@ -140,30 +138,17 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     """
     problem = fit.problem
     misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
-    used = root_weights(misfit / problem.sigma, problem.freedom).square()
+    used = problem.root_weights(misfit / problem.sigma).square()
     taken = float(diagonal_of_inverse(matrix.blocks).flatten(0, 1)[problem.node, : problem.n].sum()) / problem.sigma**2
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))
     defect = problem.defects(fit.x)
-    by = root_weights(defect, problem.freedom).square()
+    by = problem.root_weights(defect).square()
     w = problem.process * problem.sigma  # in the units of σ
     w *= math.sqrt(float((by * defect.square()).sum()) / max(taken - starts, 0.01 * starts))
     sigma = max(sigma, problem.sigma / FALL)
     return sigma, max(w / sigma, LEAST)
-
-
-def _held_out_errors(fit: SmoothingFit) -> Tensor:
-    """See `cross_validation.held_out_errors`."""
-    problem, (_, matrix, _) = fit.problem, fit.problem.normal_equations(fit.x)
-    r = problem.misfit(fit.x) / problem.sigma
-    by = root_weights(r, problem.freedom)
-    rows = (problem.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
-
-    def hat(own: Tensor) -> Tensor:
-        return _hat(matrix, rows[own], by.flatten()[own] / problem.sigma)
-
-    return left_out_errors((by * r).flatten(), problem.data, hat) * problem.sigma
 
 
 def _hat(matrix: Bordered, rows: Tensor, by: Tensor) -> Tensor:

@@ -14,14 +14,14 @@ from tqdm import tqdm
 from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
 from herglotz.training.distributed import is_first
-from herglotz.training.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 
 Callback = Callable[[int, float, Tensor], None]
 EVERY = 25  # iterations between two checkpoints inside a stage
 
 
 class Stages:
-    """Runs optimisations one after the other and remembers them.
+    """Run optimisations one after the other, and record them.
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
     and an unfinished one goes on from its best point.

@@ -1,4 +1,4 @@
-"""What several coordinates are made of, where nobody says it.
+"""The structure of several coordinates, found from the data.
 
 Every planar chain of revolute joints, in absolute or relative angles, has its mass and its weight in the dictionary
 `revolute` (`herglotz.models.features`); coordinates without an angle among them have constant masses of their own, and
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -23,38 +23,46 @@ from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
-from herglotz.training.build import build_model
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.distributed import of_first
-from herglotz.training.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.linear_start import LinearFit
+from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.prior import prior_of
 from herglotz.training.pruning import prune
-from herglotz.training.residual import ResidualProblem
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
-from herglotz.training.trajectory_fit import make_prior
+from herglotz.training.task import EXACT, NOISY, build_model
 
-MOST, MOST_LENGTHS = 3, 12  # coordinates: the dictionary of joints grows as 3ⁿ n²
-TRIPLES, ENOUGH = 4000, 5  # triples that tell the structures apart; residuals a coefficient, at least
-NUMBERS = 3e7  # in the derivatives of the linear problem: 240 MB
-NEAR = 0.02  # of the RMS distance: powers of r below 0 are no candidates where the data come nearer
-THINNED = (1, 2, 4)  # noise asks for longer steps, the rule of order 2 for shorter ones
-ROWS = 50  # residuals a coefficient that the one-step fit takes
-MISSED = 2.0  # more than so many times the noise is force that the dictionary of lengths has not
-BETTER = 0.5  # where order 4 lowers the error less than this, order is not what the rule lacks,
-EXACT = 1e-8  # σ of exact data relative to the motion's size: errors below are rounding
-EXPLAINED = 1e-7  # if the rule lacks anything: one-step error relative to the size of the motion
+MOST, MOST_LENGTHS = 3, 12  # most coordinates with and without an angle: the dictionary of joints grows as 3ⁿ n²
+TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
+NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
+NEAR = 0.02  # negative powers of r are candidates where the data stay beyond this share of the RMS distance
+THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
+MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
+BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
+EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
 
-def nothing_told(data: Trajectories, told: FitConfig) -> bool:
+class Structure(NamedTuple):
+    """The terms and starting values that were found for several coordinates."""
+
+    config: FitConfig  # the settings with the features, the order and the objective that the data call for
+    base: Baseline  # with starting values
+    reason: str  # in words and numbers
+
+
+def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
     """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
-    said = told.features or told.known or told.alike or told.diagonal or told.mass_width or told.coulomb
-    free = told.level == "auto" and not said
-    plain = told.order == 2 and told.objective != "raw" and told.supervision == "q" and told.optimiser == "lm"
-    driven = data.u is not None and told.use_inputs
-    return free and plain and not driven and 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)
+    c = user_settings
+    named = c.features or c.known or c.alike or c.diagonal or c.mass_width or c.coulomb
+    plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm"
+    driven = data.u is not None and c.use_inputs
+    several = 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)
+    return c.level == "auto" and not named and plain and not driven and several
 
 
 def dictionary(data: Trajectories) -> tuple[str, ...]:
@@ -66,21 +74,21 @@ def dictionary(data: Trajectories) -> tuple[str, ...]:
     return tuple(name for name in lengths(data.angles) if away or not name.startswith("r^"))
 
 
-def kept_structure(
-    data: Trajectories, base: Baseline, config: FitConfig, noisy: float, stages: Stages
-) -> tuple[FitConfig, Baseline]:
+def kept_structure(data: Trajectories, base: Baseline, config: FitConfig, stages: Stages) -> Structure:
     """What `structured` finds, or what the checkpoint remembers of it."""
     numbers = ("stiffness", "tilt", "rate", "start")
 
     def search() -> dict[str, Any]:
-        found, start = structured(data, base, config, noisy)
-        return {"config": found.to_dict(), "base": {name: getattr(start, name) for name in numbers}}
+        found = structured(data, base, config)
+        start = {name: getattr(found.base, name) for name in numbers}
+        return {"config": found.config.to_dict(), "base": start, "reason": found.reason}
 
-    found = stages.keep("structure", search)
-    return replace(FitConfig.from_dict(found["config"]), device=config.device), replace(base, **found["base"])
+    kept = stages.keep("structure", search)
+    found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
+    return Structure(found, replace(base, **kept["base"]), kept["reason"])
 
 
-def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: float) -> tuple[FitConfig, Baseline]:
+def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
     """Settings and starting values with the structure that the data show; unchanged where they show none.
 
     Parameters
@@ -91,30 +99,37 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig, noisy: flo
         The first look at it.
     config
         Settings of the fit.
-    noisy
-        One-step error, relative to the size of the motion, above which it is noise.
     """
-    joints, names = any(data.angles), dictionary(data)
+    joints, names, size = any(data.angles), dictionary(data), max(base.scale)
+
+    def without(reason: str) -> Structure:
+        return Structure(config, base, f"no dictionary of features: {reason}")
+
     linear = _linear(data, base, names)
     if linear is None:
-        return config, base
+        return without(f"too few samples for its {len(names)} coefficients")
     every, fit, x = linear
     start = fit.start(x)
-    if start is None or (joints and not _mass_turns(fit)):
-        return config, base
+    if start is None:
+        return without("it gives no positive mass")
+    if joints and not _mass_turns(fit):
+        return without("a mass that depends on the angles predicts held-out steps no better")
     first = _with(base, {name: tuple(values.tolist()) for name, values in start.items()}, names)
     rich = replace(config, level="forced", coupled=joints, diagonal=not joints, features=names, order=4)
     found, kept, rms = _short_fit(data.thinned(every), first, rich, every * base.max_step)
     if not (_moving(kept) if joints else kept):
-        return config, base
+        return without("the data need none of its features" + (" of the mass" if joints else ""))
     rich = replace(rich, features=kept)
-    if rms > noisy * max(base.scale):
-        if not joints and rms > MISSED * 6**0.5 * roughness(data):
-            return config, base
-        return replace(rich, order=2, objective="trajectory"), found
-    if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * max(base.scale)):
-        return replace(rich, order=2), found  # and a correction network for the rest
-    return replace(rich, objective="residual" if config.objective == "auto" else config.objective), found
+    words = f"{len(kept)} of {len(names)} features explain the steps to {rms / size:.1e} of the motion's size"
+    if rms > NOISY * size:
+        noise = NOISE_OF_R * roughness(data)
+        if not joints and rms > MISSED * noise:
+            return without(f"it misses steps by {rms:.2g}, noise by {noise:.2g}: a force is missing from it")
+        return Structure(replace(rich, order=2, objective="trajectory"), found, f"{words}: noise")
+    if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * size):
+        return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
+    objective = "residual" if config.objective == "auto" else config.objective
+    return Structure(replace(rich, objective=objective), found, f"{words}: exact")
 
 
 def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:
@@ -195,19 +210,19 @@ def _short_fit(
 ) -> tuple[Baseline, tuple[str, ...], float]:
     """Starting values, the features that stay and the one-step error of a short fit of order 4."""
     model, n = build_model(base, config, "potential"), data.dof
-    prior = make_prior(model, base, None)
+    prior = prior_of(model, base, None)
     most = ROWS * prior.start.numel() // n
     problem = ResidualProblem(model, data, max_step=max_step, sigma=1e-6 * max(base.scale), prior=prior, most=most)
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    still = problem.flat.index(POTENTIAL)[2 * n :]
-    moving = problem.flat.index(KINETIC) if KINETIC in problem.flat.names else still[:0]
+    still = problem.parameters.index(POTENTIAL)[2 * n :]
+    moving = problem.parameters.index(KINETIC) if KINETIC in problem.parameters.names else still[:0]
     features = [name for name in config.features if "v" not in name] + _moving(config.features)
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
-    relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT * max(base.scale)) ** 2)
+    relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.cat([still, moving]), r.numel())
-    values = {name: tuple(x[problem.flat.index(name)].tolist()) for name in problem.flat.names}
+    values = {name: tuple(x[problem.parameters.index(name)].tolist()) for name in problem.parameters.names}
     own = values[POTENTIAL][: 2 * n]  # −k, b of each angle; k/2, b of the others
     turn = [-1.0 if angle else 2.0 for angle in data.angles]
     values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))

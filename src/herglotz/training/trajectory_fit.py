@@ -4,48 +4,40 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.roughness import precision
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.training.baseline import Baseline
-from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
 from herglotz.training.first_states import first_states
-from herglotz.training.flat import FlatModel
-from herglotz.training.grid import segment_grid
-from herglotz.training.levenberg_marquardt import OptimiserResult, levenberg_marquardt
-from herglotz.training.lifted import Path
-from herglotz.training.prior import Prior
-from herglotz.training.robust import FAR, FEW, FREEDOM, far_out, heavy_tailed, scale_of
-from herglotz.training.shooting import ShootingProblem
-from herglotz.training.stages import Stages
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.least_squares import StatesOnly
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.robust import FAR, FEW, FREEDOM, far_out, heavy_tailed, scale_of
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
+from herglotz.training.solvers.lifted_newton import Path
+from herglotz.training.task import Task
 
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
 MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
+FLOOR = 1e-6  # of the largest |q|: errors below it are no reason to stop growing segments
+WIDER = (30.0, 900.0)  # times weaker priors: the next ranges start where the default one ends, the last at 5 baselines
+HALVED = 2.0  # factor by which a weaker prior has to lower the error of the shortest segments
+SMALL = 1e-2  # of the largest |q|: shortest segments that miss less lack no force as large as the baseline's
+NOT_THE_NOISE = 1.5  # times the data's precision; as in the verdict
+STAGE = 40  # iterations of a stage at most: a start near the optimum needs fewer, and a poor one is left by the next
 
 
 @dataclass(frozen=True)
 class TrajectoryFit:
-    """The chosen fit."""
-
-    theta: Tensor  # (P,)
-    problem: ShootingProblem
-    path: Path
-    sigma: float  # noise of q
-    departure: float | None  # prior strength, where the model has a potential network
-    held_out: dict[float, Tensor]  # error of every fold, for every strength tried
-    result: OptimiserResult
-
-
-@dataclass(frozen=True)
-class _Stage:
-    """A fit at one length of the segments."""
+    """A fit of parameters and segment states at one length of the segments and one strength of the prior."""
 
     theta: Tensor  # (P,)
     problem: ShootingProblem
@@ -59,45 +51,21 @@ class _Stage:
 
     @property
     def noise(self) -> float:
-        """Their scale."""
-        return _noise(self.problem, self.path)
+        """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
+        return scale_of(self.misfit) if self.problem.freedom else float(self.misfit.square().mean().sqrt())
 
+    def states(self) -> Tensor:
+        """The fitted trajectory at the samples, (N, 2n+1)."""
+        grid, x = self.problem.grid, self.path.x.flatten(0, 1)
+        out = x.new_empty(self.problem.data.samples, x.shape[-1])
+        out[grid.sample] = x[grid.node]
+        return out
 
-class StateEquations(Protocol):
-    """A problem over parameters and states, the parameters first, whose equations of the states can be had alone."""
-
-    def cost(self, x: Tensor) -> Tensor:
-        """See `LeastSquares`."""
-        ...
-
-    def normal_equations(self, x: Tensor, *, held: bool) -> tuple[Tensor, Any, Tensor]:
-        """See `LeastSquares`; `held`: of the states alone."""
-        ...
-
-
-class StatesOnly:
-    """Such a problem with the parameters held: only the states are fitted."""
-
-    def __init__(self, problem: StateEquations, theta: Tensor):
-        self.problem, self.theta = problem, theta
-
-    def full(self, states: Tensor) -> Tensor:
-        """All unknowns of the problem."""
-        return torch.cat([self.theta, states])
-
-    def cost(self, x: Tensor) -> Tensor:
-        """See `LeastSquares`."""
-        return self.problem.cost(self.full(x))
-
-    def normal_equations(self, x: Tensor) -> tuple[Tensor, Any, Tensor]:
-        """See `LeastSquares`."""
-        return self.problem.normal_equations(self.full(x), held=True)
-
-
-def make_prior(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior:
-    """The prior every objective uses, sized by the data."""
-    typical = min(v / s for v, s in zip(base.speed, base.scale, strict=True))
-    return Prior(model, base.low, base.high, departure=departure, weight=1.0, rate_spread=0.3 * typical)
+    def held_out_errors(self) -> Tensor:
+        """Of every fold, in units of q; see `cross_validation`."""
+        problem = self.problem
+        _, A, _ = problem.normal_equations(self.result.x)
+        return held_out_errors(problem, self.path, self.theta, A)
 
 
 def segment_lengths(data: Trajectories) -> list[int]:
@@ -129,76 +97,171 @@ def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> Non
     )
 
 
-def fit_trajectories(
-    model: ContactLagrangian,
-    data: Trajectories,
-    base: Baseline,
-    sigma: float,
-    departures: tuple[float, ...],
-    iterations: int,
-    stages: Stages,
-    *,
-    frozen: bool = False,
-    robust: str = "auto",
-    s: Tensor | None = None,
-) -> TrajectoryFit | None:
-    """Fit parameters and states to positions (or, `frozen`, the states alone).
+class SegmentStages:
+    """Fits of one model at growing segment lengths.
 
-    Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
-    the states of the one before. With `robust` "auto" the first stage is fitted with Student's t as well. Where that
-    shows outliers, and they are few, they are left out and least squares go on with the rest; where the rest has
-    outliers still, or they are many, Student's t is the loss of all further stages (`herglotz.training.robust`). Then
-    every prior strength is fitted in turn, the weakest first: its residuals give the noise that all strengths are
-    fitted with. The strongest prior whose held-out error is not beaten beyond its spread wins.
-
-    Returns
-    -------
-    TrajectoryFit or None
-        From the longest segments that could be fitted; None if the model cannot follow even the shortest.
+    Parameters
+    ----------
+    task
+        Data, first look, settings and stages.
+    model
+        Its current parameters are the start.
+    frozen
+        Fit the states alone.
+    s
+        (N,) s at every sample in the model's unit, where it is known.
+    label
+        What sets the names of these stages apart from those of others in the same fit.
     """
-    if model.potential.network is None or frozen:
-        departures = departures[:1]
-    theta, exact = FlatModel(model).get(), 1e-6 * max(base.scale)
 
-    def stage(
-        length: int, sigma: float, freedom: float | None, before: _Stage | None, used: Tensor | None = None
-    ) -> _Stage | None:
-        grid = segment_grid(data, length, base.model_step)
-        prior = make_prior(model, base, departures[0])
-        problem = ShootingProblem(model, data, grid, sigma=sigma, prior=prior, freedom=freedom, used=used, s=s)
+    def __init__(
+        self, task: Task, model: ContactLagrangian, *, frozen: bool = False, s: Tensor | None = None, label: str = ""
+    ):
+        self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
+        self.lengths = segment_lengths(task.data)
+
+    def fit(
+        self, length: int, sigma: float, freedom: float | None, before: TrajectoryFit | None, used: Tensor | None = None
+    ) -> TrajectoryFit | None:
+        """Segments of one length, from the states of the stage before; None where no path is found."""
+        task = self.task
+        grid = segment_grid(task.data, length, task.base.model_step)
+        problem = ShootingProblem(
+            self.model, task.data, grid, sigma=sigma, prior=prior_of(self.model, task.base, task.config.departures[0]),
+            freedom=freedom, used=used, s=self.s,
+        )  # fmt: skip
         if before is None:
-            start, states = theta, first_states(problem, theta)
+            start = problem.parameters.get()
+            states = first_states(problem, start)
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
-        result, found = _optimise(problem, start, states, name, iterations, stages, frozen)
-        path = problem.solve(problem.pack(found, result.x[-states.numel() :].reshape(states.shape)))
-        return None if path is None or not math.isfinite(result.cost) else _Stage(found, problem, path, result)
+        return self.optimise(problem, start, states, name)
 
-    freedom, used = (FREEDOM if robust == "on" else None), None
-    lengths = segment_lengths(data)
-    last = stage(lengths[0], sigma, freedom, None)
-    if last is None:
+    def optimise(self, problem: ShootingProblem, theta: Tensor, states: Tensor, name: str) -> TrajectoryFit | None:
+        """Minimise from these parameters and segment states; None where no path is found."""
+        target = StatesOnly(problem, theta) if self.frozen else problem
+        x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
+        total = min(self.task.config.iterations, STAGE)
+        result = self.task.stages.run(
+            name + self.label, x, total,
+            lambda x, callback: levenberg_marquardt(
+                target, x, max_iterations=total, rtol=1e-4, patience=3, callback=callback
+            ),
+        )  # fmt: skip
+        if not self.frozen:
+            theta = problem.unpack(result.x)[0]
+        path = problem.solve(problem.pack(theta, result.x[-states.numel() :].reshape(states.shape)))
+        return None if path is None or not math.isfinite(result.cost) else TrajectoryFit(theta, problem, path, result)
+
+    def shortest(self, sigma: float) -> TrajectoryFit | None:
+        """The shortest segments, from the samples."""
+        return self.fit(self.lengths[0], sigma, FREEDOM if self.task.config.robust == "on" else None, None)
+
+    def robust_or_not(self, first: TrajectoryFit) -> TrajectoryFit:
+        """The shortest segments, with Student's t or without the outliers where the data have any.
+
+        With `robust` "auto" they are fitted with Student's t as well. Where that shows outliers, and they are few, they
+        are left out and least squares go on with the rest; where the rest has outliers still, or they are many,
+        Student's t is the loss of all further stages (`problems.robust`).
+        """
+        length = self.lengths[0]
+        if self.task.config.robust != "auto":
+            return first
+        trial = self.fit(length, max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
+        if trial is None or not heavy_tailed(trial.misfit):
+            return first
+        rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
+        return trial if rest is None else rest
+
+    def grow(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit:
+        """From the shortest segments to whole trajectories, or as long as the model follows the data."""
+        last, best = first, first.noise
+        freedom = first.problem.freedom
+        used = None if bool(first.problem.used.all()) else first.problem.used
+        for length in self.lengths[1:]:
+            if not self.frozen:
+                sigma = last.noise if freedom else max(sigma, last.noise)
+            longer = self.fit(length, sigma, freedom, last, used)
+            if longer is None or (not self.frozen and longer.noise > LOST * max(best, FLOOR * self.task.size)):
+                break  # no parameters follow the data for so long: chaos, or forces that the model does not know
+            last, best = longer, min(best, longer.noise)
+        return last
+
+
+def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | None = None) -> TrajectoryFit | None:
+    """The states of the data with the parameters held; None if the model follows not even the shortest segments."""
+    stages = SegmentStages(task, model, frozen=True, s=s)
+    first = stages.fit(stages.lengths[0], sigma, None, None)
+    return None if first is None else stages.grow(first, sigma)
+
+
+def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[TrajectoryFit] | None:
+    """Fit parameters and states to positions.
+
+    Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
+    the states of the one before. Then every prior strength is fitted in turn, the weakest first: its residuals give the
+    noise that all strengths are fitted with. The strongest prior whose held-out error is not beaten beyond its spread
+    wins.
+
+    Returns
+    -------
+    Chosen or None
+        From the longest segments that could be fitted; None if the model cannot follow even the shortest.
+    """
+    if model.potential.network is None:
+        task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
+    stages, first = _wide_enough(task, model, sigma)
+    if first is None:
         return None
-    if robust == "auto" and not frozen:  # outliers stand out best where segments are short
-        trial = stage(lengths[0], max(scale_of(last.misfit), 1e-3 * exact), FREEDOM, None)
-        if trial is not None and heavy_tailed(trial.misfit):
-            rest = _without_outliers(trial, lambda sigma, used: stage(lengths[0], sigma, None, trial, used))
-            last, freedom, used = (trial, FREEDOM, None) if rest is None else (rest, None, rest.problem.used)
-    best = last.noise
-    for length in lengths[1:]:
-        if not frozen:
-            sigma = last.noise if freedom else max(sigma, last.noise)
-        longer = stage(length, sigma, freedom, last, used)
-        if longer is None or (not frozen and longer.noise > LOST * max(best, exact)):
-            break  # no parameters follow the data for so long: chaos, or forces that the model does not know
-        last, best = longer, min(best, longer.noise)
-    if frozen:
-        return TrajectoryFit(last.theta, last.problem, last.path, sigma, None, {}, last.result)
-    return _choose_departure(model, data, base, departures, iterations, stages, last)
+    departures = stages.task.config.departures
+    last = stages.grow(stages.robust_or_not(first), sigma)
+    previous, noise = last, last.noise
+
+    def fit(name: str, departure: float) -> TrajectoryFit | None:
+        nonlocal previous
+        old = previous.problem
+        problem = ShootingProblem(
+            model, task.data, old.grid, sigma=noise, prior=prior_of(model, task.base, departure), freedom=old.freedom,
+            used=old.used,
+        )  # fmt: skip
+        problem.path = previous.path
+        states = problem.states_at(previous.path, old.grid.start_sample)
+        found = stages.optimise(problem, previous.theta, states, name)
+        previous = found or previous
+        return found
+
+    # The weakest prior twice: the first round finds the noise, which then stays the same for all.
+    noise = (fit("noise", max(departures)) or last).noise
+    found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
+    return found or Chosen(last, departures[0], {})
 
 
-def _without_outliers(trial: _Stage, again: Callable[[float, Tensor], _Stage | None]) -> _Stage | None:
+def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:
+    """The stages whose range of priors lets the shortest segments follow the data, and the fit of these segments.
+
+    The range of the settings, if these segments are at the data's precision or miss less than 1 % of the motion. If
+    not, ranges weaker by 30 and 900 are tried, and taken where they halve the error: the baseline then lacks a force as
+    large as its own. Errors are those of the bulk, for outliers are no reason for another prior.
+    """
+    stages = SegmentStages(task, model)
+    first = stages.shortest(sigma)
+    enough = max(NOT_THE_NOISE * precision(task.data), SMALL * task.size)
+    for by in WIDER if len(task.config.departures) > 1 else ():
+        if first is not None and scale_of(first.misfit) <= enough:
+            break
+        weaker = tuple(departure * by for departure in task.config.departures)
+        wide = replace(task, config=replace(task.config, departures=weaker))
+        other = SegmentStages(wide, model, label=f", prior weaker by {by:g}")
+        found = other.shortest(sigma)
+        if found is not None and (first is None or scale_of(found.misfit) < scale_of(first.misfit) / HALVED):
+            stages, first = other, found
+    return stages, first
+
+
+def _without_outliers(
+    trial: TrajectoryFit, again: Callable[[float, Tensor], TrajectoryFit | None]
+) -> TrajectoryFit | None:
     """The same segments by least squares without the samples far from the robust fit; None if outliers remain.
 
     A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least squares,
@@ -214,71 +277,3 @@ def _without_outliers(trial: _Stage, again: Callable[[float, Tensor], _Stage | N
     if rest is None or heavy_tailed(rest.misfit) or float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR:
         return None
     return rest
-
-
-def _choose_departure(
-    model: ContactLagrangian,
-    data: Trajectories,
-    base: Baseline,
-    departures: tuple[float, ...],
-    iterations: int,
-    stages: Stages,
-    last: _Stage,
-) -> TrajectoryFit:
-    grid = last.problem.grid
-    first = TrajectoryFit(last.theta, last.problem, last.path, last.noise, departures[0], {}, last.result)
-    fits: list[TrajectoryFit] = []
-    held_out: dict[float, Tensor] = {}
-    previous = first
-    # The weakest prior twice: the first round finds the noise, which then stays the same for all.
-    weakest = max(departures)
-    for number, departure in enumerate([weakest, *sorted(departures, reverse=True)]):
-        sigma = _noise(previous.problem, previous.path) if number <= 1 else previous.sigma
-        prior = make_prior(model, base, departure)
-        problem = ShootingProblem(
-            model, data, grid, sigma=sigma, prior=prior, freedom=last.problem.freedom, used=last.problem.used
-        )
-        problem.path = previous.path
-        states = problem.states_at(previous.path, grid.start_sample)
-        name = f"prior {departure:g}" if number else "noise"
-        result, new_theta = _optimise(problem, previous.theta, states, name, iterations, stages, False)
-        cost, A, _ = problem.normal_equations(result.x)
-        if problem.path is None or not bool(torch.isfinite(cost)):
-            continue
-        previous = TrajectoryFit(new_theta, problem, problem.path, sigma, departure, held_out, result)
-        if number:
-            fits.append(previous)
-            held_out[departure] = held_out_errors(problem, problem.path, new_theta, A)
-    if not fits:
-        return first
-    chosen = simplest_not_beaten(held_out)
-    return next(f for f in fits if f.departure == chosen)
-
-
-def _optimise(
-    problem: ShootingProblem,
-    theta: Tensor,
-    states: Tensor,
-    name: str,
-    iterations: int,
-    stages: Stages,
-    frozen: bool,
-) -> tuple[OptimiserResult, Tensor]:
-    target = StatesOnly(problem, theta) if frozen else problem
-    x = states.reshape(-1) if frozen else problem.pack(theta, states)
-    total = min(iterations, 40)
-    result = stages.run(
-        name,
-        x,
-        total,
-        lambda x, callback: levenberg_marquardt(
-            target, x, max_iterations=total, rtol=1e-4, patience=3, callback=callback
-        ),
-    )
-    return result, theta if frozen else problem.unpack(result.x)[0]
-
-
-def _noise(problem: ShootingProblem, path: Path) -> float:
-    """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
-    misfit = problem.misfit(path)[problem.used[problem.grid.sample]]
-    return scale_of(misfit) if problem.freedom else float(misfit.square().mean().sqrt())

@@ -21,13 +21,15 @@ from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
-from herglotz.training.grid import segment_grid
-from herglotz.training.lifted import Path
-from herglotz.training.robust import FREEDOM
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.run import Run
-from herglotz.training.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.stages import Stages
-from herglotz.training.trajectory_fit import fit_trajectories, make_prior
+from herglotz.training.task import Task
+from herglotz.training.trajectory_fit import fit_states
 
 NULL = 1e-13  # eigenvalue, relative to the largest, that rounding leaves of a null direction
 
@@ -91,9 +93,9 @@ class Laplace:
         self.base = estimate_baseline(train, outliers=found, substeps=run.config.substeps)
         self.sigma = float(run.metrics["sigma"])
         departure = run.metrics.get("departure") or run.config.departures[-1]
-        self.prior = make_prior(run.model, self.base, departure)
+        self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, _starts(run), ~out)
-        self.theta = self.problem.flat.get()
+        self.theta = self.problem.parameters.get()
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         _, A, _ = self.problem.normal_equations(x)
         errors = held_out_errors(self.problem, self.path, self.theta, A)
@@ -135,8 +137,8 @@ class Laplace:
         if not 3 <= seen < min(data.lengths):
             raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
         head = _first(data, (seen,) * len(data))
-        settings = self.run.config.departures[:1], 1, Stages(False, None, "", resume=False)
-        found = fit_trajectories(self.run.model, head, self.base, self.sigma, *settings, frozen=True)
+        task = Task(head, self.base, replace(self.run.config, iterations=1), Stages(False, None, "", resume=False))
+        found = fit_states(task, self.run.model, self.sigma)
         if found is None or found.problem.grid.segments > len(data):
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
         problem, P, d = found.problem, len(self.theta), self.problem.d
@@ -166,12 +168,12 @@ class Laplace:
     def standard_deviations(self) -> dict[str, Tensor]:
         """Of every parameter, by name, in its own units."""
         P = len(self.theta)
-        return self.problem.flat.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
+        return self.problem.parameters.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
 
     def names(self) -> list[str]:
         """Every entry of the parameters θ by name: `damping.rate`, `potential.network.weights.0[3]`."""
-        flat = self.problem.flat
-        every = zip(flat.names, flat.sizes, strict=True)
+        parameters = self.problem.parameters
+        every = zip(parameters.names, parameters.sizes, strict=True)
         return [name if size == 1 else f"{name}[{i}]" for name, size in every for i in range(size)]
 
     def effective_parameters(self) -> float:
@@ -207,7 +209,7 @@ class Laplace:
         problem = ShootingProblem(
             self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom, used=used
         )
-        theta = problem.flat.get()
+        theta = problem.parameters.get()
         path = problem.solve(problem.pack(theta, start[:, : problem.d]))
         if path is None:
             raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")

@@ -23,7 +23,7 @@ from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residu
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, solve
 from herglotz.training import Prior, levenberg_marquardt
-from herglotz.training.flat import FlatModel
+from herglotz.training.parameter_vector import ParameterVector
 
 EXACT = 1e-8  # σ of the residuals relative to the motion's size
 Callback = Callable[[int, float, Tensor], None]
@@ -43,7 +43,7 @@ class FlowProblem:
     """
 
     def __init__(self, model: ContactLagrangian, before: State, after: State, h: float, chunk: int = 1024):
-        self.flat, self.before, self.after, self.chunk = FlatModel(model), before, after, chunk
+        self.parameters, self.before, self.after, self.chunk = ParameterVector(model), before, after, chunk
         self.h = before.s.new_tensor(h)
         self.momentum = float(before.p.square().mean().sqrt().clamp(min=1e-12))
         self.sigma = EXACT * float(max(model.config.scale))
@@ -52,7 +52,7 @@ class FlowProblem:
 
     def start(self) -> Tensor:
         """Return the parameters, (P,)."""
-        return self.flat.get()
+        return self.parameters.get()
 
     def residuals(self, theta: Tensor) -> Tensor:
         """Return the residuals, (T, 2n + 1), in units of q."""
@@ -75,7 +75,7 @@ class FlowProblem:
         return cost, A, b
 
     def _local(self, theta: Tensor, q0: Tensor, p0: Tensor, s0: Tensor, q1: Tensor, p1: Tensor, s1: Tensor) -> Tensor:
-        P = self.flat.partials(theta, q0, q1, s0, self.h, 2)
+        P = self.parameters.partials(theta, q0, q1, s0, self.h, 2)
         J = momentum_jacobian(P, p0)
         action = (s0 + P.L - s1) / self.momentum
         position, momentum = solve(J, momentum_residual(P, p0)), solve(J, momentum_plus(P) - p1)
@@ -119,5 +119,5 @@ def distil(
     problem = FlowProblem(model, before, after, h)
     result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3, callback=callback)
     new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)
-    FlatModel(new).set(result.x)
+    ParameterVector(new).set(result.x)
     return new, float(problem.residuals(result.x).square().mean().sqrt())

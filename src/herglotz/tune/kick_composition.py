@@ -25,7 +25,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Rollout, State, Status, Step
+from herglotz.stepping import OneStepMethod, State, Status, Step
 from herglotz.training import levenberg_marquardt
 
 LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
@@ -34,7 +34,7 @@ WEAK = 10.0  # σ of the prior on each number's distance from its start, relativ
 
 
 @dataclass(frozen=True)
-class KickStepper:
+class KickStepper(OneStepMethod):
     """A stepper of kicks and drifts, with `step` and `rollout` as `Stepper` has them, at its own h only.
 
     Parameters
@@ -117,14 +117,6 @@ class KickStepper:
         c = torch.exp(-self.rate * self.h + nan)
         status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
         return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
-
-    def rollout(self, q: Tensor, p: Tensor, s: Tensor | None = None, *, h: Tensor | float, steps: int) -> Rollout:
-        """Take `steps` equal steps from (q, p, s); s defaults to 0."""
-        states, taken = [State(q, p, torch.zeros_like(q[..., 0]) if s is None else s)], []
-        for _ in range(steps):
-            taken.append(self.step(states[-1], h))
-            states.append(taken[-1].state)
-        return Rollout.of(states, taken)
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain numbers for JSON."""

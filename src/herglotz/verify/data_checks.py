@@ -15,8 +15,8 @@ from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.stepping import State, solve
 from herglotz.training import Run
-from herglotz.training.grid import segment_grid
 from herglotz.training.inputs import step_inputs
+from herglotz.training.problems.grid import segment_grid
 from herglotz.verify.report import Check
 
 # Bound of the one-step error over that of uniform motion, the null model. A fitted model reaches 1e-2 and less on clean

@@ -1,29 +1,21 @@
 """The zoo: its motions are right, its draws repeatable, and its judgement knows a right model from a null one."""
 
-# ruff: noqa: E402
-# (benchmarks are scripts: their folder is put on the path below)
-
 import json
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-ROOT = Path(__file__).parents[3]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from zoo_systems.drawing import KINDS, draw, draw_mechanism
-from zoo_systems.judging import AT, AT_NOISE, SAID, SILENT, USE, outcome, relative, score
-from zoo_systems.known import fit_known
-from zoo_systems.mechanisms import Mechanism
-from zoo_systems.motion import exact_motion
-from zoo_systems.ours import complaint, trajectories
-from zoo_systems.prediction import MechanismModel, own_predictions, trained
-from zoo_systems.report import report, shares
-from zoo_systems.sindy import fit_sindy
-
-sys.path.remove(str(ROOT / "benchmarks"))
+from benchmarks.zoo import beyond, line, numbers
+from benchmarks.zoo_systems.drawing import KINDS, draw, draw_mechanism
+from benchmarks.zoo_systems.judging import AT, AT_NOISE, SAID, SILENT, USE, outcome, relative, score
+from benchmarks.zoo_systems.known import fit_known
+from benchmarks.zoo_systems.mechanisms import Mechanism
+from benchmarks.zoo_systems.motion import exact_motion
+from benchmarks.zoo_systems.ours import complaint, trajectories
+from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
+from benchmarks.zoo_systems.report import report, shares
+from benchmarks.zoo_systems.sindy import fit_sindy
 
 VALUES, SAMPLE = {"g": 1.0, "o0": 0.260806, "d0": 0.012981}, 2.5362090384317573  # of system 1 of zoo 1
 
@@ -181,3 +173,25 @@ def test_the_report_counts(pendulum):
     rows = [row, row | {"outcome": SILENT, "ahead_of_sindy": False}]
     assert shares(rows) == {AT: 0.5, USE: 0.0, SAID: 0.0, SILENT: 0.5, "ahead of SINDy": 0.5}
     assert "**failed silently**" in report(rows, 1, 60.0)
+
+
+def test_what_was_not_reached_is_null_in_json(pendulum):
+    # fails if a row holds Infinity or NaN, which JSON has not, or a table of such a row cannot be made
+    true = own_predictions(pendulum, MechanismModel(pendulum.mechanism))
+    row = pendulum.facts() | {"commit": "abc", "ahead_of_sindy": False, "outcome": SAID}
+    row |= {name: numbers(pendulum, true) | {"cpu_s": 1.0} for name in ("known", "sindy")}
+    row["ours"] = numbers(pendulum, None) | {"cpu_s": 150.0, "said": "too slow"}
+    json.dumps(row, allow_nan=False)
+    assert row["ours"]["score"] is None
+    assert row["known"]["score"] == max(row["known"][f"score_{part}"] for part in ("later", "unseen"))
+    assert "too slow" in report([row], 1, 150.0)
+    assert "not reached" in line(row)
+
+
+def test_how_far_unseen_motions_leave_what_was_trained_on(pendulum):
+    # fails if the held-out third counts as trained on, or a motion below the range is not seen
+    inside = replace(pendulum.train, truth=pendulum.train.truth[:, : trained(pendulum.train)])
+    assert beyond(replace(pendulum, test=inside)) == 0.0
+    for sign in (-1, 1):
+        far = replace(inside, truth=inside.truth + sign * 100.0 * pendulum.size)
+        assert beyond(replace(pendulum, test=far)) == pytest.approx(100.0, abs=1e-3)

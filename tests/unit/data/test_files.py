@@ -4,7 +4,6 @@ import os
 
 import pytest
 
-from herglotz.data import files
 from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
 
@@ -28,7 +27,7 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path, monkeypat
     def full(_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(files.os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(InputError, match="cannot be written"):
         write_atomically(path, b"new")
     assert path.read_bytes() == b"old"

@@ -4,10 +4,10 @@ import json
 
 import pytest
 import torch
-from test_pt2 import SMALL, beside, damped, model_of, states_of
+from export_models import model_of, states_of
 
 from herglotz.errors import InputError
-from herglotz.export import ExportedStepper, compare, export_aoti, load_pt2
+from herglotz.export import ExportedStepper, export_aoti
 from herglotz.export.metadata import describe
 from herglotz.stepping import State
 
@@ -51,26 +51,3 @@ def test_only_what_the_code_can_read_reaches_it():
         with pytest.raises(InputError):
             exported.step(State(q, p, s), h)
     assert len(seen) == 2
-
-
-@pytest.mark.slow  # a compiler run of 20–60 s for each
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-@pytest.mark.parametrize("level", ["affine", "forced"])
-def test_a_file_matches_the_eager_stepper(level, dtype, tmp_path):
-    # fails if the code is specialised to a batch, loses an input u, or a loop inside it is miscompiled
-    inputs = 2 if level == "forced" else 0
-    model = damped(level, dtype, inputs)
-    exported = load_pt2(export_aoti(model, tmp_path / "code.pt2", h=0.1, box=SMALL))
-    assert exported.kind == "aoti"
-    result = compare(exported, beside(model), batches=(1, 7, 1009, 4096), steps=1000)
-    assert max(result[key] for key in ("q", "p", "s", "c")) <= (1e-12 if dtype == torch.float64 else 1e-5), result
-    assert result["status"] == result["failed"] == 0
-    q, p, s = states_of(1, 3, dtype)
-    u = (torch.linspace(-1, 1, 6).reshape(3, 2).to(q),) if inputs else ()
-    ours = exported.init(q, q + 0.1 * p, s, 0.1, *u)
-    with torch.no_grad():
-        eager = beside(model).init(q, q + 0.1 * p, s, 0.1, *u)
-    for a, b in zip(ours, eager, strict=True):
-        torch.testing.assert_close(a, b)
-    outside = exported.programs["rollout"](q + 100, p, s, torch.full((1, 3), 0.1).to(q), *(x[None] for x in u))
-    assert outside[6].tolist() == exported.outside_box(State(q + 100, p, s))[None].to(torch.uint8).tolist()

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 import torch
-from test_pt2 import BOX, model_of, states_of
+from export_models import BOX, model_of, states_of
 
 import herglotz
 from herglotz.errors import InputError

@@ -1,4 +1,4 @@
-"""Features in C: every function they are made of, up to 32 coordinates, and the terms that C does not know."""
+"""Features in C: every function they are made of, up to 32 coordinates."""
 
 import shutil
 from typing import Any
@@ -6,8 +6,7 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.errors import InputError
-from herglotz.export import compile_c, export_c
+from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 
@@ -55,18 +54,3 @@ def test_features_step_in_c_as_they_do_in_eager(tmp_path, monkeypatch, name, dty
     torch.testing.assert_close(out.p, expected.p, rtol=tol, atol=tol)
     torch.testing.assert_close(out.s, expected.s, rtol=tol, atol=10 * tol)
     CASES[name].double()
-
-
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        ({"features": ("cos(q1 - q2) v1 v2",)}, "features of the velocity cannot be written as C"),
-        ({"level": "forced", "coupled": True}, "coupled friction cannot be written as C"),
-        ({"order": 4, "potential_width": 0}, "the rule of order 4 cannot be written as C"),
-    ],
-)
-def test_terms_without_c_are_refused_by_name(tmp_path, settings, words):
-    # fails if a term is left out of the file in silence
-    sizes: dict[str, Any] = {name: (1.0,) * 2 for name in ("scale", "speed", "stiffness", "tilt")}
-    with pytest.raises(InputError, match=words):
-        export_c(ContactLagrangian(ModelConfig(angles=(True,) * 2, **sizes, **settings)), tmp_path / "x.h", h=0.1)

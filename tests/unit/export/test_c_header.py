@@ -296,7 +296,7 @@ def test_metadata(tmp_path):
     assert (entries["level"], entries["h"], entries["units"], entries["note"]) == ("affine", 0.25, ["rad"], "*/ ?")
     assert entries["box"] == BOX
     assert f'_weights_sha256[] = "{weights_digest(model)}"' in text
-    assert "herglotz_stepper_q_low[herglotz_stepper_N] = {-1.0}" in text
+    assert "stepper_q_low[stepper_N] = {-1.0}" in text
     assert "@" not in text
 
 

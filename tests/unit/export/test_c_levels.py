@@ -1,5 +1,6 @@
 """C for every level of the ladder: it computes what the eager stepper does, in float64 and in float32."""
 
+import functools
 import shutil
 from typing import Any
 
@@ -29,7 +30,14 @@ CASES: dict[str, dict[str, Any]] = {
     "full, correction": {"level": "full", "correction_width": 4, "activation": "silu", "mass_width": 3},
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},
-}
+    "coupled": {"level": "forced", "coupled": True},
+    "velocities": {"level": "linear", "features": ("cos(q1) v1 v2", "q2^2 v2^2")},
+    "order 4": {"level": "linear", "order": 4, "potential_width": 0, "features": ("q2^4", "cos(q1) v1 v2")},
+    "order 4, coupled motors": {
+        "level": "forced", "order": 4, "potential_width": 0, "inputs": 1, "coupled": True, "coulomb": True,
+        "features": ("q2^4",),
+    },
+}  # fmt: skip
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -69,6 +77,18 @@ def problem(case, steps, dtype=torch.float64):
     return model, State(x[:, :2], x[:, 2:4], x[:, 4]), options
 
 
+@functools.cache
+def compiled_of(case, dtype=torch.float64):
+    """The compiled stepper of a case, made once for all tests."""
+    return compile_c(damped(case).to(dtype))
+
+
+def blocks(found):
+    """All derivatives of a step side by side."""
+    parts = [found.by_state, found.by_h[..., None], *(() if found.by_input is None else (found.by_input,))]
+    return torch.cat([x.double() for x in parts], -1)
+
+
 def one(b, states, options):
     """Sample b by itself."""
     inputs = {"inputs": options["inputs"][b]} if "inputs" in options else {}
@@ -85,7 +105,7 @@ def test_every_level_agrees_with_the_eager_stepper(case):
     model, states, options = problem(case, 60)
     with torch.no_grad():
         eager = Stepper(model, tol=4e-16).rollout(*states, **options)
-    compiled = compile_c(model)
+    compiled = compiled_of(case)
     ours = compiled.rollout(*states, **options)
     assert eager.ok.all()
     assert ours.ok.all()
@@ -96,11 +116,40 @@ def test_every_level_agrees_with_the_eager_stepper(case):
         assert relative(getattr(single, name), getattr(ours, name)[0]) <= 1e-12, name
 
 
-@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full"])
+@pytest.mark.parametrize("case", CASES)
+def test_the_derivative_of_a_step_is_that_of_the_eager_stepper(case):
+    # fails if a block is written to another's place, the map of the inputs is left out, or a term has no derivative
+    model, state, options = problem(case, 1)
+    u = options["inputs"][:, 0] if "inputs" in options else None
+    wanted = blocks(Stepper(model, tol=4e-16).linearise(state, H, u))
+    found = compiled_of(case).linearise(state, H, u)
+    assert (blocks(found) - wanted).abs().max() <= 1e-10 * wanted.abs().max()
+
+
+@pytest.mark.parametrize("case", ["linear", "motors"])
+def test_the_derivative_in_float32(case):
+    # fails if the Jacobian in float is made from numbers of another type
+    model, state, options = problem(case, 1)
+    u = options["inputs"][:, 0] if "inputs" in options else None
+    wanted = blocks(Stepper(model, tol=4e-16).linearise(state, H, u))
+    small = State(*(x.float() for x in state))
+    found = blocks(compiled_of(case, torch.float32).linearise(small, H, None if u is None else u.float()))
+    assert (found - wanted).abs().max() <= 2e-5 * wanted.abs().max()
+
+
+def test_a_failed_step_has_no_derivative():
+    # fails if a step without a solution has a derivative that looks like one
+    _, state, _ = problem("affine, tanh", 1)
+    found = compiled_of("affine, tanh").linearise(State(state.q, state.p * 1e200, state.s), H)
+    assert bool((found.step.status != 0).all())
+    assert bool(torch.isnan(found.by_state).all())
+
+
+@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4"])
 def test_float32_keeps_its_digits_over_many_steps(case):
     # fails if c is multiplied into p or sigma: 1 + E rounds, and 1000 steps add it up to 3e-5
     model, states, options = problem(case, 1000, torch.float32)
-    compiled = compile_c(model)
+    compiled = compiled_of(case, torch.float32)
     ours, single = compiled.rollout(*states, **options), compiled.rollout(*(x[0] for x in states), **options)
     wide = State(*(x.double() for x in states))
     exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=1000)
@@ -116,7 +165,7 @@ def test_float32_keeps_its_digits_over_many_steps(case):
 def test_no_inputs_is_not_a_missing_input():
     # fails if the C reads inputs where there are none, or the input of another step
     model, states, options = problem("motors", 20)
-    compiled = compile_c(model)
+    compiled = compiled_of("motors")
     still = {**options, "inputs": torch.zeros_like(options["inputs"])}
     free = {k: v for k, v in options.items() if k != "inputs"}
     assert torch.equal(compiled.rollout(*states, **still).q, compiled.rollout(*states, **free).q)
@@ -133,9 +182,9 @@ def test_no_inputs_is_not_a_missing_input():
 @pytest.mark.parametrize("change", [{"inputs": torch.zeros(20, 2)}, {"inputs": torch.zeros(3, 19, 3)}])
 def test_wrong_inputs_are_refused(change):
     # fails if a wrong number of motors or of steps reaches C, where it would read other memory
-    model, states, options = problem("motors", 20)
+    _, states, options = problem("motors", 20)
     with pytest.raises(InputError, match="u needs 3"):
-        compile_c(model).rollout(*states, **{**options, "inputs": change["inputs"].double()})
+        compiled_of("motors").rollout(*states, **{**options, "inputs": change["inputs"].double()})
 
 
 def test_the_terms_of_the_full_level_and_of_the_mass_are_seen():
@@ -157,7 +206,7 @@ def test_init_of_the_new_terms(case):
     model, (q, p, s), _ = problem(case, 1)
     with torch.no_grad():
         eager = Stepper(model).init(q, q + 0.1 * p, s, H)
-    for ours, theirs in zip(compile_c(model).init(q, q + 0.1 * p, s, H), eager, strict=True):
+    for ours, theirs in zip(compiled_of(case).init(q, q + 0.1 * p, s, H), eager, strict=True):
         assert relative(ours, theirs) <= 1e-13
 
 
@@ -166,7 +215,7 @@ def test_viscous_friction_needs_no_iteration():
     model, states, _ = problem("viscous, motors", 1)
     h = torch.tensor([0.1, 0.3, 0.1, 0.2], dtype=torch.float64)
     u = torch.ones(4, 2, dtype=torch.float64)
-    ours = compile_c(model).rollout(*states, h=h, inputs=u)
+    ours = compiled_of("viscous, motors").rollout(*states, h=h, inputs=u)
     with torch.no_grad():
         eager = Stepper(model).rollout(*states, h=h, inputs=u)
     assert bool((ours.residual == 0).all())

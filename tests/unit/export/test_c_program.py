@@ -177,18 +177,20 @@ int main(void) {
   int i, j;
   P.q0[0] = 0.3; P.q0[1] = -0.7; P.p0[0] = 0.4; P.p0[1] = 0.9; P.s0 = 0.8; P.h = 0.1;
   arm_potential(P.q0, &P.V0);
+  arm_prepare(&P);
+  arm_begin(&P, up.move);
   at.move[0] = 0.05;
   at.move[1] = -0.02;
-  arm_evaluate(&P, 2, &at);
+  arm_evaluate(&P, &at);
   for (j = 0; j < 2; j++) {
     for (i = 0; i < 2; i++) up.move[i] = down.move[i] = at.move[i];
     up.move[j] += 1e-5;
     down.move[j] -= 1e-5;
-    arm_evaluate(&P, 1, &up);
-    arm_evaluate(&P, 1, &down);
+    arm_evaluate_first(&P, &up);
+    arm_evaluate_first(&P, &down);
     for (i = 0; i < 2; i++) {
-      worst = fmax(worst, fabs((up.F[i] - down.F[i]) / 2e-5 - at.J[i][j]));
-      size = fmax(size, fabs(at.J[i][j] + 10.0 * (i == j)));
+      worst = fmax(worst, fabs((up.F[i] - down.F[i]) / 2e-5 - at.J[i * 2 + j]));
+      size = fmax(size, fabs(at.J[i * 2 + j] + 10.0 * (i == j)));
     }
   }
   printf("%g %g\\n", worst, size);

@@ -8,60 +8,18 @@ import zipfile
 import pytest
 import torch
 import torch.export.pt2_archive._package
+from export_models import BOX, SMALL, model_of, states_of
 
-import herglotz.export.pt2
+import herglotz.export.lower.pt2
 from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compare, export_pt2, load_pt2, weights_digest
-from herglotz.export.equation import Equations, eliminate
 from herglotz.export.metadata import FORMAT
-from herglotz.export.module import RolloutModule, StepModule
-from herglotz.export.newton import Newton, status_of
+from herglotz.export.newton import status_of, unfinished
+from herglotz.export.step import StepGraphs
 from herglotz.mechanics import flow_derivative, partials, step_derivative
-from herglotz.models import LEVELS, ContactLagrangian, ModelConfig
+from herglotz.models import ModelConfig
 from herglotz.stepping import State, Status, Stepper
-
-SIZES = (("q", 2, 1.0), ("p", 2, 1.0), ("s", 1, 0.5))
-BOX = {name + end: [sign * x] * n for name, n, x in SIZES for end, sign in (("_low", -1), ("_high", 1))}
-SMALL = {key: [0.5 * x for x in values[:1]] for key, values in BOX.items()}
-
-
-def model_of(n, level, correction=0, dtype=torch.float64):
-    """A model whose every parameter is random."""
-    ones, make = (1.0,) * n, torch.Generator().manual_seed(n)
-    angles = tuple(i % 2 == 0 for i in range(n))
-    config = ModelConfig(
-        angles, level, ones, ones, ones, (0.0,) * n, potential_width=4, damping_width=4, correction_width=correction
-    )
-    model = ContactLagrangian(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
-    return model.to(dtype)
-
-
-def damped(level, dtype, inputs=0):
-    """One coordinate, and motions that die out at rate 0.3 (at all levels but the conservative one)."""
-    one, make = (1.0,), torch.Generator().manual_seed(1)
-    config = ModelConfig(
-        (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs,
-        input_zero=inputs > 0,
-    )  # fmt: skip
-    model = ContactLagrangian(config)
-    with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
-    return model.to(dtype)
-
-
-def beside(model):
-    """The eager stepper with Newton to rounding: at its own tolerance (64 eps of q) it is itself 1e-12 off."""
-    double = next(model.parameters()).dtype == torch.float64
-    return Stepper(model, tol=1e-15 if double else None)
-
-
-def states_of(n, batch, dtype=torch.float64, seed=0):
-    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
-    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+from herglotz.stepping.linearise import eliminate
 
 
 @pytest.fixture(scope="module")
@@ -88,95 +46,6 @@ def test_a_file_matches_the_eager_stepper_at_every_batch_size(written):
     assert max(result[key] for key in ("q", "p", "s", "c")) <= 1e-12, result
     assert result["status"] == result["failed"] == 0
     assert result["same_weights"] is True
-
-
-def test_a_step_and_the_loop_inside_the_file_agree(written):
-    # fails if the rollout's guess, its carry or its per-step h differ from single steps
-    q, p, s = states_of(2, 3)
-    h = torch.tensor([0.1, 0.2, 0.05, 0.05], dtype=torch.float64)
-    whole, state = written[2].rollout(q, p, s, h=h), State(q, p, s)
-    for k in range(4):
-        with torch.no_grad():
-            step = written[2].step(state, h[k])
-        state = step.state
-        torch.testing.assert_close(whole.q[:, k + 1], state.q, rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(whole.sigma[:, k + 1] / whole.sigma[:, k], step.c, rtol=1e-12, atol=0)
-
-
-def test_a_file_starts_from_positions(written):
-    # fails if init returns the momentum of FL⁻, or s0 in place of s1
-    model, _, exported = written
-    q0, delta, s0 = states_of(2, 5)
-    ours = exported.init(q0, q0 + 0.1 * delta, s0, 0.1)
-    with torch.no_grad():
-        eager = Stepper(model).init(q0, q0 + 0.1 * delta, s0, 0.1)
-    for a, b in zip(ours, eager, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-@pytest.mark.parametrize("level", LEVELS)
-def test_every_level_over_a_thousand_steps(level, dtype, tmp_path):
-    # fails if a level's graph is wrong, or a float64 constant turns a float32 result into float64
-    model = damped(level, dtype)
-    exported = load_pt2(export_pt2(model, tmp_path / "level.pt2", h=0.1, box=SMALL))
-    result = compare(exported, beside(model), batches=(1, 1009, 4096), steps=1000)
-    assert max(result[key] for key in ("q", "p", "s", "c")) <= (1e-12 if dtype == torch.float64 else 1e-5), result
-    assert result["status"] == result["failed"] == 0
-    with torch.no_grad():
-        assert exported.step(states_of(1, 2, dtype), 0.1).state.q.dtype == dtype
-
-
-@pytest.mark.parametrize("level", LEVELS)
-def test_the_graphs_of_every_level_step_like_the_model(level):
-    # fails if a level's trace keeps the batch it was traced with, loses an input u, or folds what is no constant
-    model = damped(level, torch.float64, inputs=2 if level == "forced" else 0)
-    step, rollout = StepModule(model), RolloutModule(model)
-    q, p, s = states_of(1, 5)
-    h = torch.tensor([0.1, 0.2, 0.15, 0.1], dtype=torch.float64)
-    u = torch.linspace(-1, 1, 40, dtype=torch.float64).reshape(5, 4, 2) if level == "forced" else None
-    with torch.no_grad():
-        eager = beside(model).rollout(q, p, s, h=h, inputs=u)
-        rows, first = ((), ()) if u is None else ((u.transpose(0, 1),), (u[:, 0],))
-        q_all, _, s_all, _, _, status = rollout(q, p, s, h[:, None].expand(4, 5), *rows)
-        one = step(q, p, s, h[:1].expand(5), *first)
-    assert not status.any()
-    torch.testing.assert_close(q_all.transpose(0, 1), eager.q[:, 1:], rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(s_all.transpose(0, 1), eager.s[:, 1:], rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(one[0], eager.q[:, 1], rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(one[1], eager.p[:, 1], rtol=1e-12, atol=1e-12)
-
-
-def test_a_saved_file_takes_inputs(tmp_path):
-    # fails if u is lost in the file, or reaches another sample or step than its own, or 0 stands for no input: the zero
-    # of a sensor is another number
-    model = damped("forced", torch.float64, inputs=2)
-    exported = load_pt2(export_pt2(model, tmp_path / "driven.pt2", h=0.1))
-    q, p, s = states_of(1, 3)
-    u = torch.linspace(-1, 1, 3 * 4 * 2, dtype=torch.float64).reshape(3, 4, 2)
-    with torch.no_grad():
-        ours, eager = (
-            exported.rollout(q, p, s, h=0.1, inputs=u),
-            beside(model).rollout(q, p, s, h=0.1, inputs=u),
-        )
-        one, first = exported.step(State(q, p, s), 0.1, u[:, 0]), beside(model).step(State(q, p, s), 0.1, u=u[:, 0])
-        start, other = (
-            exported.init(q, q + 0.1 * p, s, 0.1, u[:, 0]),
-            beside(model).init(q, q + 0.1 * p, s, 0.1, u[:, 0]),
-        )
-    for name in ("q", "p", "s"):
-        torch.testing.assert_close(getattr(ours, name), getattr(eager, name), rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(getattr(one.state, name), getattr(first.state, name), rtol=1e-12, atol=1e-12)
-        torch.testing.assert_close(getattr(start, name), getattr(other, name), rtol=1e-12, atol=1e-12)
-    for bad in (u[..., :1], u.float(), u * torch.nan, u[:2], u[0, 0]):
-        with pytest.raises(InputError, match=r"input|finite"):
-            exported.rollout(q, p, s, h=0.1, steps=4, inputs=bad)
-    shared = exported.rollout(q, p, s, h=0.1, inputs=u[1], every=2)
-    torch.testing.assert_close(shared.q[1], ours.q[1, ::2], rtol=1e-14, atol=0)
-    with torch.no_grad():
-        idle, other = exported.rollout(q, p, s, h=0.1, steps=4), beside(model).rollout(q, p, s, h=0.1, steps=4)
-    torch.testing.assert_close(idle.q, other.q, rtol=1e-12, atol=1e-12)
 
 
 def test_the_derivative_of_a_file_is_that_of_the_implicit_function_theorem(written):
@@ -290,12 +159,11 @@ def test_a_failed_sample_is_nan_and_leaves_its_neighbours_alone(written):
 
 def newton(model, iterations, q, p, s, h):
     """The loop of the exported graphs, turned by hand."""
-    equations, h = Equations.of(model), torch.full_like(s, h)
-    solver = Newton(equations.newton, iterations, max(model.config.speed))
-    assert equations.field is not None
-    carry, problem = solver.start(q, s, torch.zeros_like(q)), (q, p, s, h, *equations.field(q))
-    while bool(solver.unfinished(carry[0], carry[1])):
-        carry = solver.iterate(problem, carry, solver.equation.constants)
+    graphs, h = StepGraphs(model), torch.full_like(s, h)
+    state, here, (trail,), _ = graphs.layout.split(graphs.start(q, p, s))
+    carry = graphs.begin(h, trail)
+    while bool(unfinished(carry[0], carry[1], iterations)):
+        carry = graphs.iterate(*state, h, *carry, *here)
     _, done, x, delta, merit, _, _, _, L, c = carry
     return q + x, status_of(h, merit, delta.abs().amax(-1), done, L, c), delta.abs().amax(-1)
 
@@ -401,7 +269,7 @@ def test_files_of_others_are_refused(tmp_path):
     later = {"format": 99, "dof": 1, "dtype": "float64", "h": 0.1, "box": None}
     later |= {"newton_iterations": 2, "newton_tolerance": 0.0}
     torch.export.save(program, tmp_path / "later.pt2", extra_files={"metadata.json": json.dumps(later)})
-    with pytest.raises(InputError, match="format 99, this herglotz reads 2"):
+    with pytest.raises(InputError, match="format 99, this herglotz reads 3"):
         load_pt2(tmp_path / "later.pt2")
 
 
@@ -434,7 +302,7 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
 
 def test_an_unwritable_path_is_refused(tmp_path, monkeypatch):
     # fails if torch's error reaches the user or a partial file stays behind
-    monkeypatch.setattr(herglotz.export.pt2, "_program", lambda *_, **__: None)  # what is written does not matter here
+    monkeypatch.setattr(herglotz.export.lower.pt2, "programs_of", lambda *_: {})  # what is written does not matter here
     monkeypatch.setattr(torch.export.pt2_archive._package, "package_pt2", lambda *_, **__: None)
     with pytest.raises(InputError, match="cannot be written"):
         export_pt2(model_of(1, "linear"), tmp_path / "nowhere" / "a.pt2", h=0.1)

@@ -15,7 +15,7 @@ from herglotz.models.feature_grammar import HIGHEST_POWER
 from herglotz.models.features import LIBRARIES, expand, parse
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.training.residual import MANY, ResidualProblem
+from herglotz.training.problems.one_step import MANY, ResidualProblem
 
 ANGLES, LENGTHS = (True, True), (False, False)
 

@@ -20,7 +20,8 @@ def at(force, **changes):
 
 
 def state(x, v, s=0.0, m=2.0):
-    return tuple(torch.tensor(y, dtype=torch.float64) for y in ([[x]], [[m * v]], [s]))
+    q, p, s = (torch.tensor(y, dtype=torch.float64) for y in ([[x]], [[m * v]], [s]))
+    return q, p, s
 
 
 def slip(t, a, g, x, v):

@@ -9,7 +9,7 @@ from herglotz.data import simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import Prior, ResidualProblem, adam
-from herglotz.training.supervision import SupervisedProblem
+from herglotz.training.problems.supervised import SupervisedProblem
 
 
 class Line:

@@ -68,7 +68,7 @@ def test_expected_triples_weigh_by_their_own_error(data):
     both = ResidualProblem(model, data, sigma=0.1, expected=(more, 0.5))
     x = plain.start()
     torch.testing.assert_close(both.residuals(x), plain.residuals(x))
-    r = both._all(x)[both.recorded :]
+    r = both.all_residuals(x)[both.recorded :]
     torch.testing.assert_close(both.cost(x), plain.cost(x) + (r / 0.5).square().sum() / 2)
     cost, _, gradient = both.normal_equations(x)
     torch.testing.assert_close(cost, both.cost(x))

@@ -17,10 +17,10 @@ from herglotz.training import distributed
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.build import build_model
+from herglotz.training.task import build_model
 from herglotz.training.distributed import is_first, process_group
-from herglotz.training.matrix_free import MatrixFree
-from herglotz.training.trajectory_fit import make_prior
+from herglotz.training.solvers.matrix_free import MatrixFree
+from herglotz.training.problems.prior import prior_of
 
 torch.set_num_threads(1)
 distributed.LEAST = 8  # there are few rows, and each process shall have some
@@ -42,7 +42,7 @@ with process_group():
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
     base = estimate_baseline(data)
     model = build_model(base, FitConfig(correction_width=5, level="linear"), "correction")
-    problem = MatrixFree(ResidualProblem(model, data, sigma=1e-3, prior=make_prior(model, base, None)))
+    problem = MatrixFree(ResidualProblem(model, data, sigma=1e-3, prior=prior_of(model, base, None)))
     x = problem.problem.start()
     cost, curvature, b = problem.normal_equations(x)
     step = curvature.solve(-b, 0.3 * curvature.diagonal(), tol=1e-13)

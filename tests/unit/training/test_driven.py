@@ -24,8 +24,8 @@ from herglotz.training import (
     save_run,
     select,
 )
-from herglotz.training.grid import segment_grid
 from herglotz.training.inputs import step_inputs
+from herglotz.training.problems.grid import segment_grid
 from herglotz.verify import verify
 
 SIZES: dict[str, Any] = {"scale": (1.5,), "speed": (1.5,), "stiffness": (1.0,), "tilt": (0.0,)}
@@ -86,7 +86,7 @@ def test_gradients_with_inputs_match_finite_differences(objective):
         problem = ShootingProblem(model, data, segment_grid(data, 9, 0.3), sigma=0.1, prior=prior, freedom=4.0)
         i = problem.grid.start_sample
         velocity = (data.q[i + 1] - data.q[i]) / (data.t[i + 1] - data.t[i])[:, None]
-        x = problem.pack(problem.flat.get(), problem.states(data.q[i], velocity))
+        x = problem.pack(problem.parameters.get(), problem.states(data.q[i], velocity))
     cost, _, b = problem.normal_equations(x)
     assert float(cost) == pytest.approx(float(problem.cost(x)), rel=1e-12)
     make = torch.Generator().manual_seed(0)

@@ -12,7 +12,7 @@ from herglotz.scenes import reference_solve, scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.trajectory_fit import make_prior
+from herglotz.training.problems.prior import prior_of
 
 
 def build(config) -> Any:
@@ -25,7 +25,7 @@ def one_step_fit(data, iterations=40, s0=None, **settings) -> tuple[Any, torch.T
     base = estimate_baseline(data)
     sizes = {k: getattr(base, k) for k in ("angles", "scale", "speed", "stiffness", "tilt", "rate")}
     model = build(replace(ModelConfig(**sizes, damping_width=6), **settings))
-    problem = ResidualProblem(model, data, sigma=1e-8, prior=make_prior(model, base, 6e-3))
+    problem = ResidualProblem(model, data, sigma=1e-8, prior=prior_of(model, base, 6e-3))
     t = problem.triples
     held = torch.arange(len(t)) % 3 == 2
     problem.triples = pick(t, ~held)
@@ -33,7 +33,7 @@ def one_step_fit(data, iterations=40, s0=None, **settings) -> tuple[Any, torch.T
     if s0 is not None and problem.latents:
         x[-problem.latents :] = s0
     x = levenberg_marquardt(problem, x, max_iterations=iterations).x
-    problem.flat.set(x[: len(problem.flat.get())])
+    problem.parameters.set(x[: len(problem.parameters.get())])
     problem.triples = pick(t, held)
     return model, problem.residuals(x)
 

@@ -11,9 +11,9 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.levenberg_marquardt import _damped_step
-from herglotz.training.matrix_free import DENSE, Curvature, MatrixFree
-from herglotz.training.trajectory_fit import make_prior
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.solvers.levenberg_marquardt import _damped_step
+from herglotz.training.solvers.matrix_free import DENSE, Curvature, MatrixFree
 
 
 def problem_of(width, freedom=None, chunk=4096, sigma=1e-3, trajectories=6):
@@ -21,7 +21,7 @@ def problem_of(width, freedom=None, chunk=4096, sigma=1e-3, trajectories=6):
     base = estimate_baseline(data)
     sizes = {k: getattr(base, k) for k in ("angles", "scale", "speed", "stiffness", "tilt", "rate")}
     model = ContactLagrangian(ModelConfig(**sizes, potential_width=0, correction_width=width))
-    prior = make_prior(model, base, 6e-3)
+    prior = prior_of(model, base, 6e-3)
     return ResidualProblem(model, data, sigma=sigma, prior=prior, freedom=freedom, chunk=chunk)
 
 
@@ -116,7 +116,7 @@ def test_fit_takes_products_beyond_a_size(monkeypatch):
         made.append(len(problem.start()))
         return MatrixFree(problem)
 
-    module = sys.modules["herglotz.training.fit"]
+    module = sys.modules["herglotz.training.one_step_fit"]
     monkeypatch.setattr(module, "MatrixFree", watched)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=20, h=0.5, seed=0)
     settings = FitConfig(objective="residual", correction_width=4, iterations=2, train_fraction=1.0)

@@ -10,11 +10,12 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt, lifted
+from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
-from herglotz.training.grid import segment_grid
-from herglotz.training.lifted import solve_path
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.solvers import lifted_newton
+from herglotz.training.solvers.lifted_newton import solve_path
 from herglotz.training.stages import Stages
 
 
@@ -32,7 +33,7 @@ def model_of(level, n=1, seed=0, **settings):
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """The steps' derivatives by parts of 20, so that there are several."""
-    monkeypatch.setattr(lifted, "CHUNK", 20)
+    monkeypatch.setattr(lifted_newton, "CHUNK", 20)
 
 
 def data_of(n=1, gaps=2, noise=0.01):
@@ -59,7 +60,7 @@ def shooting_problem(level, n=1):
     problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=0.1, prior=prior)
     starts = problem.grid.start_sample
     velocity = (data.q[starts + 1] - data.q[starts]) / (data.t[starts + 1] - data.t[starts])[:, None]
-    return problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], velocity))
+    return problem, problem.pack(problem.parameters.get(), problem.states(data.q[starts], velocity))
 
 
 @pytest.mark.parametrize("level", ["linear", "affine"])
@@ -156,9 +157,10 @@ def test_lifted_solution_is_the_stepped_one():
         theta, states = problem.unpack(x)
         start = torch.cat([states, states.new_zeros(len(states), 3 - states.shape[1])], -1)
         rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
-        path = solve_path(problem.flat, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
+        path = solve_path(problem.parameters, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
         with torch.no_grad():
-            out = Stepper(problem.flat.at(theta)).rollout(start[:, :1], start[:, 1:2], start[:, 2], h=problem.grid.h)
+            stepper = Stepper(problem.parameters.at(theta))
+            out = stepper.rollout(start[:, :1], start[:, 1:2], start[:, 2], h=problem.grid.h)
         assert path is not None
         torch.testing.assert_close(path.x[..., 0], out.q[..., 0], rtol=1e-9, atol=1e-10)
         torch.testing.assert_close(path.x[..., 2], out.s, rtol=1e-9, atol=1e-10)
@@ -246,7 +248,7 @@ def test_held_out_errors_are_those_of_a_refit():
         problem.weights = weights
         starts = problem.grid.start_sample
         v = (data.q[starts + 1] - data.q[starts]) / 0.2
-        result = levenberg_marquardt(problem, problem.pack(problem.flat.get(), problem.states(data.q[starts], v)))
+        result = levenberg_marquardt(problem, problem.pack(problem.parameters.get(), problem.states(data.q[starts], v)))
         return problem, result.x
 
     everything = torch.ones(data.samples, dtype=torch.float64)

@@ -11,7 +11,7 @@ from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit, laplace
 from herglotz.training.baseline import outliers_pull
-from herglotz.training.robust import FEW, FREEDOM, far_out, heavy_tailed, loss, root_weights, scale_of
+from herglotz.training.problems.robust import FEW, FREEDOM, far_out, heavy_tailed, loss, root_weights, scale_of
 
 SETTINGS = FitConfig(departures=(2e-3,), objective="trajectory", train_fraction=1.0)
 

@@ -11,8 +11,8 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import ShootingProblem, levenberg_marquardt, smooth
-from herglotz.training.grid import segment_grid
-from herglotz.training.trajectory_fit import StatesOnly
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.least_squares import StatesOnly
 
 NOISE = 0.05
 
@@ -68,7 +68,7 @@ def test_little_process_noise_is_single_shooting():
     data, _ = recorded(model, gaps=False, count=1)
     found = smooth(model, data, NOISE, process=1e-4)
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, 1.0), sigma=NOISE)
-    states = StatesOnly(problem, problem.flat.get())
+    states = StatesOnly(problem, problem.parameters.get())
     start = torch.cat([found.states.q[0], found.states.p[0]]) + 0.05
     x = levenberg_marquardt(states, start, rtol=1e-12).x
     torch.testing.assert_close(torch.cat([found.states.q[0], found.states.p[0]]), x, rtol=0, atol=1e-4)

@@ -8,7 +8,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import reference_solve, scene
 from herglotz.training import FitConfig, Prior, fit
-from herglotz.training.supervision import SupervisedProblem
+from herglotz.training.problems.supervised import SupervisedProblem
 
 
 def pendulum(unit=1.0, **settings):

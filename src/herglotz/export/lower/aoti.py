@@ -1,0 +1,107 @@
+"""A model as machine code in a `.pt2` file (AOTInductor): fast batches without Python, on one kind of processor."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch._inductor
+from torch._inductor.package.package import package_aoti
+from torch.export import ExportedProgram
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
+from herglotz.export.compare import compare
+from herglotz.export.load import load_pt2
+from herglotz.export.metadata import AOTI, KEY, describe, to_json
+from herglotz.export.newton import ITERATIONS
+from herglotz.export.programs import programs_of, quiet
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+
+
+def export_aoti(
+    model: ContactLagrangian,
+    path: PathLike,
+    *,
+    h: float,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    metadata: Mapping[str, Any] | None = None,
+    newton_iterations: int = ITERATIONS,
+) -> Path:
+    """Compile K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow to machine code.
+
+    h has the shape (K, B), and so have the outputs (q and p: (K, B, n)); K = 1 is one step. The compiled code checks
+    nothing and takes contiguous tensors of the model's dtype only: call it through `load_aoti`, which does check. It
+    runs on the kind of processor it was compiled on, without derivatives.
+
+    Parameters
+    ----------
+    model, path, h, box, units, metadata, newton_iterations
+        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside,
+        plus 2 where h is outside an `h_range` in the metadata.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        If there is no C++ compiler, an argument is not usable, what was compiled does not step like the model, or the
+        file cannot be written.
+    """
+    entries = describe(model, h, box, units, newton_iterations, metadata or {})
+    settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
+    check_compiler()
+    with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
+        package = str(Path(folder, "code.pt2"))
+        programs = programs_of(model, entries, tuple(AOTI))
+        package_aoti(package, {AOTI[name]: _compiled(program, settings) for name, program in programs.items()})
+        _check(package, model)
+        content = Path(package).read_bytes()
+    write_atomically(path, content)
+    return Path(path)
+
+
+def _compiled(program: ExportedProgram, settings: dict[str, Any]) -> Any:
+    """The files of one program."""
+    options = settings | {"aot_inductor.package": True}
+    arguments, _ = program.example_inputs  # pyright: ignore[reportGeneralTypeIssues]  it has some
+    return torch._inductor.aot_compile(program.module(check_guards=False), arguments, options=options)  # pyright: ignore
+
+
+def _check(package: str, model: ContactLagrangian) -> None:
+    """Step the new file beside the model: compilers have been seen to put values where others belong.
+
+    Raises
+    ------
+    InputError
+        If they disagree.
+    """
+    found = compare(load_pt2(package), Stepper(model), batches=(1, 7), steps=20)
+    worst = max(found[key] for key in ("q", "p", "s"))  # NaN, which is not larger, where every start fails
+    if worst > (1e-6 if next(model.parameters()).dtype == torch.float64 else 1e-2):
+        raise InputError(f"the compiled code differs from the model by {worst:.1e}; export to --format c or onnx")
+
+
+def check_compiler() -> None:
+    """Raise unless a C++ compiler is there.
+
+    Raises
+    ------
+    InputError
+        Saying what to install.
+    """
+    given = os.environ.get("CXX", "")
+    names = [given.split()[0]] if given.split() else ["g++", "clang++", "c++"]
+    if not any(shutil.which(name) for name in names):
+        missing = f"$CXX names '{given}', which is not there" if given else "no C++ compiler (g++, clang++) in the PATH"
+        raise InputError(f"{missing}; install one, for example with: apt install g++, or export to --format c")

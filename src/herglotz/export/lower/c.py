@@ -1,0 +1,266 @@
+"""A traced step as C: the pieces that the runtime calls, cut by what each number depends on.
+
+The step of a model is one traced function (`herglotz.export.step_parts.StepParts`). Its numbers fall into pieces that
+run at different times, and hand on what a later piece reads as members of two structures:
+
+    prepare    what depends on h alone               members of NAME_problem, kept while h stays
+    begin      what depends on the start of a step   members of NAME_problem, and the guess of Δ
+    evaluate   F and, on demand, J at a trial Δ      members of NAME_terms
+    gains      p1 − p0, s1 − s0 and c − 1 at the end
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from herglotz.export.equation import Equations, input_count
+from herglotz.export.lower.interpret import interpret
+from herglotz.export.lower.program import NAME, Program, Ref, literal
+from herglotz.export.step_parts import potential, step_parts
+
+PREPARE, BEGIN, EVALUATE, GAINS = range(4)
+Outputs = Mapping[str, Any]  # the place written to → its number, or the list of its numbers
+
+
+class StepInC:
+    """The C functions of one model's step.
+
+    Parameters
+    ----------
+    equations
+        Of the model, in float64: numbers are rounded when they are written.
+    explicit
+        Whether the step needs no iteration.
+    """
+
+    def __init__(self, equations: Equations, explicit: bool):
+        self.explicit = explicit
+        self.program = Program()
+        n, m = equations.model.config.dof, input_count(equations.model)
+        self.n, self.m = n, m
+        names = {
+            "P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n,
+            "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}),
+        }  # fmt: skip
+        given = {name: self.program.given(name, size) for name, size in names.items()}
+        graph = step_parts(equations.model, explicit)
+        arrays = interpret(self.program, graph, list(given.values()))
+        guess, F, J, dp, ds, E = (list(x.ravel()) for x in arrays)
+        self.earliest = self._earliest({name: given[name][0].statement for name in given})
+        self.outputs = {
+            "begin": {"move": guess},
+            "evaluate_first": {"t->F": F},
+            **({} if explicit else {"evaluate": {"t->F": F, "t->J": J}}),
+            "gains": {"dp": dp, "*ds": ds[0], "*E": E[0]},
+        }
+
+    def _earliest(self, given: Mapping[str, int]) -> list[int]:
+        """The first piece in which each statement could run."""
+        of_input = {"P->h": PREPARE, "t->move": EVALUATE, "x": GAINS, "V1->value": GAINS, "V1->slope": GAINS}
+        known = {number: of_input.get(name, BEGIN) for name, number in given.items()}
+        earliest: list[int] = []
+        for i, statement in enumerate(self.program.statements):
+            earliest.append(known.get(i, max((earliest[j] for j in statement.reads), default=PREPARE)))
+        return earliest
+
+    @cached_property
+    def runs(self) -> dict[str, set[int]]:
+        """The statements of each function: as early as they can run, but what only the end of a step needs at the end.
+
+        Between `evaluate_first` and `gains` only what the former computes is handed on, as it may be the last to run.
+        """
+        needed = {name: needed_by(self.program, outputs) for name, outputs in self.outputs.items()}
+        every = set().union(*needed.values())
+        first, second = needed["evaluate_first"], needed.get("evaluate", set())
+        starting = needed["begin"] | first | second
+        runs = {
+            "prepare": {i for i in every if self.earliest[i] == PREPARE},
+            "begin": {i for i in starting if self.earliest[i] == BEGIN},
+            "evaluate_first": {i for i in first if self.earliest[i] == EVALUATE},
+            "evaluate": {i for i in second if self.earliest[i] == EVALUATE},
+        }
+        runs["gains"] = needed["gains"] - runs["prepare"] - runs["begin"] - runs["evaluate_first"]
+        return runs
+
+    @cached_property
+    def handed_on(self) -> dict[int, str]:
+        """The statements whose results another function reads, and the member each is kept in."""
+        read: dict[str, set[int]] = {}
+        for name, run in self.runs.items():
+            read[name] = set().union(*(self.program.statements[i].reads for i in run))
+            rows = self.outputs.get(name, {}).values()
+            read[name] |= {x.statement for row in rows for x in _row(row) if isinstance(x, Ref)}
+        kept: dict[int, str] = {}
+        for name, holder, readers in (
+            ("prepare", "P", ("begin", "evaluate_first", "evaluate", "gains")),
+            ("begin", "P", ("evaluate_first", "evaluate", "gains")),
+            ("evaluate_first", "t", ("gains",)),
+        ):
+            wanted = set().union(*(read.get(reader, set()) for reader in readers))
+            for i in sorted(self.runs[name] & wanted):
+                if not self.program.statements[i].name:
+                    kept[i] = f"{holder}->x{i}"
+        return kept
+
+    def members(self, holder: str) -> str:
+        """The declarations of what is handed on in one structure."""
+        lines = []
+        for i, place in self.handed_on.items():
+            size = self.program.statements[i].size
+            if place.startswith(f"{holder}->"):
+                lines.append(f"  REAL x{i}{f'[{size}]' if size else ''};\n")
+        return "".join(lines)
+
+    def source(self) -> str:
+        """The functions, as a text of `REAL` and `FN_`, which stand for one sample or for a register of them."""
+        problem, terms = "FN_problem *P", "FN_terms *t"
+        heads = {
+            "prepare": f"prepare({problem})",
+            "begin": f"begin({problem}, REAL move[hz_N])",
+            "evaluate_first": f"evaluate_first(const {problem}, {terms})",
+        }
+        if not self.explicit:
+            heads["evaluate"] = f"evaluate(const {problem}, {terms})"
+        heads["gains"] = f"gains(const {problem}, const {terms}, const REAL x[hz_N], const FN_potential_t *V1,\n    "
+        heads["gains"] += "REAL dp[hz_N], REAL *ds, REAL *E)"
+        parts = []
+        for name, head in heads.items():
+            comment = COMMENTS[name]
+            head = f"{comment}static inline void FN_{head}"
+            parts.append(function(self.program, head, self.runs[name], self.outputs.get(name, {}), self.handed_on))
+        return "".join(parts)
+
+
+COMMENTS = {
+    "prepare": "\n/* What depends on h alone. */\n",
+    "begin": "\n/* What depends on the start of the step, and the step without what couples q1, as a guess. */\n",
+    "evaluate_first": "\n/* F at q1 = q0 + t->move. */\n",
+    "evaluate": "\n/* F and J = dF/dq1. */\n",
+    "gains": "\n/* p1 - p0, s1 - s0 and c - 1 of the solved step: x is the move, t->move where F was evaluated. */\n",
+}
+
+
+def function(
+    program: Program,
+    head: str,
+    numbers: Iterable[int],
+    outputs: Outputs,
+    handed_on: Mapping[int, str],
+) -> str:
+    """One C function of statements and outputs."""
+    name = lambda m: _name(program, int(m[1]), handed_on)  # noqa: E731
+    lines: list[str] = []
+    for i in sorted(numbers):
+        statement = program.statements[i]
+        if statement.name:
+            continue
+        if statement.size and i not in handed_on:
+            lines.append(f"REAL t{i}[{statement.size}];")
+        text = statement.text
+        if i in handed_on:
+            text = text.replace(f"const REAL @{i} =", f"@{i} =", 1)
+        lines += NAME.sub(name, text).split("\n")
+    for place, row in outputs.items():
+        for i, atom in enumerate(_row(row)):
+            right = program.read(atom) if isinstance(atom, Ref) else f"SPREAD({program.read(atom)})"
+            lines.append(f"{place if row is atom else f'{place}[{i}]'} = {NAME.sub(name, right)};")
+    body = "".join(f"  {line}\n" for line in lines)
+    unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
+                     if not re.search(rf"\b{x}\b", body))  # fmt: skip
+    counter = "  int k;\n" if "(k = 0;" in body else ""
+    return f"{head} {{\n{counter}{unused}{body}}}\n"
+
+
+def _row(numbers: Any) -> list[Any]:
+    """The numbers of an output; a `Ref` is one number."""
+    return numbers if type(numbers) is list else [numbers]
+
+
+def _name(program: Program, number: int, handed_on: Mapping[int, str]) -> str:
+    return program.statements[number].name or handed_on.get(number) or f"t{number}"
+
+
+class Emitted(NamedTuple):
+    """What of a header depends on the model."""
+
+    tables: str
+    scalars: str  # types and functions for one sample
+    lanes: str  # the same for a register of samples
+    slopes: str  # the derivative of a step
+
+
+def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: bool) -> Emitted:
+    """The emitted parts of a header, with constants as `R(0.5)`."""
+    program = Program(tables=step.program.tables)
+    q = program.given("q", step.n)
+    graph = potential(equations)
+    V, slope = (np.full(n, 0.0, object) for n in (1, step.n)) if graph is None else interpret(program, graph, [q])
+    outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
+    head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
+    texts = TYPES.format(push="  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else "", problem=step.members("P"),
+                         terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
+    slopes = _slopes_source(equations, step) if derivatives else ""
+    tables = "".join(
+        f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
+        for row, name in step.program.tables.items()
+    )
+    wide = texts.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
+    return Emitted(tables, as_scalars(texts), wide if lanes else "", as_scalars(slopes))
+
+
+TYPES = """
+/* The potential at one point. */
+typedef struct {{
+  REAL value, slope[hz_N];
+}} FN_potential_t;
+
+/* The start of a step, and what does not change while it is solved. */
+typedef struct {{
+  REAL q0[hz_N], p0[hz_N], s0, h;
+{push}  FN_potential_t V0;
+{problem}}} FN_problem;
+
+/* The step equation at one q1 = q0 + move. Once it is solved, `rest` is the last, tiny correction:
+   q1 = q0 + move + rest. */
+typedef struct {{
+  REAL move[hz_N], rest[hz_N], F[hz_N], J[hz_N * hz_N];
+{terms}}} FN_terms;
+"""
+
+
+def as_scalars(text: str) -> str:
+    """An emitted text for one sample."""
+    return text.replace("SPREAD(", "(").replace("FN_", "hz_").replace("REAL", "hz_real")
+
+
+def _slopes_source(equations: Equations, step: StepInC) -> str:
+    """The derivative of a solved step as a C function."""
+    program = Program(tables=step.program.tables)
+    n, m = step.n, step.m
+    sizes = {"P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "move": n, **({"P->push": m} if m else {})}
+    (slopes,) = interpret(program, equations.jacobian, [program.given(name, size) for name, size in sizes.items()])
+    head = "\n/* d(q, p, s)' / d(q, p, s, h, push) at the solution q1 = q0 + move, row by row. */\n"
+    head += "static inline void FN_slopes(const FN_problem *P, const REAL move[hz_N], REAL *slopes)"
+    return whole(program, head, {"slopes": list(slopes.ravel())})
+
+
+def whole(program: Program, head: str, outputs: Outputs) -> str:
+    """A function that is one piece."""
+    return function(program, head, needed_by(program, outputs), outputs, {})
+
+
+def needed_by(program: Program, outputs: Outputs) -> set[int]:
+    """The statements that outputs need, down to the inputs."""
+    todo = [x.statement for row in outputs.values() for x in _row(row) if isinstance(x, Ref)]
+    needed: set[int] = set()
+    while todo:
+        i = todo.pop()
+        if i not in needed:
+            needed.add(i)
+            todo += program.statements[i].reads
+    return needed

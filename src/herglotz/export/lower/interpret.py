@@ -1,0 +1,283 @@
+"""What the operations of a traced graph do to arrays of numbers of a `Program`."""
+
+from __future__ import annotations
+
+import math
+import operator
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import fx
+
+from herglotz.errors import InputError
+from herglotz.export.lower.program import Atom, Compared, Program, Ref, fold_add, fold_multiply
+from herglotz.export.trace import Graph
+
+aten = torch.ops.aten
+MATHEMATICS: dict[str, Callable[[float], float]] = {
+    "sin": math.sin, "cos": math.cos, "exp": math.exp, "expm1": math.expm1, "sqrt": math.sqrt, "atanh": math.atanh,
+    "tanh": math.tanh, "fabs": abs, "sigmoid": lambda x: 1 / (1 + math.exp(-x)),
+    "softplus": lambda x: max(x, 0.0) + math.log1p(math.exp(-abs(x))),
+}  # fmt: skip
+WHERE = (aten.where.self, aten.where.ScalarOther, aten.where.ScalarSelf, aten.where.Scalar)
+ROWS = ("tanh", "sigmoid", "softplus")  # functions with a kernel for a whole row
+
+
+def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -> list[np.ndarray]:
+    """The outputs of a graph as arrays of atoms, for one sample: the batch axis has size 1.
+
+    Parameters
+    ----------
+    program
+        Takes the statements.
+    graph
+        The traced function.
+    inputs
+        The numbers of each argument, in its order.
+    """
+    places = [node for node in graph.code.graph.nodes if node.op == "placeholder"]
+    values: dict[fx.Node, Any] = {}
+    for node, numbers in zip(places, inputs, strict=False):
+        shape = (1, *node.meta["example"].shape[1:])
+        values[node] = _array(numbers).reshape(shape)
+    for node, constant in zip(places[len(inputs) :], graph.constants, strict=True):
+        array = constant.detach().cpu().numpy()
+        values[node] = array.astype(object) if array.dtype.kind == "f" else array
+    table = operations(program)
+
+    def value(x: Any) -> Any:
+        if isinstance(x, fx.Node):
+            return values[x]
+        if isinstance(x, (list, tuple)):
+            return [value(y) for y in x]
+        return x
+
+    for node in graph.code.graph.nodes:
+        if node.op == "call_function":
+            if node.target not in table:
+                raise InputError(f"{node.target} cannot be written as C yet; export the model as .pt2 instead")
+            options = {k: value(v) for k, v in node.kwargs.items() if k in ("value", "alpha")}
+            values[node] = table[node.target](*value(node.args), **options)
+        elif node.op == "output":
+            return [value(x) for x in node.args[0]]
+    raise AssertionError("a graph without output")
+
+
+def _array(atoms: Sequence[Atom]) -> np.ndarray:
+    """An array of atoms: numpy would take a `Ref` for a row."""
+    out = np.empty(len(atoms), object)
+    for i, x in enumerate(atoms):
+        out[i] = x
+    return out
+
+
+def _full(shape: Any, value: float) -> np.ndarray:
+    return np.full(tuple(shape), float(value), object)
+
+
+def operations(program: Program) -> dict[Any, Callable[..., Any]]:
+    """The table: what each operation gives."""
+    c = _Numbers(program)
+    same = lambda x, *_, **__: x  # noqa: E731
+    transposed = lambda x: x.T if x.ndim == 2 else np.swapaxes(x, -1, -2)  # noqa: E731
+    table: dict[Any, Callable[..., Any]] = {
+        aten.add.Tensor: c.add, aten.add.Scalar: c.add,
+        aten.sub.Tensor: lambda x, y, alpha=1: c.subtract(x, c.multiply(y, alpha)),
+        aten.rsub.Scalar: lambda x, y: c.subtract(y, x),
+        aten.mul.Tensor: c.multiply, aten.mul.Scalar: c.multiply,
+        aten.div.Tensor: c.divide, aten.div.Scalar: c.divide,
+        aten.addcmul.default: c.add_product,
+        aten.neg.default: lambda x: c.multiply(x, -1.0),
+        aten.reciprocal.default: lambda x: c.divide(1.0, x),
+        aten.pow.Tensor_Scalar: c.power,
+        aten.tanh_backward.default: lambda g, t: c.multiply(g, c.subtract(1.0, c.multiply(t, t))),
+        aten.sigmoid_backward.default: lambda g, s: c.multiply(g, c.multiply(s, c.subtract(1.0, s))),
+        aten.gt.Tensor: c.greater, **dict.fromkeys(WHERE, c.choose),
+        aten.log_sigmoid.default: lambda x: c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0),
+        aten.log_sigmoid_forward.default: lambda x: (
+            c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0), None,
+        ),
+        aten.log_sigmoid_backward.default: lambda g, x, _: c.multiply(g, c.function("sigmoid", c.multiply(x, -1.0))),
+        aten.linear.default: lambda x, w, b=None: c.product(x, w.T, b),
+        aten.addmm.default: lambda b, x, w: c.add(c.product(x, w), b) if b.ndim > 1 else c.product(x, w, b),
+        aten.mm.default: c.product, aten.bmm.default: c.product, aten.matmul.default: c.product,
+        aten.mv.default: c.product, aten.dot.default: c.product,
+        aten.sum.dim_IntList: c.sum,
+        aten.linalg_inv_ex.default: lambda x, *_, **__: (c.inverse(x), None),
+        aten.cat.default: lambda xs, dim=0: np.concatenate(xs, dim),
+        aten.stack.default: lambda xs, dim=0: np.stack(xs, dim),
+        aten.unsqueeze.default: np.expand_dims, aten.select.int: lambda x, dim, i: np.take(x, i, axis=dim),
+        aten.squeeze.dim: np.squeeze,
+        aten.slice.Tensor: lambda x, dim=0, a=None, b=None, step=1: x[
+            (slice(None),) * (dim % x.ndim) + (slice(a, b, step),)
+        ],
+        aten.movedim.int: np.moveaxis, aten.movedim.intlist: np.moveaxis, aten.transpose.int: np.swapaxes,
+        aten.t.default: transposed, aten.numpy_T.default: np.transpose, aten.permute.default: np.transpose,
+        aten.expand.default: _expand, aten.expand_as.default: lambda x, y: np.broadcast_to(x, y.shape),
+        aten.reshape.default: lambda x, shape: x.reshape(shape),
+        aten.repeat.default: np.tile,
+        aten.flatten.using_ints: lambda x, a=0, b=-1: x.reshape(
+            *x.shape[: a % x.ndim], -1, *x.shape[b % x.ndim + 1 :]
+        ),
+        aten.unflatten.int: lambda x, dim, shape: x.reshape(*x.shape[: dim % x.ndim], *shape, *x.shape[dim % x.ndim + 1 :]),  # noqa: E501
+        aten.unbind.int: lambda x, dim=0: [np.take(x, i, axis=dim) for i in range(x.shape[dim])],
+        aten.split_with_sizes.default: lambda x, sizes, dim=0: np.split(x, np.cumsum(sizes)[:-1], axis=dim),
+        aten.split.Tensor: lambda x, size, dim=0: np.split(x, range(size, x.shape[dim], size), axis=dim),
+        aten.broadcast_tensors.default: lambda xs: np.broadcast_arrays(*xs),
+        aten.index.Tensor: lambda x, places: x[tuple(slice(None) if p is None else p for p in places)],
+        aten.index_select.default: lambda x, dim, i: np.take(x, i, axis=dim),
+        aten.diag_embed.default: _diagonal,
+        aten.zeros_like.default: lambda x, **_: _full(x.shape, 0),
+        aten.ones_like.default: lambda x, **_: _full(x.shape, 1),
+        aten.empty_like.default: lambda x, **_: _full(x.shape, 0),
+        aten.full_like.default: lambda x, v, **_: _full(x.shape, v),
+        aten.new_zeros.default: lambda _, shape: _full(shape, 0), aten.zeros.default: lambda shape: _full(shape, 0),
+        aten._new_zeros_with_same_feature_meta.default: lambda x, *_, **__: _full(x.shape, 0),
+        aten.new_ones.default: lambda _, shape: _full(shape, 1),
+        aten.sym_size.int: lambda x, dim: x.shape[dim], operator.getitem: lambda x, i: x[i], operator.mul: operator.mul,
+    }  # fmt: skip
+    table |= dict.fromkeys(
+        (aten.clone.default, aten._to_copy.default, aten.contiguous.default, aten.detach.default, aten.alias.default,
+         aten.to.dtype, aten.to.device, aten.to.dtype_layout), same,
+    )  # fmt: skip
+    for name in ("sin", "cos", "exp", "expm1", "sqrt", "atanh", "tanh", "sigmoid"):
+        table[getattr(aten, name).default] = lambda x, name=name: c.function(name, x)
+    table[aten.abs.default] = lambda x: c.function("fabs", x)
+    return table
+
+
+class _Numbers:
+    """Arithmetic on arrays of atoms."""
+
+    def __init__(self, program: Program):
+        self.program = program
+
+    def add(self, x: Any, y: Any, alpha: float = 1) -> np.ndarray:
+        y = y if alpha == 1 else self.multiply(y, alpha)
+        return self.program.elementwise("{0} + {1}", fold_add, _atoms(x), _atoms(y))
+
+    def subtract(self, x: Any, y: Any) -> np.ndarray:
+        def fold(a: Atom, b: Atom) -> Atom | None:
+            if not isinstance(b, Ref) and (b == 0.0 or not isinstance(a, Ref)):
+                return a if b == 0.0 else a - b
+            return 0.0 if a is b else None
+
+        x, y = np.broadcast_arrays(_atoms(x), _atoms(y))
+        if all(not isinstance(a, Ref) and a == 0.0 for a in x.flat):
+            return self.multiply(y, -1.0)
+        return self.program.elementwise("{0} - {1}", fold, x, y)
+
+    def add_product(self, a: Any, x: Any, y: Any, value: float = 1) -> np.ndarray:
+        """The sum a + value x y, in one operation where none of its numbers can be left out."""
+        a, x, y = np.broadcast_arrays(_atoms(a), _atoms(x), _atoms(y))
+        simple = lambda v: not isinstance(v, Ref) and v in (0.0, 1.0, -1.0)  # noqa: E731
+        whole = all(isinstance(v, Ref) for v in x.flat) and not any(simple(v) for v in y.flat)
+        if abs(value) == 1 and whole and all(isinstance(v, Ref) or v != 0.0 for v in a.flat):
+            form = "{0} + {1} * {2}" if value == 1 else "{0} - {1} * {2}"
+            return self.program.elementwise(form, lambda *_: None, a, x, y)
+        if value == -1:
+            return self.subtract(a, self.multiply(x, y))
+        return self.add(a, self.multiply(self.multiply(x, y), value))
+
+    def multiply(self, x: Any, y: Any) -> np.ndarray:
+        x, y = _atoms(x), _atoms(y)
+        for a, b in ((x, y), (y, x)):
+            if a.size == 1 and not isinstance(a.flat[0], Ref) and a.flat[0] == -1.0:
+                shape = np.broadcast_shapes(x.shape, y.shape)
+                negative = lambda v: None if isinstance(v, Ref) else -v  # noqa: E731
+                return self.program.elementwise("-{0}", negative, np.broadcast_to(b, shape))
+        return self.program.elementwise("{0} * {1}", fold_multiply, x, y)
+
+    def divide(self, x: Any, y: Any) -> np.ndarray:
+        def fold(a: Atom, b: Atom) -> Atom | None:
+            if not isinstance(a, Ref) and (a == 0.0 or not isinstance(b, Ref)):
+                return 0.0 if a == 0.0 else a / b
+            return a if not isinstance(b, Ref) and b == 1.0 else None
+
+        return self.program.elementwise("{0} / {1}", fold, _atoms(x), _atoms(y))
+
+    def power(self, x: np.ndarray, exponent: float) -> np.ndarray:
+        whole = int(exponent)
+        if whole != exponent or abs(whole) > 16:
+            fold = lambda a: None if isinstance(a, Ref) else a**exponent  # noqa: E731
+            return self.program.elementwise(f"FN_pow({{0}}, R({float(exponent)}))", fold, x)
+        out: Any = _full(x.shape, 1)
+        for _ in range(abs(whole)):
+            out = self.multiply(out, x)
+        return out if whole >= 0 else self.divide(1.0, out)
+
+    def function(self, name: str, x: np.ndarray) -> np.ndarray:
+        fold = lambda a: None if isinstance(a, Ref) else MATHEMATICS[name](a)  # noqa: E731
+        return self.program.elementwise(f"FN_{name}({{0}})", fold, x, kernel=f"FN_{name}_row" if name in ROWS else None)
+
+    def greater(self, x: Any, y: Any) -> np.ndarray:
+        x, y = np.broadcast_arrays(_atoms(x), _atoms(y))
+        out = np.empty(x.shape, object)
+        for i in np.ndindex(x.shape):
+            out[i] = Compared(x[i], y[i]) if isinstance(x[i], Ref) or isinstance(y[i], Ref) else bool(x[i] > y[i])
+        return out
+
+    def choose(self, where: np.ndarray, x: Any, y: Any) -> np.ndarray:
+        where, x, y = np.broadcast_arrays(where, _atoms(x), _atoms(y))
+
+        def fold(condition: Any, a: Atom, b: Atom) -> Atom | None:
+            if isinstance(condition, Compared):
+                return a if a == b else None
+            return a if condition else b
+
+        return self.program.elementwise("{0} ? {1} : {2}", fold, where.astype(object), x, y)
+
+    def product(self, x: np.ndarray, w: np.ndarray, bias: np.ndarray | None = None) -> np.ndarray:
+        """Matrix products as torch broadcasts them."""
+        if x.ndim == 1:
+            return self.product(x[None], w, bias)[0]
+        if w.ndim == 1:
+            return self.product(x, w[:, None], bias)[..., 0]
+        outer = np.broadcast_shapes(x.shape[:-2], w.shape[:-2])
+        x, w = np.broadcast_to(x, (*outer, *x.shape[-2:])), np.broadcast_to(w, (*outer, *w.shape[-2:]))
+        out = np.empty((*outer, x.shape[-2], w.shape[-1]), object)
+        b = None if bias is None else list(bias)
+        for i in np.ndindex(*outer, x.shape[-2]):
+            row = self.program.product(list(x[i]), w[i[:-1]], b)
+            for k, value in enumerate(row):
+                out[(*i, k)] = value
+        return out
+
+    def sum(self, x: np.ndarray, axes: Any, keep: bool = False) -> np.ndarray:
+        axes = [axes] if isinstance(axes, int) else axes
+        for axis in sorted((a % x.ndim for a in axes), reverse=True):
+            moved = np.moveaxis(x, axis, -1)
+            total = np.empty(moved.shape[:-1], object)
+            for i in np.ndindex(total.shape):
+                total[i] = self.program.sum(list(moved[i]))
+            x = np.expand_dims(total, axis) if keep else total
+        return x
+
+    def inverse(self, x: np.ndarray) -> np.ndarray:
+        out = np.empty(x.shape, object)
+        for i in np.ndindex(x.shape[:-2]):
+            out[i] = self.program.inverse(x[i])
+        return out
+
+
+def _atoms(x: Any) -> np.ndarray:
+    """Numbers as an array of atoms."""
+    if isinstance(x, np.ndarray):
+        return x if x.dtype == object else x.astype(float).astype(object)
+    out = np.empty((), object)
+    out[()] = float(x)
+    return out
+
+
+def _expand(x: np.ndarray, shape: Sequence[int]) -> np.ndarray:
+    missing = len(shape) - x.ndim
+    return np.broadcast_to(x, [x.shape[i - missing] if size == -1 else size for i, size in enumerate(shape)])
+
+
+def _diagonal(x: np.ndarray) -> np.ndarray:
+    out = _full((*x.shape, x.shape[-1]), 0)
+    for i in range(x.shape[-1]):
+        out[..., i, i] = x[..., i]
+    return out

@@ -1,0 +1,133 @@
+"""A model as one `.onnx` file that steps with onnxruntime and numpy alone: both loops are inside."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from torch import Tensor
+from torch.export import ExportedProgram
+from torch.export.graph_signature import InputKind
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
+from herglotz.export.lower.onnx_table import write
+from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of
+from herglotz.export.metadata import KEY, describe, to_json
+from herglotz.export.newton import ITERATIONS
+from herglotz.export.programs import programs_of, quiet
+from herglotz.models import ContactLagrangian
+
+OPSET = 20
+OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
+
+
+def export_onnx(
+    model: ContactLagrangian,
+    path: PathLike,
+    *,
+    h: float,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    metadata: Mapping[str, Any] | None = None,
+    newton_iterations: int = ITERATIONS,
+) -> Path:
+    """Write K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow as an ONNX graph.
+
+    Inputs q, p (B, n), s (B,) and h (K, B), a row a step; K = 1 is one step. Outputs q, p (K, B, n), the others (K, B):
+    what steps 1 … K give. Batch size and number of steps are free. A model with inputs takes u (K, B, m) after h.
+    A failed step has a status other than 0, and NaN from there on. The entry `herglotz_init` of the model's metadata is
+    a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1.
+
+    Parameters
+    ----------
+    model, path, h, box, units, metadata, newton_iterations
+        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside,
+        plus 2 where h is outside an `h_range` in the metadata.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        If onnx is not installed, an argument is not usable, or the file cannot be written.
+    """
+    try:
+        import onnx  # noqa: F401
+    except ImportError as error:
+        raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
+    entries = describe(model, h, box, units, newton_iterations, metadata or {})
+    text = to_json(entries)
+    with quiet():
+        programs = programs_of(model, entries, ("rollout", "linearise", "init"))
+    u = ("u",) if entries["inputs"] else ()
+    said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
+    further = {
+        "init": (("q0", "q1", "s0", "h"), ("p", "s")),
+        "linearise": (("q", "p", "s", "h"), (*said, "jacobian")),
+    }
+    properties = {KEY: text}
+    for name, (inputs, outputs) in further.items():
+        second = graph_of(programs[name], (*inputs, *u), outputs, {})
+        properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
+    write_atomically(path, graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties))
+    return Path(path)
+
+
+def graph_of(
+    program: ExportedProgram, inputs: Sequence[str], outputs: Sequence[str], properties: Mapping[str, str]
+) -> bytes:
+    """A program as a serialised ONNX model; K steps and B samples are free sizes."""
+    import onnx
+    from onnx import helper
+
+    values, shapes = _placeholders(program, inputs)
+    dtype = next(x.dtype for x in values if isinstance(x, Tensor) and x.is_floating_point())
+    writer = Writer(Constants(), dtype)
+    found = write(writer, program.graph_module, values)
+    places: Any = next(x for x in program.graph.nodes if x.op == "output").args[0]
+    for name, x in zip(outputs, found, strict=True):
+        writer.emit("Identity", x, to=name)
+    described_outputs = dict(zip(outputs, places, strict=True))
+    graph = helper.make_graph(
+        writer.nodes, "herglotz",
+        [_info(name, described(x)) for name, x in shapes.items()],
+        [_info(name, described(x)) for name, x in described_outputs.items()],
+        writer.constants.tensors,
+    )  # fmt: skip
+    proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="herglotz")
+    proto.ir_version = min(proto.ir_version, 10)
+    helper.set_model_props(proto, dict(properties))
+    onnx.checker.check_model(proto)
+    return proto.SerializeToString()
+
+
+def _placeholders(program: ExportedProgram, inputs: Sequence[str]) -> tuple[list[Any], dict[str, Any]]:
+    """What the placeholders of a program stand for: known tensors, or the names of the file's inputs."""
+    values, named = [], {}
+    left = iter(inputs)
+    known = {**program.state_dict, **program.constants}
+    nodes = (x for x in program.graph.nodes if x.op == "placeholder")
+    for node, spec in zip(nodes, program.graph_signature.input_specs, strict=True):
+        if spec.kind == InputKind.USER_INPUT:
+            name = next(left)
+            named[name] = node
+            values.append(name)
+        else:
+            values.append(known[str(spec.target)])
+    return values, named
+
+
+def _info(name: str, value: Tensor) -> Any:
+    """The description of an input or output: free sizes are called K (steps) and B (samples)."""
+    from onnx import helper
+
+    free = iter(("K", "B")[-sum(not isinstance(x, int) for x in value.shape) :])
+    return helper.make_tensor_value_info(
+        name, kind_of(value.dtype), [x if isinstance(x, int) else next(free) for x in value.shape]
+    )

@@ -1,0 +1,321 @@
+"""Straight-line C in static single assignment: scalars, loops over rows and calls of kernels, each expression once.
+
+A number of the traced function is an `Atom`: a Python float where it is constant, else a `Ref` to what a statement
+computes. Constants are folded, zeros and ones dropped. A loop is written where eight or more neighbouring results have
+operands that lie in a row of memory each; everything else is one scalar a line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+LOOP = 8  # results from which on a loop is written; shorter rows are faster and no longer as scalars
+DENSE = 64  # nonzero weights from which on a matrix product is a call
+
+
+class Ref(NamedTuple):
+    """A result of a statement: a scalar, or entry `index` of its row."""
+
+    statement: int
+    index: int = 0
+
+
+class Compared(NamedTuple):
+    """The condition a > b."""
+
+    a: Any
+    b: Any
+
+
+Atom = Any  # float | Ref | Compared
+NAME = re.compile(r"@(\d+)")
+
+
+@dataclass
+class Statement:
+    """One line or loop; `@7` in the text stands for the result of statement 7."""
+
+    text: str
+    size: int  # 0: a scalar
+    reads: set[int]
+    name: str = ""  # of an input
+
+
+@dataclass
+class Program:
+    """Statements in order, with what is known of their results."""
+
+    statements: list[Statement] = field(default_factory=list)
+    tables: dict[tuple[float, ...], str] = field(default_factory=dict)
+    known: dict[Any, Atom] = field(default_factory=dict)
+
+    def given(self, name: str, size: int) -> list[Ref]:
+        """An input of the function: a row of `size`, or a scalar where that is 0."""
+        number = self._append(Statement("", size, set(), name))
+        return [Ref(number, i) for i in range(max(size, 1))]
+
+    def table(self, values: Iterable[float]) -> str:
+        """The name of a row of constants."""
+        key = tuple(float(x) for x in values)
+        return self.tables.setdefault(key, f"hz_w{len(self.tables)}")
+
+    def scalar(self, form: str, atoms: Sequence[Atom]) -> Ref:
+        """The result of a formula such as `{0} + {1}`; the same formula of the same numbers is computed once."""
+        key = (form, *atoms)
+        if key not in self.known:
+            text = f"const REAL @{len(self.statements)} = {form.format(*map(self.read, atoms))};"
+            self.known[key] = Ref(self._append(Statement(text, 0, _reads(atoms))))
+        return self.known[key]
+
+    def elementwise(
+        self, form: str, fold: Callable[..., Atom | None], *operands: Any, kernel: str | None = None
+    ) -> np.ndarray:
+        """A formula entry by entry.
+
+        Parameters
+        ----------
+        form
+            As in `scalar`.
+        fold
+            The result where no operation is needed, else None.
+        operands
+            Arrays of atoms that broadcast.
+        kernel
+            A function of (count, x, y) that does a whole row.
+        """
+        arrays = np.broadcast_arrays(*(np.asarray(x, object) for x in operands))
+        out = np.empty(arrays[0].size, object)
+        columns = [x.ravel() for x in arrays]
+        fresh: dict[Any, list[int]] = {}
+        for i, atoms in enumerate(zip(*columns, strict=True)):
+            value = fold(*atoms)
+            if value is None:
+                value = self.known.get((form, *atoms))
+            if value is None:
+                fresh.setdefault(atoms, []).append(i)
+            else:
+                out[i] = value
+        todo = list(fresh)
+        start = 0
+        while start < len(todo):
+            count = _run(todo, start)
+            results = self._row(form, todo[start : start + count], kernel)
+            for atoms, result in zip(todo[start : start + count], results, strict=True):
+                for i in fresh[atoms]:
+                    out[i] = result
+            start += count
+        return out.reshape(arrays[0].shape)
+
+    def _row(self, form: str, entries: list[tuple[Atom, ...]], kernel: str | None) -> list[Ref]:
+        """The results of one run of entries: a loop if it is long, else scalars."""
+        count = len(entries)
+        if count < LOOP:
+            return [self.scalar(form, atoms) for atoms in entries]
+        columns = list(zip(*entries, strict=True))
+        number = len(self.statements)
+        if kernel is not None:
+            where = self.pointer(columns[0])
+            number = len(self.statements)
+            text = f"{kernel}({count}, {where}, @{number});"
+        else:
+            right = form.format(*(self._in_loop(column) for column in columns))
+            text = f"for (k = 0; k < {count}; k++) @{number}[k] = {right};"
+        self._append(Statement(text, count, _mentioned(text) - {number}))
+        results = [Ref(number, i) for i in range(count)]
+        for atoms, result in zip(entries, results, strict=True):
+            self.known[(form, *atoms)] = result
+        return results
+
+    def _in_loop(self, column: Sequence[Atom]) -> str:
+        """How a loop over k reads a column whose entries `_run` has found regular."""
+        first = column[0]
+        if not isinstance(first, Ref):
+            return self.read(first) if len(set(column)) == 1 else f"{self.table(column)}[k]"
+        stride = column[1].index - first.index
+        if not stride:
+            return self.read(first)
+        index = "k" if stride == 1 else f"{stride} * k"
+        return f"@{first.statement}[{index}{f' + {first.index}' if first.index else ''}]"
+
+    def read(self, atom: Atom) -> str:
+        """One number, as an operand."""
+        if isinstance(atom, Compared):
+            return f"{self.read(atom.a)} > {self.read(atom.b)}"
+        if not isinstance(atom, Ref):
+            return literal(atom)
+        return f"@{atom.statement}[{atom.index}]" if self.statements[atom.statement].size else f"@{atom.statement}"
+
+    def pointer(self, atoms: Sequence[Atom]) -> str:
+        """The address of these numbers in a row, which are copied together where they do not lie so."""
+        first = atoms[0]
+        if isinstance(first, Ref) and self.statements[first.statement].size:
+            wanted = [Ref(first.statement, first.index + i) for i in range(len(atoms))]
+            if list(atoms) == wanted:
+                return f"@{first.statement}" + (f" + {first.index}" if first.index else "")
+        key = ("packed", *atoms)
+        if key not in self.known:
+            number, lines, start = len(self.statements), [], 0
+            while start < len(atoms):
+                count = _run([(x,) for x in atoms], start)
+                if count < LOOP:
+                    lines += [f"@{number}[{i}] = {self._spread(atoms[i])};" for i in range(start, start + count)]
+                else:
+                    right = self._in_loop(atoms[start : start + count])
+                    right = right if isinstance(atoms[start], Ref) else f"SPREAD({right})"
+                    at = f"k + {start}" if start else "k"
+                    lines.append(f"for (k = 0; k < {count}; k++) @{number}[{at}] = {right};")
+                start += count
+            self._append(Statement("\n".join(lines), len(atoms), _reads(atoms)))
+            self.known[key] = Ref(number)
+        return f"@{self.known[key].statement}"
+
+    def _spread(self, atom: Atom) -> str:
+        return self.read(atom) if isinstance(atom, Ref) else f"SPREAD({literal(atom)})"
+
+    def product(self, x: Sequence[Atom], weight: np.ndarray, bias: Sequence[Atom] | None) -> list[Atom]:
+        """Σ_j x_j w_jk + b_k for one row x (k,), w (k, m) and b (m,)."""
+        kept = [j for j, value in enumerate(x) if value != 0.0 and any(w != 0.0 for w in weight[j])]
+        x, weight = [x[j] for j in kept], weight[kept]
+        size = weight.shape[1]
+        start = [0.0] * size if bias is None else list(bias)
+        if not kept:
+            return start
+        constant = all(isinstance(w, float) for w in weight.flat)
+        fixed = all(not isinstance(v, Ref) for v in x)
+        if constant and not fixed and all(isinstance(b, float) for b in start):
+            if size >= LOOP and len(kept) <= 4:
+                return self._few_inputs(x, weight, start)
+            if max(len(kept), size) >= LOOP and np.count_nonzero(weight) >= min(DENSE, weight.size):
+                return self._call_product(x, weight, start)
+        return [self.sum([start[k], *(multiply(self, v, w) for v, w in zip(x, weight[:, k], strict=True))])
+                for k in range(size)]  # fmt: skip
+
+    def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
+        key = ("few", tuple(x), tuple(weight.flat), tuple(start))
+        if key not in self.known:
+            number, size = len(self.statements), len(start)
+            terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
+            terms = [self._in_loop(list(start)), *terms] if any(start) else terms
+            text = f"for (k = 0; k < {size}; k++) @{number}[k] = {' + '.join(terms)};"
+            self.known[key] = Ref(self._append(Statement(text, size, _reads(x))))
+        return [Ref(self.known[key].statement, i) for i in range(len(start))]
+
+    def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
+        key = ("product", tuple(x), tuple(weight.flat), tuple(start))
+        if key not in self.known:
+            where = self.pointer(x)
+            number, size = len(self.statements), len(start)
+            tables = f"{self.table(weight.flat)}, {self.table(weight.T.flat)}"
+            text = f"for (k = 0; k < {size}; k++) @{number}[k] = SPREAD({self._in_loop(list(start))});\n"
+            text += f"FN_product({len(x)}, {size}, {tables}, {where}, @{number});"
+            self.known[key] = Ref(self._append(Statement(text, size, _mentioned(text) - {number})))
+        return [Ref(self.known[key].statement, i) for i in range(len(start))]
+
+    def sum(self, atoms: Iterable[Atom]) -> Atom:
+        """The sum, by a call where the numbers lie in a long row."""
+        terms = [x for x in atoms if x != 0.0]
+        if len(terms) >= LOOP and _run([(x,) for x in terms], 0) == len(terms) and isinstance(terms[0], Ref):
+            where = self.pointer(terms)
+            key = ("sum", where, len(terms))
+            if key not in self.known:
+                text = f"const REAL @{len(self.statements)} = FN_sum({len(terms)}, {where});"
+                self.known[key] = Ref(self._append(Statement(text, 0, _mentioned(where))))
+            return self.known[key]
+        total: Atom = 0.0
+        for x in terms:
+            total = add(self, total, x)
+        return total
+
+    def inverse(self, matrix: np.ndarray) -> np.ndarray:
+        """The inverse of a matrix (n, n) of atoms."""
+        where, n = self.pointer(list(matrix.flat)), len(matrix)
+        number = len(self.statements)
+        text = f"FN_inverse({n}, {where}, @{number});"
+        self._append(Statement(text, n * n, _mentioned(where)))
+        return np.array([Ref(number, i) for i in range(n * n)] + [None], object)[:-1].reshape(n, n)
+
+    def _append(self, statement: Statement) -> int:
+        self.statements.append(statement)
+        return len(self.statements) - 1
+
+
+def add(program: Program, a: Atom, b: Atom) -> Atom:
+    """The sum of two numbers."""
+    value = fold_add(a, b)
+    return program.scalar("{0} + {1}", (a, b)) if value is None else value
+
+
+def multiply(program: Program, a: Atom, b: Atom) -> Atom:
+    """The product of two numbers."""
+    value = fold_multiply(a, b)
+    if value is None and -1.0 in (a, b):
+        return program.scalar("-{0}", (b if a == -1.0 else a,))
+    return program.scalar("{0} * {1}", (a, b)) if value is None else value
+
+
+def fold_add(a: Atom, b: Atom) -> Atom | None:
+    """The sum where it needs no operation, else None."""
+    if isinstance(a, Ref):
+        return a if not isinstance(b, Ref) and b == 0.0 else None
+    if isinstance(b, Ref):
+        return b if a == 0.0 else None
+    return a + b
+
+
+def fold_multiply(a: Atom, b: Atom) -> Atom | None:
+    """The product where it needs no operation, else None."""
+    if not isinstance(a, Ref) and not isinstance(b, Ref):
+        return a * b
+    for number, other in ((a, b), (b, a)):
+        if not isinstance(number, Ref):
+            return 0.0 if number == 0.0 else other if number == 1.0 else None
+    return None
+
+
+def literal(value: float) -> str:
+    """A constant, which `herglotz.export.c_header` rounds and marks by the number type."""
+    text = repr(float(value))
+    return f"R({text})" if value >= 0 else f"(-R({text[1:]}))"
+
+
+def _reads(atoms: Iterable[Atom]) -> set[int]:
+    reads: set[int] = set()
+    for x in atoms:
+        if isinstance(x, Compared):
+            reads |= _reads((x.a, x.b))
+        elif isinstance(x, Ref):
+            reads.add(x.statement)
+    return reads
+
+
+def _mentioned(text: str) -> set[int]:
+    return {int(x) for x in NAME.findall(text)}
+
+
+def _run(entries: Sequence[tuple[Atom, ...]], start: int) -> int:
+    """How many entries from `start` on one loop can read: operands are constants, one number, or evenly spaced."""
+    first, count = entries[start], 1
+    strides: list[int | None] | None = None
+    while start + count < len(entries):
+        entry = entries[start + count]
+        steps = [_step(a, b, count) for a, b in zip(first, entry, strict=True)]
+        if None in steps or (strides is not None and steps != strides):
+            break
+        strides = steps
+        count += 1
+    return count
+
+
+def _step(a: Atom, b: Atom, distance: int) -> int | None:
+    """The stride between two entries of a row; None where there is none."""
+    if isinstance(a, Ref) and isinstance(b, Ref) and a.statement == b.statement:
+        gap = b.index - a.index
+        return gap // distance if gap % distance == 0 else None
+    if isinstance(a, Compared) or isinstance(b, Compared):
+        return None
+    return None if isinstance(a, Ref) or isinstance(b, Ref) else 0

@@ -1,0 +1,73 @@
+"""A model as one `.pt2` file that steps with PyTorch alone, without this package."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.export.metadata import METADATA, describe, to_json
+from herglotz.export.newton import ITERATIONS
+from herglotz.export.programs import programs_of, quiet
+from herglotz.models import ContactLagrangian
+
+
+def export_pt2(
+    model: ContactLagrangian,
+    path: PathLike,
+    *,
+    h: float,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    metadata: Mapping[str, Any] | None = None,
+    newton_iterations: int = ITERATIONS,
+) -> Path:
+    """Write the model's flow as a `.pt2` file: graphs of tensor operations that any PyTorch of this version runs.
+
+    It holds four programs. `model`, the one that `torch.export.load(path).module()` gives on a machine without
+    herglotz, is one step (q, p, s, h) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state;
+    `rollout` is K steps with both loops inside; `linearise` is one step and its Jacobian; `init` makes (p1, s1) from
+    (q0, q1, s0, h). The batch size is free and
+    every step h > 0 is accepted. A model with inputs takes u after h. With a box, outside is 1 where a step starts or
+    ends beyond it, plus 2 where h is beyond `h_range`.
+
+    Parameters
+    ----------
+    model
+        In float32 or float64, which becomes the dtype of the file; not changed.
+    path
+        Where to write, atomically; the name should end in `.pt2`.
+    h
+        Typical step of the model, in the data's time unit: recorded, not imposed.
+    box
+        Where the model was fitted: q_low, q_high, p_low, p_high (n numbers each), s_low, s_high (one each).
+    units
+        Unit of each coordinate.
+    metadata
+        Further JSON-ready entries; they may not replace those written here. `h_range` = (low, high) makes the loaders
+        refuse other steps, and the file flag them.
+    newton_iterations
+        Bound on the Newton iterations of a step, at least 2.
+
+    Returns
+    -------
+    Path
+        The file written.
+
+    Raises
+    ------
+    InputError
+        If h, box, units or metadata are not usable, or the file cannot be written.
+    """
+    entries = describe(model, h, box, units, newton_iterations, metadata or {})
+    text = to_json(entries)
+    with quiet():
+        programs = programs_of(model, entries, ("model", "rollout", "linearise", "init"))
+        from torch.export.pt2_archive._package import package_pt2  # what torch.export.save calls for a single program
+
+        buffer = io.BytesIO()
+        package_pt2(buffer, exported_programs=programs, extra_files={METADATA: text})
+    write_atomically(path, buffer.getvalue())
+    return Path(path)

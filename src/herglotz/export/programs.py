@@ -1,0 +1,84 @@
+"""The programs of an exported file, traced once for every format: one step, K steps, and the start from positions."""
+
+from __future__ import annotations
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.export import Dim, ExportedProgram
+
+from herglotz.export.equation import Equations, batched, example
+from herglotz.export.inline import inlined, opaque
+from herglotz.export.module import InitModule, LinearisedModule, RolloutModule, StepModule
+from herglotz.export.step import StepGraphs
+from herglotz.models import ContactLagrangian
+
+EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
+
+
+def programs_of(
+    model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str]
+) -> dict[str, ExportedProgram]:
+    """Those programs of `model` (a differentiable step), `rollout`, `linearise` and `init` that are named.
+
+    Each holds for any batch size; `entries` is the file's metadata.
+    """
+    equations = Equations.of(model)
+    graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
+    q, p, s, *more = example(equations.model, entries["h"])
+    stacked = [x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in more]
+    iterations = entries["newton_iterations"]
+    make = {
+        "model": lambda: _program(StepModule(equations, iterations, graphs=graphs), (q, p, s, *more)),
+        "rollout": lambda: _program(RolloutModule(graphs, iterations), (q, p, s, *stacked), stacked=3),
+        "linearise": lambda: _program(LinearisedModule(graphs, equations.jacobian, iterations), (q, p, s, *more)),
+        "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
+    }
+    return {name: make[name]() for name in names}
+
+
+def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: int | None = None) -> ExportedProgram:
+    """Export for any batch size; arguments from `stacked` on have a leading axis of steps, free as well."""
+    one = {0: Dim.DYNAMIC}
+    count = len(arguments)
+    split = count if stacked is None else stacked
+    shapes = tuple(one if i < split else {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} for i in range(count))
+    with torch.no_grad(), opaque(module):
+        program = torch.export.export(module, arguments, dynamic_shapes=batched(module, shapes))
+    return _slim(inlined(program))
+
+
+def _slim(program: ExportedProgram) -> ExportedProgram:
+    """Drop stack traces (most of the file, and full of local paths) and give constants their own storage.
+
+    Index tensors are views of one storage; torch saves such a group in one piece, and warns that it may be wrong.
+    """
+    for module in program.graph_module.modules():
+        for node in getattr(module, "graph", program.graph).nodes:
+            for key in ("stack_trace", "nn_module_stack", "source_fn_stack"):
+                node.meta.pop(key, None)
+    for name, value in list(program.constants.items()):
+        if isinstance(value, Tensor):
+            program.constants[name] = value.clone()
+    return program
+
+
+@contextmanager
+def quiet() -> Iterator[None]:
+    """Without the remarks that torch's exporters make on their own code."""
+    logs = [logging.getLogger(name) for name in ("torch.export", "torch.onnx", "torch._inductor")]
+    levels = [log.level for log in logs]
+    for log in logs:
+        log.setLevel(logging.CRITICAL)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        for log, level in zip(logs, levels, strict=True):
+            log.setLevel(level)

@@ -1,0 +1,168 @@
+/* Functions that compilers vectorise, and rows of them. */
+
+/* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r in z = r^2. */
+#if hz_SINGLE
+#define hz_LIMIT 20.0
+#define hz_LN2_HIGH 6.93359375e-01
+#define hz_LN2_LOW -2.12194440e-04
+#define hz_BIAS 127
+#define hz_MANTISSA 23
+#define hz_EXP_TERMS(r)                                                                                              \
+  (((((hz_R(1.0 / 5040) * r + hz_R(1.0 / 720)) * r + hz_R(1.0 / 120)) * r + hz_R(1.0 / 24)) * r + hz_R(1.0 / 6)) * r + \
+   hz_R(0.5))
+#define hz_ARTANH_TERMS(z)                                                                                            \
+  (((((((hz_R(1.0 / 15) * z + hz_R(1.0 / 13)) * z + hz_R(1.0 / 11)) * z + hz_R(1.0 / 9)) * z + hz_R(1.0 / 7)) * z +    \
+     hz_R(1.0 / 5)) * z + hz_R(1.0 / 3)) * z + hz_R(1.0))
+#else
+#define hz_LIMIT 40.0
+#define hz_LN2_HIGH 6.93147180369123816490e-01
+#define hz_LN2_LOW 1.90821492927058770002e-10
+#define hz_BIAS 1023
+#define hz_MANTISSA 52
+#define hz_EXP_TERMS(r)                                                                                               \
+  (((((((((((hz_R(1.0 / 6227020800.0) * r + hz_R(1.0 / 479001600)) * r + hz_R(1.0 / 39916800)) * r +                   \
+           hz_R(1.0 / 3628800)) * r + hz_R(1.0 / 362880)) * r + hz_R(1.0 / 40320)) * r + hz_R(1.0 / 5040)) * r +       \
+       hz_R(1.0 / 720)) * r + hz_R(1.0 / 120)) * r + hz_R(1.0 / 24)) * r + hz_R(1.0 / 6)) * r + hz_R(0.5))
+#define hz_ARTANH_TERMS(z)                                                                                            \
+  (((((((((((((((((hz_R(1.0 / 35) * z + hz_R(1.0 / 33)) * z + hz_R(1.0 / 31)) * z + hz_R(1.0 / 29)) * z +              \
+                hz_R(1.0 / 27)) * z + hz_R(1.0 / 25)) * z + hz_R(1.0 / 23)) * z + hz_R(1.0 / 21)) * z +                \
+            hz_R(1.0 / 19)) * z + hz_R(1.0 / 17)) * z + hz_R(1.0 / 15)) * z + hz_R(1.0 / 13)) * z +                    \
+        hz_R(1.0 / 11)) * z + hz_R(1.0 / 9)) * z + hz_R(1.0 / 7)) * z + hz_R(1.0 / 5)) * z + hz_R(1.0 / 3)) * z +      \
+   hz_R(1.0))
+#endif
+
+/* exp(y) - 1 = 2^k (exp(r) - 1) + 2^k - 1 with |r| <= ln(2)/2, for |y| cut off at hz_LIMIT: a few units in the last
+   place, without branches or calls. Needs IEEE 754 numbers. NaN stays. */
+static inline hz_real hz_growth(hz_real y) {
+  hz_pun two;
+  hz_real r;
+  int k;
+  y = y > hz_R(hz_LIMIT) ? hz_R(hz_LIMIT) : y;
+  y = y < hz_R(-hz_LIMIT) ? hz_R(-hz_LIMIT) : y;
+  r = y == y ? y * hz_R(1.44269504088896340736) : hz_R(0.0);
+  k = (int)(r + (r < hz_R(0.0) ? hz_R(-0.5) : hz_R(0.5)));
+  r = (y - (hz_real)k * hz_R(hz_LN2_HIGH)) - (hz_real)k * hz_R(hz_LN2_LOW);
+  two.bits = (hz_bits_t)(k + hz_BIAS) << hz_MANTISSA;
+  return two.number * (r + r * r * hz_EXP_TERMS(r)) + (two.number - hz_R(1.0));
+}
+
+static inline hz_real hz_tanh(hz_real x) {
+  const hz_real e = hz_growth(hz_R(2.0) * x);
+  return e / (e + hz_R(2.0));
+}
+
+static inline hz_real hz_sigmoid(hz_real x) { return hz_R(0.5) + hz_R(0.5) * hz_tanh(hz_R(0.5) * x); }
+
+/* log(1 + e^x), by log(1 + y) = 2 artanh(y / (2 + y)) with y = e^-|x|. */
+static inline hz_real hz_softplus(hz_real x) {
+  const hz_real size = hz_fabs(x), y = hz_R(1.0) + hz_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
+  return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
+}
+
+#ifdef __GNUC__
+/* Registers of numbers, as wide as the processor's, with GCC and clang: what they hold side by side is the units of a
+   layer or, in batches, the samples. Any other compiler goes number by number. */
+#if defined(__AVX512F__)
+#define hz_LANE_BYTES 64
+#elif defined(__AVX__)
+#define hz_LANE_BYTES 32
+#else
+#define hz_LANE_BYTES 16
+#endif
+#if hz_SINGLE
+typedef int hz_signed_t;
+#else
+typedef long long hz_signed_t;
+#endif
+typedef hz_real hz_lanes __attribute__((vector_size(hz_LANE_BYTES), may_alias));
+typedef hz_real hz_part __attribute__((vector_size(hz_LANE_BYTES), aligned(sizeof(hz_real)), may_alias));
+typedef hz_signed_t hz_masks __attribute__((vector_size(hz_LANE_BYTES)));
+typedef int hz_counts __attribute__((vector_size(hz_LANE_BYTES / sizeof(hz_real) * sizeof(int))));
+enum { hz_LANES = (int)(hz_LANE_BYTES / sizeof(hz_real)) };
+
+static inline hz_lanes hz_spread(hz_real x) {
+  hz_lanes y = {hz_R(0.0)};
+  return y + x;
+}
+
+static inline hz_lanes hz_select(hz_masks where, hz_lanes a, hz_lanes b) {
+  return (hz_lanes)((where & (hz_masks)a) | (~where & (hz_masks)b));
+}
+
+static inline hz_lanes hz_wide_growth(hz_lanes y) {
+  const hz_lanes most = hz_spread(hz_R(hz_LIMIT)), zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
+  hz_lanes r, whole;
+  hz_counts k;
+  hz_masks two;
+  y = hz_select((hz_masks)(y > most), most, y);
+  y = hz_select((hz_masks)(y < -most), -most, y);
+  r = hz_select((hz_masks)(y == y), y * hz_R(1.44269504088896340736), zero);
+  r += hz_select((hz_masks)(r < zero), -half, half);
+  k = __builtin_convertvector(r, hz_counts);
+  whole = __builtin_convertvector(k, hz_lanes);
+  r = (y - whole * hz_R(hz_LN2_HIGH)) - whole * hz_R(hz_LN2_LOW);
+  two = __builtin_convertvector(k + hz_BIAS, hz_masks) << hz_MANTISSA;
+  return (hz_lanes)two * (r + r * r * hz_EXP_TERMS(r)) + ((hz_lanes)two - hz_R(1.0));
+}
+
+static inline hz_lanes hz_wide_fabs(hz_lanes x) { return hz_select((hz_masks)(x < hz_spread(hz_R(0.0))), -x, x); }
+
+static inline hz_lanes hz_wide_tanh(hz_lanes x) {
+  const hz_lanes e = hz_wide_growth(hz_R(2.0) * x);
+  return e / (e + hz_R(2.0));
+}
+
+static inline hz_lanes hz_wide_sigmoid(hz_lanes x) { return hz_R(0.5) + hz_R(0.5) * hz_wide_tanh(hz_R(0.5) * x); }
+
+static inline hz_lanes hz_wide_softplus(hz_lanes x) {
+  const hz_lanes size = hz_wide_fabs(x), y = hz_R(1.0) + hz_wide_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
+  return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
+}
+
+/* A function of <math.h>, lane by lane. */
+#define hz_LANE_BY_LANE(function)                           \
+  static inline hz_lanes hz_wide_##function(hz_lanes x) {   \
+    int w;                                                  \
+    for (w = 0; w < hz_LANES; w++) x[w] = hz_##function(x[w]); \
+    return x;                                               \
+  }
+hz_LANE_BY_LANE(sin)
+hz_LANE_BY_LANE(cos)
+hz_LANE_BY_LANE(exp)
+hz_LANE_BY_LANE(expm1)
+hz_LANE_BY_LANE(sqrt)
+hz_LANE_BY_LANE(atanh)
+#undef hz_LANE_BY_LANE
+
+static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {
+  int w;
+  for (w = 0; w < hz_LANES; w++) x[w] = hz_pow(x[w], power);
+  return x;
+}
+
+#define hz_PARTS_OF(function) \
+  for (; k + hz_LANES <= count; k += hz_LANES) *(hz_part *)(y + k) = hz_wide_##function(*(const hz_part *)(x + k));
+#define hz_WIDE_ROW_OF(function)                                                               \
+  static inline void hz_wide_##function##_row(int count, const hz_lanes *x, hz_lanes *y) {     \
+    int k;                                                                                     \
+    for (k = 0; k < count; k++) y[k] = hz_wide_##function(x[k]);                               \
+  }
+#else
+#define hz_PARTS_OF(function)
+#define hz_WIDE_ROW_OF(function)
+#endif
+
+/* y_k = f(x_k) of a whole row. */
+#define hz_ROW_OF(function)                                                              \
+  static inline void hz_##function##_row(int count, const hz_real *x, hz_real *y) {      \
+    int k = 0;                                                                           \
+    hz_PARTS_OF(function)                                                                \
+    for (; k < count; k++) y[k] = hz_##function(x[k]);                                   \
+  }                                                                                      \
+  hz_WIDE_ROW_OF(function)
+hz_ROW_OF(tanh)
+hz_ROW_OF(sigmoid)
+hz_ROW_OF(softplus)
+#undef hz_ROW_OF
+#undef hz_PARTS_OF
+#undef hz_WIDE_ROW_OF

@@ -1,0 +1,153 @@
+/* Loops over samples around the header, for `herglotz.export.c_stepper`: not part of what is exported. */
+
+#include "stepper.h"
+
+#if hz_INPUTS
+#define U(expression) (expression),
+#else
+#define U(expression)
+#endif
+
+static void load(const hz_real *q, const hz_real *p, const hz_real *s, long b, hz_state *x) {
+  int i;
+  for (i = 0; i < hz_N; i++) {
+    x->q[i] = q[b * hz_N + i];
+    x->p[i] = p[b * hz_N + i];
+  }
+  x->s = s[b];
+  x->sigma = (hz_real)1.0;
+}
+
+static void store(const hz_state *x, long at, hz_real *q_out, hz_real *p_out, hz_real *s_out, hz_real *sigma_out) {
+  int i;
+  for (i = 0; i < hz_N; i++) {
+    q_out[at * hz_N + i] = x->q[i];
+    p_out[at * hz_N + i] = x->p[i];
+  }
+  s_out[at] = x->s;
+  sigma_out[at] = x->sigma;
+}
+
+#ifdef hz_BATCHED
+/* The samples b .. b + LANES of herglotz_rollouts. */
+static void lanes(long b, long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s,
+    const hz_real *h, long h_sample, long h_step, const hz_real *u, long u_sample, hz_real *q_out, hz_real *p_out,
+    hz_real *s_out, hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
+  hz_wide_state x;
+  hz_wide_track track;
+  hz_state one;
+  hz_real now[hz_LANES], left[hz_LANES];
+  const hz_real *push[hz_LANES];
+  int status[hz_LANES], w, count = batch - b < hz_LANES ? (int)(batch - b) : hz_LANES;
+  long k;
+  for (w = 0; w < hz_LANES; w++) {
+    load(q, p, s, w < count ? b + w : batch - 1, &one);
+    hz_wide_set(&x, w, &one);
+    status[w] = hz_CONVERGED;
+  }
+  hz_wide_track_start(&x, &track);
+  for (k = 0; k <= steps; k++) {
+    int before[hz_LANES];
+    for (w = 0; w < hz_LANES; w++) {
+      const long sample = w < count ? b + w : batch - 1;
+      before[w] = status[w];
+      if (k > 0) now[w] = h[sample * h_sample + (k - 1) * h_step];
+      push[w] = u && k > 0 ? u + sample * u_sample + (k - 1) * hz_M : 0;
+    }
+    (void)push;
+    if (k > 0) hz_wide_advance(&x, &track, now, U(push) status, left);
+    for (w = 0; w < count; w++) {
+      if (before[w]) continue;
+      if (k > 0) {
+        status_out[(b + w) * steps + k - 1] = (unsigned char)status[w];
+        residual_out[(b + w) * steps + k - 1] = left[w];
+      }
+      if (status[w]) continue;
+      hz_wide_get(&x, w, &one);
+      store(&one, (b + w) * (steps + 1) + k, q_out, p_out, s_out, sigma_out);
+    }
+  }
+}
+#endif
+
+/* Rollouts of `batch` samples; outputs are (batch, steps + 1, ...), statuses and residuals (batch, steps). The outputs
+   arrive full of NaN and the statuses full of hz_DIVERGED: nothing is written after a failure but its own status. */
+void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
+    long h_sample, long h_step, const hz_real *u, long u_sample, hz_real *q_out, hz_real *p_out, hz_real *s_out,
+    hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
+  long b, k;
+  (void)u;
+  (void)u_sample;
+#ifdef hz_BATCHED
+  if (batch > 1) {
+    for (b = 0; b < batch; b += hz_LANES)
+      lanes(b, batch, steps, q, p, s, h, h_sample, h_step, u, u_sample, q_out, p_out, s_out, sigma_out, status_out,
+          residual_out);
+    return;
+  }
+#endif
+  for (b = 0; b < batch; b++) {
+    hz_state x;
+    hz_track track;
+    load(q, p, s, b, &x);
+    hz_track_start(&x, &track);
+    for (k = 0; k <= steps; k++) {
+      if (k > 0) {
+        const long step = b * steps + k - 1;
+        const hz_real now = h[b * h_sample + (k - 1) * h_step];
+        hz_real left = (hz_real)0.0;
+        const int status = hz_advance(&x, &track, now, U(u ? u + b * u_sample + (k - 1) * hz_M : 0) &left);
+        status_out[step] = (unsigned char)status;
+        residual_out[step] = left;
+        if (status) break;
+      }
+      store(&x, b * (steps + 1) + k, q_out, p_out, s_out, sigma_out);
+    }
+  }
+}
+
+#if hz_DERIVATIVES
+/* Steps of `batch` samples with their derivatives; h and u are one a sample. Outputs arrive full of NaN. */
+void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
+    const hz_real *u, hz_real *q_out, hz_real *p_out, hz_real *s_out, hz_real *sigma_out, unsigned char *status_out,
+    hz_real *residual_out, hz_real *by_state, hz_real *by_input, hz_real *by_h) {
+  const long size = 2 * hz_N + 1;
+  long b;
+  (void)u;
+  (void)by_input;
+  for (b = 0; b < batch; b++) {
+    hz_state x;
+    int status;
+    load(q, p, s, b, &x);
+    status = hz_step_jacobian(&x, h[b], U(u ? u + b * hz_M : 0) residual_out + b, by_state + b * size * size,
+        U(by_input + b * size * hz_M) by_h + b * size);
+    status_out[b] = (unsigned char)(status & 15);
+    if (!(status & 15)) store(&x, b, q_out, p_out, s_out, sigma_out);
+  }
+}
+#endif
+
+void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_real *s0, const hz_real *h,
+    long h_sample, const hz_real *u, long u_sample, hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
+  long b;
+  int i;
+  (void)u;
+  (void)u_sample;
+  for (b = 0; b < batch; b++) {
+    hz_state x;
+    const int status = hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b * h_sample], U(u ? u + b * u_sample : 0) &x) & 15;
+    status_out[b] = (unsigned char)status;
+    if (status) continue;
+    for (i = 0; i < hz_N; i++) p_out[b * hz_N + i] = x.p[i];
+    s_out[b] = x.s;
+  }
+}
+
+void herglotz_outside_box(long batch, const hz_real *q, const hz_real *p, const hz_real *s, unsigned char *out) {
+  long b;
+  for (b = 0; b < batch; b++) {
+    hz_state x;
+    load(q, p, s, b, &x);
+    out[b] = hz_outside_box(&x) != 0;
+  }
+}

@@ -1,0 +1,44 @@
+#ifdef __cplusplus
+#define hz_RESTRICT
+#else
+#define hz_RESTRICT restrict
+#endif
+
+#if hz_SINGLE
+#define hz_sin sinf
+#define hz_cos cosf
+#define hz_exp expf
+#define hz_expm1 expm1f
+#define hz_sqrt sqrtf
+#define hz_atanh atanhf
+#define hz_pow powf
+#define hz_fabs fabsf
+#define hz_floor_of floorf
+#else
+#define hz_sin sin
+#define hz_cos cos
+#define hz_exp exp
+#define hz_expm1 expm1
+#define hz_sqrt sqrt
+#define hz_atanh atanh
+#define hz_pow pow
+#define hz_fabs fabs
+#define hz_floor_of floor
+#endif
+
+/* What a step returns: `status & 15` is 0 where it succeeded; the bits above are flags. */
+enum {
+  hz_CONVERGED = 0,
+  hz_MAX_ITERATIONS = 1,
+  hz_SINGULAR = 2,     /* det J = 0 or c = 0: the step is not defined there */
+  hz_DIVERGED = 3,     /* a value stopped being finite */
+  hz_BAD_INPUT = 5,    /* h <= 0, or a number that is not finite */
+  hz_OUTSIDE_BOX = 16, /* a separate bit: a state outside the box of the fitted data; the step is done */
+  hz_OUTSIDE_H = 32    /* a separate bit: h outside [hz_h_low, hz_h_high]; the step is done */
+};
+
+/* A state. q in hz_units; p in the units of D2 L_d, s in those of L_d; sigma is the product of the factors c of the
+   steps so far (start it at 1). */
+typedef struct {
+  hz_real q[hz_N], p[hz_N], s, sigma;
+} hz_state;

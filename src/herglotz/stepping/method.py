@@ -1,0 +1,124 @@
+"""What a stepper is: `step` takes one step, and the one driver of rollouts takes any number of them."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.stepping.events import Event, Watch
+from herglotz.stepping.rollout import Drive, OneStep, Plan, Track, roll_out
+from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
+
+
+class OneStepMethod(ABC):
+    """A stepper of states (q, p, s). A concrete one implements `step`; what follows is the same for all."""
+
+    throw: bool = False  # raise `StepError` at the first sample that fails
+
+    @abstractmethod
+    def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
+        """One step of h > 0, scalar or (...)."""
+
+    def rollout(
+        self,
+        q: Tensor,
+        p: Tensor,
+        s: Tensor | None = None,
+        *,
+        h: Tensor | float,
+        steps: int | None = None,
+        inputs: Tensor | None = None,
+        every: int = 1,
+        events: Sequence[Event | Callable[[State], Tensor]] = (),
+        checkpoint: int | None = None,
+        chunk: int = 1024,
+    ) -> Rollout:
+        """Step K times from (q, p, s).
+
+        Parameters
+        ----------
+        q, p
+            (..., n).
+        s
+            (...); default 0.
+        h
+            A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
+        steps
+            K; needed for a scalar h without inputs only.
+        inputs
+            (K, m) or (..., K, m): u_k of each step, for an L_d with `at(u)`.
+        every
+            Keep each m-th state only; m divides K. Statuses and residuals are the worst of the m steps.
+        events
+            `Event`s, or functions of the state that stop a sample where they change sign. A sample that stopped keeps
+            its state at the event, with `Status.STOPPED`. The time of an event is a constant for the gradient.
+        checkpoint
+            Length of the segments whose inner steps the backward pass computes again: with K steps, memory for about
+            K / length + length of them instead of K. Without gradients it does nothing.
+        chunk
+            Steps gathered before they are written into the result.
+
+        Returns
+        -------
+        Rollout
+            K/m + 1 states and K/m statuses.
+
+        Raises
+        ------
+        InputError
+            If h is not positive, lengths disagree, no inputs are taken, or options do not fit together.
+        """
+        start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
+        if inputs is not None:
+            inputs = torch.as_tensor(inputs, dtype=q.dtype, device=q.device)
+            self._check_inputs(inputs)
+            steps = inputs.shape[-2] if steps is None and torch.as_tensor(h).ndim == 0 else steps
+        if events and checkpoint is not None:
+            raise InputError("events and checkpoint exclude one another; leave one out")
+        watch = Watch(events, start) if events else None
+        track = self._roll_out(start, h, steps, inputs, watch, every=every, chunk=chunk, checkpoint=checkpoint)
+        q, p, s = track.states
+        return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events)
+
+    def _roll_out(
+        self,
+        start: Any,
+        h: Tensor | float,
+        steps: int | None,
+        inputs: Tensor | None = None,
+        watch: Watch | None = None,
+        **plan: Any,
+    ) -> Track:
+        """The rollout of any named tuple of tensors whose last entry is (...)."""
+        h_all = step_sizes(check_h(h, start[-1]), steps)
+        if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
+            raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
+        cut = Plan(h_all.shape[-1], **plan)
+        return roll_out(start, Drive(self._single_step, h_all, cut, inputs, watch, self._iterates, self._check_step))
+
+    def _checked(self, state: State) -> State:
+        """The state, if this stepper can start from it."""
+        return check_state(state)
+
+    def _check_inputs(self, inputs: Tensor) -> None:
+        """Refuse inputs that this stepper does not take."""
+        raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
+
+    @property
+    def _iterates(self) -> bool:
+        """Whether steps want a guess."""
+        return False
+
+    def _single_step(self) -> OneStep:
+        """The function that a rollout's steps are taken by."""
+        return lambda state, h, guess, u, low: (self.step(state, h, guess), None)  # noqa: ARG005  one signature for all
+
+    def _check_step(self, step: Step, state: Any, h: Tensor, u: Tensor | None) -> None:  # noqa: ARG002
+        """With `throw`, raise `StepError` if a sample failed."""
+        if self.throw:
+            throw_failure(step.status, step.residual)

@@ -1,0 +1,187 @@
+"""One step of one discrete Lagrangian, by the cheapest way its form allows: closed form, increments, or positions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import (
+    DiscreteLagrangian,
+    Driven,
+    Partials,
+    momentum_plus,
+    momentum_residual,
+    partials,
+)
+from herglotz.mechanics.newton import Found, attached
+from herglotz.mechanics.regularity import regularity
+from herglotz.stepping.equation import End, ModelEquation, PartialsEquation, StepEquation, StepOfModel, model_equation
+from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
+from herglotz.stepping.field import Field
+from herglotz.stepping.newton import Increments, find_root, status_of
+from herglotz.stepping.state import State, Status, Step
+
+
+class SingleStep:
+    """Steps whose inputs are already checked; keeps what consecutive steps share (the force at the common point).
+
+    In float32 steps are taken in increments Δ = q1 − q0 where L_d offers them, and rollouts sum them compensated:
+    q1 − q0 and q0 + Δ would round away a small step.
+    """
+
+    def __init__(self, L_d: DiscreteLagrangian, tol: float | None, max_iterations: int, explicit: bool):
+        self.L_d, self.tol, self.max_iterations = L_d, tol, max_iterations
+        self.leapfrog: Leapfrog | None = leapfrog(L_d) if explicit else None
+        self._field: Field | None = None  # the potential at self._at
+        self._at: Tensor | None = None
+        self._terms: ModelEquation | None = None  # made at the first step that iterates
+        self._tried = False
+        self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
+
+    def __call__(
+        self,
+        state: State,
+        h: Tensor,
+        guess: Tensor | None = None,
+        u: Tensor | None = None,
+        low: State | None = None,
+    ) -> tuple[Step, State | None]:
+        """The step with input u, and the rounding errors to carry on; `low` is what the step before has handed on."""
+        if self.leapfrog is not None:
+            return self._explicit(self.leapfrog, state, h, u, low)
+        return self._implicit(state, h, state.q if guess is None else guess, u, low)
+
+    def _explicit(
+        self, frog: Leapfrog, state: State, h: Tensor, u: Tensor | None, low: State | None
+    ) -> tuple[Step, State | None]:
+        q0, p0, s0 = state
+        increments = _low_precision(q0)
+        move = frog(q0, p0, s0, h, self._field if self._at is q0 else None, u, increments)
+        if move.dp is not None:
+            new, low = _compensated(state, State(move.delta, move.dp, move.L), low)
+        else:
+            new, low = State(move.q1, move.p1, s0 + move.L), None
+        with torch.no_grad():
+            status = explicit_status(*new, move.c, frog.regular(h))
+        good = status is None
+        if self._fine is None or self._fine[1].shape != s0.shape:
+            zero = torch.zeros_like(s0)
+            self._fine = zero.to(torch.uint8), zero
+        step = _report(new, move.c, self._fine[0] if status is None else status, self._fine[1], 1, good)
+        self._at, self._field = step.state.q, move.there
+        return step, low
+
+    def _implicit(
+        self, state: State, h: Tensor, guess: Tensor, u: Tensor | None, low: State | None
+    ) -> tuple[Step, State | None]:
+        q0, p0, s0 = state
+        L_d = driven_by(self.L_d, u)
+        increments = _low_precision(q0) and hasattr(L_d, "partials_increment")
+        # What is left of q1 goes into p divided by h at every step, and adds up: steps are solved to rounding.
+        tol = self.tol if self.tol is not None else 4 * torch.finfo(q0.dtype).eps
+        order = 2 if torch.is_grad_enabled() else 1
+        with torch.no_grad():
+            equation = self._equation(L_d, state, h, u, increments, order)
+            found = find_root(equation, q0, guess, tol, self.max_iterations, order, increments)
+            end = equation.end(found.x, found.point)
+            status, good = status_of(found, end)
+            if isinstance(equation, PartialsEquation):  # the terms of a model have no pole in h
+                status = _at_pole(L_d, state, h, q0 + found.x if increments else found.x, found, status)
+                good = good and not bool(status.any())
+        x = found.x
+        if order == 2:
+            assert found.point.J is not None
+            x, end = _attach(L_d, state, h, found.x, found.point.J, increments)
+        if increments:
+            new, low = _compensated(state, State(x, end.p1 - p0 if end.dp is None else end.dp, end.L), low)
+            new = new._replace(p=end.p1) if end.dp is None else new
+        else:
+            new = State(x, end.p1, s0 + end.L)
+        step = _report(new, end.c, status, found.residual, found.iterations, good)
+        if isinstance(equation, StepOfModel):
+            self._at, self._field = step.state.q, equation.there
+        return step, low
+
+    def _equation(
+        self, L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, increments: bool, order: int
+    ) -> StepEquation:
+        """The step equation: by terms for a model, else by the partials of L_d."""
+        if not self._tried:
+            self._tried, self._terms = True, model_equation(self.L_d)
+        if self._terms is None:
+            return PartialsEquation(L_d, *state, h, order, increments)
+        return self._terms.at(*state, h, u, increments, self._field if self._at is state.q else None)
+
+
+def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:
+    """The discrete Lagrangian of a step with input u.
+
+    Raises
+    ------
+    InputError
+        If there is an input and L_d takes none.
+    """
+    if u is None:
+        return L_d
+    if not isinstance(L_d, Driven):
+        raise InputError(f"{type(L_d).__name__} takes no inputs: it has no method `at(u)`; leave the inputs out")
+    return L_d.at(u)
+
+
+def _at_pole(L_d: DiscreteLagrangian, state: State, h: Tensor, q1: Tensor, found: Found, status: Tensor) -> Tensor:
+    """The status of every sample, SINGULAR where L_d has a pole at this h: q1 is right there, p1 and s1 are rounding.
+
+    |F| / |J⁻¹F| tells the size of J for nothing, and eps |J| |q| the rounding of p1. Only where that leaves p1
+    less than a third of its digits, as it may also for a body almost at rest, L_d is asked beside h.
+    """
+    q0, p0, s0 = state
+    size = torch.maximum(q0.abs(), q1.abs()).amax(-1)
+    F = found.point.F.abs().amax(-1)
+    eps = torch.finfo(F.dtype).eps
+    momenta = p0.abs().amax(-1) + found.point.rest.L.abs() / size
+    suspect = (eps * size * F > eps ** (1 / 3) * momenta * found.residual) & (status == Status.CONVERGED)
+    if not bool(suspect.any()):
+        return status
+    pole = regularity(L_d, q0, q1, s0, h).lost("pole")
+    return torch.where(suspect & pole, torch.full_like(status, Status.SINGULAR), status)
+
+
+def _attach(
+    L_d: DiscreteLagrangian, state: State, h: Tensor, x: Tensor, J: Tensor, increments: bool
+) -> tuple[Tensor, End]:
+    """Give the solved x its derivative: one Newton step, which is zero in value and dx = −J⁻¹ dF in slope."""
+    q0, p0, s0 = state
+    P = _evaluate(L_d, q0, x, s0, h, increments)
+    F = momentum_residual(P, p0)
+    if P.force is not None and P.force.held is not None and not increments:  # what is held has q1 = q0
+        F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
+    x = attached(x, J, F)
+    P = _evaluate(L_d, q0, x, s0, h, increments)
+    return x, End(momentum_plus(P), P.L, P.c)
+
+
+def _evaluate(L_d: DiscreteLagrangian, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, increments: bool) -> Partials:
+    """First derivatives at (q0, x) or, in increments, at (q0, q0 + x)."""
+    if increments:
+        assert isinstance(L_d, Increments)
+        return L_d.partials_increment(q0, x, s0, h, 1)
+    return partials(L_d, q0, x, s0, h)
+
+
+def _low_precision(x: Tensor) -> bool:
+    return x.element_size() < 8
+
+
+def _compensated(state: State, change: State, low: State | None) -> tuple[State, State]:
+    """Kahan's sum: state + change, and what rounding took from it, to be added to the next change."""
+    wanted = change if low is None else State(*(a + b for a, b in zip(change, low, strict=True)))
+    new = State(*(a + b for a, b in zip(state, wanted, strict=True)))
+    with torch.no_grad():
+        lost = State(*(b - (c - a) for a, b, c in zip(state, wanted, new, strict=True)))
+    return new, lost
+
+
+def _report(new: State, c: Tensor, status: Tensor, residual: Tensor, iterations: int, good: bool) -> Step:
+    """The step; `good`: no sample failed."""
+    return (Step if good else Step.of)(new, c, status, residual, iterations)

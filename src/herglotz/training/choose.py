@@ -1,0 +1,172 @@
+"""`choose`: the decisions of a fit from a `Look` at the data, each with its reason."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+from herglotz.training.config import FitConfig
+from herglotz.training.look import Look
+from herglotz.training.one_step_fit import NOISE_OF_R
+from herglotz.training.plan import Plan
+from herglotz.training.task import NOISY
+
+RESTARTS = 4  # random initialisations of a single layer: some stall at a hundred times the error of others
+
+
+class Rule(NamedTuple):
+    """One question about the objective; the first question that is answered decides."""
+
+    question: str
+    objective: str  # that a yes leads to
+    answer: Callable[[Look, FitConfig], str | None]  # the reason where the answer is yes
+
+
+def _supervised(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    which = {"q": None, "qs": "s", "qps": "s and p"}[config.supervision]
+    return which and f"supervision '{config.supervision}': only one-step errors use the recorded {which}"
+
+
+def _named(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    return None if config.objective == "auto" else "the user named it"
+
+
+def _structured(seen: Look, config: FitConfig) -> str | None:
+    return seen.structure if config.objective == "auto" != seen.settings.objective else None
+
+
+def _explained(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    if seen.baseline_motion is None:
+        return None
+    return f"the baseline's equation of motion explains every step to {seen.baseline_motion[1]:.2g}: exact"
+
+
+def _noisy(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    limit = NOISY * max(seen.base.scale)
+    if seen.probe is None or not seen.probe.rms > limit:
+        return None
+    return f"a flexible model misses single steps by {seen.probe.rms:.2g}, more than {limit:.2g}: noise"
+
+
+def _few(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    if seen.probe is None or seen.probe.enough:
+        return None
+    return f"{seen.probe.residuals} one-step errors for {seen.probe.unknowns} unknowns, fewer than two each"
+
+
+def _exact(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    assert seen.probe is not None
+    limit = NOISY * max(seen.base.scale)
+    return f"a flexible model misses single steps by {seen.probe.rms:.2g}, less than {limit:.2g}: exact"
+
+
+RULES = (
+    Rule("Are s or p fitted too?", "residual", _supervised),
+    Rule("Did the user name the objective?", "as named", _named),
+    Rule("Does a dictionary of features explain the steps?", "as found", _structured),
+    Rule("Does the baseline's equation of motion explain the steps?", "residual", _explained),
+    Rule("Does a flexible model miss single steps?", "trajectory", _noisy),
+    Rule("Are there fewer than two one-step errors an unknown?", "trajectory", _few),
+    Rule("Else", "residual", _exact),
+)
+
+
+def choose(seen: Look, user_settings: FitConfig) -> Plan:
+    """Return the plan that these data and the user's settings call for."""
+    c, base, probe = seen.settings, seen.base, seen.probe
+    objective, why = choose_objective(seen, user_settings)
+    one_step, covered = objective in ("residual", "raw"), seen.baseline_motion is not None
+    network, why_network = _network(objective, covered)
+    restarts = c.restarts or (RESTARTS if covered else 1)
+    continues = one_step and probe is not None and restarts == 1
+    sigma = None if one_step or probe is None or not probe.enough else probe.rms / NOISE_OF_R
+    own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
+    return Plan(
+        level=c.level, objective=objective, network=network, order=c.order, features=c.features,
+        forces={"coulomb": c.coulomb, "coupled": c.coupled, "diagonal": c.diagonal}, start={**own, **base.start},
+        outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
+        reasons={
+            "level": _level_reason(seen, user_settings),
+            "objective": why,
+            "network": why_network,
+            "order": _structure_reason(seen, c.order == user_settings.order),
+            "features": _structure_reason(seen, c.features == user_settings.features),
+            "forces": _structure_reason(seen, seen.structure is None),
+            "start": "least squares on finite differences" if not base.start else "one linear problem",
+            "outliers": _outlier_reason(seen),
+            "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
+            "sigma": _sigma_reason(seen, one_step, sigma),
+            "restarts": _restart_reason(user_settings, covered),
+            "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
+        },
+    )  # fmt: skip
+
+
+def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
+    """Return the objective of the first of `RULES` that is answered, and its reason."""
+    for rule in RULES:
+        reason = rule.answer(seen, user_settings)
+        if reason is not None:
+            return (rule.objective if not rule.objective.startswith("as ") else seen.settings.objective), reason
+    raise AssertionError("the last rule has no condition")
+
+
+def drawing() -> str:
+    """Return the choice of the objective as a mermaid flowchart (docs/trajectory.md)."""
+    lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
+    for k, rule in enumerate(RULES, 1):
+        if k == len(RULES):
+            lines.append(f'    q{k}["{rule.question.lower()}"] --> o{k}(["{rule.objective}"])')
+        else:
+            lines.append(f'    q{k}{{"{rule.question}"}} -- yes --> o{k}(["{rule.objective}"])')
+            lines.append(f"    q{k} -- no --> q{k + 1}")
+    return "\n".join(lines)
+
+
+def _network(objective: str, covered: bool) -> tuple[str, str]:
+    if objective == "raw":
+        return "plain", "a network alone, to show the collapse of the raw residual"
+    if objective != "residual":
+        return "potential", "noise hides what a step's correction would learn"
+    if covered:
+        return "covered", "the baseline's motions fill the holes between samples: one wide layer learns more"
+    return "correction", "exact steps show what the rule of order 2 misses"
+
+
+def _level_reason(seen: Look, config: FitConfig) -> str:
+    if config.level != "auto":
+        return "the user named it"
+    if seen.structure is not None and seen.settings.features:
+        return seen.structure
+    if seen.data.u is not None:
+        return "inputs are recorded"
+    return "dry or coupled friction is a force" if config.coulomb or config.coupled else "the simplest with damping"
+
+
+def _structure_reason(seen: Look, as_set: bool) -> str:
+    if as_set or seen.structure is None:
+        return "as set" if seen.structure is None else f"as set; {seen.structure}"
+    return seen.structure
+
+
+def _outlier_reason(seen: Look) -> str:
+    lone = int(seen.spikes.sum())
+    if seen.settings.robust != "auto":
+        return f"robust '{seen.settings.robust}' was set"
+    if lone:
+        return f"{lone} single spikes left out; there may be more"
+    return "they pull the least-squares start" if seen.outliers else "no spikes, and least squares are not pulled"
+
+
+def _sigma_reason(seen: Look, one_step: bool, sigma: float | None) -> str:
+    rough = f"polynomials through nine samples leave {seen.noise:.2g}" if math.isfinite(seen.noise) else "few samples"
+    if one_step:
+        return f"one-step fits need none; {rough}"
+    return f"{'a one-step fit will measure it' if sigma is None else 'the probe error / √6'}; {rough}"
+
+
+def _restart_reason(config: FitConfig, covered: bool) -> str:
+    if config.restarts is not None:
+        return "the user named it"
+    return "a single layer stalls from some initialisations" if covered else "two layers, or none, do not stall"

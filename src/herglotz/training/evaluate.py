@@ -1,0 +1,146 @@
+"""`evaluate`: states at every sample, those of the unseen part by a free run, and their errors."""
+
+from __future__ import annotations
+
+import platform
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+import herglotz
+from herglotz.data import Trajectories
+from herglotz.data.spikes import spikes
+from herglotz.data.splits import leading_rows
+from herglotz.stepping import State, Stepper
+from herglotz.training.inputs import step_inputs
+from herglotz.training.look import Look
+from herglotz.training.objectives import Fitted
+from herglotz.training.plan import Plan
+from herglotz.training.problems.grid import substeps
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.supervised import SupervisedProblem
+from herglotz.training.run import Run, box_of
+from herglotz.training.task import Task
+from herglotz.training.verdict import judged
+
+
+def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
+    """Return the finished run: its states, its free run beyond the training part, and the errors of both."""
+    train, data, config = seen.train, seen.data, task.config
+    fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
+    dropped = seen.spikes.clone()
+    if fitted.used is not None:
+        dropped[~dropped] = ~fitted.used
+    states, status = _states_everywhere(fitted, data, train.lengths, task.base.model_step)
+    metrics = _errors(fitted, task, seen, dropped, states)
+    metrics |= judged(task, seen, fitted, metrics)
+    metrics |= {
+        "extrapolation_status": status,
+        "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
+        "seed": config.seed,
+        "level": config.level,
+        "plan": plan.to_dict(),
+        "data": {"source": data.source, "sha256": data.digest(), "trajectories": len(data), "samples": data.samples},
+        "versions": {
+            "herglotz": herglotz.__version__,
+            "torch": torch.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+        },
+    }
+    x, n = fitted.states, data.dof
+    box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
+    h = train.typical_step / config.substeps
+    return Run(fitted.model, config, metrics, data, train.lengths, states, h, box, task.stages.history)
+
+
+def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
+    """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
+    n, u = train.dof, step_inputs(fitted.model, train)
+    out = fitted.states.new_empty(train.samples, 2 * n + 1)
+    out[~dropped] = fitted.states
+    for row in dropped.nonzero()[:, 0].tolist():  # never the first of a trajectory
+        x, h = out[row - 1], train.t[row] - train.t[row - 1]
+        with torch.no_grad():
+            step = Stepper(fitted.model).step(
+                State(x[:n], x[n : 2 * n], x[2 * n]), h, u=None if u is None else u[row - 1]
+            )
+        out[row] = torch.cat([step.state.q, step.state.p, step.state.s[None]])
+    return out
+
+
+def _states_everywhere(
+    fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
+) -> tuple[State, str]:
+    """Return states at every sample: fitted ones on the training part, then a free run from the last of them."""
+    known, n, u = fitted.states, data.dof, step_inputs(fitted.model, data)
+    out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
+    stepper, status, done = Stepper(fitted.model), "ok", 0
+    for first, length, trained in zip(data.offsets, data.lengths, train_lengths, strict=True):
+        out[first : first + trained] = known[done : done + trained]
+        done += trained
+        if trained == length:
+            continue
+        h, stops, row = _fine_steps(data.t[first + trained - 1 : first + length], max_step)
+        start = out[first + trained - 1]
+        inputs = None if u is None else u[first + trained - 1 + row]
+        with torch.no_grad():
+            run = stepper.rollout(start[:n], start[n : 2 * n], start[2 * n], h=h, inputs=inputs)
+        after = torch.cat([run.q, run.p, run.s[:, None]], -1)[stops]
+        out[first + trained : first + length] = after
+        if not bool(run.ok.all()):
+            status = f"a step failed after t = {float(data.t[first + trained - 1]):g}; nothing is predicted beyond it"
+    return State(out[:, :n], out[:, n : 2 * n], out[:, 2 * n]), status
+
+
+def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Model steps that cover the recorded times, the node that reaches each of them, the row each step starts in."""
+    counts = torch.tensor([substeps(h, max_step) for h in t.diff().tolist()], device=t.device)
+    row = torch.arange(len(counts), device=t.device).repeat_interleave(counts)
+    return (t.diff() / counts).repeat_interleave(counts), counts.cumsum(0), row
+
+
+def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State) -> dict[str, Any]:
+    """Return RMS errors in units of q; None where no sample can be measured or the prediction failed."""
+    data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
+    training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
+    for first, trained in zip(data.offsets, train.lengths, strict=True):
+        training[first : first + trained] = True
+    error, unit = states.q - data.q, fitted.notes.get("unit_of_s")
+    used, beyond = training.clone(), ~training
+    used[training] = ~dropped
+    if robust:
+        beyond &= ~spikes(data)
+    unseen = seen.unseen or data
+    triples = unseen.triples(base.max_step)
+    problem = ResidualProblem(fitted.model, unseen, max_step=base.max_step)
+    x = problem.start()
+    if unit is not None:
+        problem = SupervisedProblem(fitted.model, unseen, momenta=False, max_step=base.max_step)
+        x = torch.cat([x[: problem.P], x.new_tensor([unit]).log()])
+    ratio = (triples.h1 / triples.h0)[:, None]
+    unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
+    stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
+    rate = getattr(fitted.model.damping, "rate", None)
+    return {
+        "one_step_rms": _rms(problem.residuals(x)) if stepped else None,
+        "one_step_rms_constant_velocity": _rms(unmoved) if len(triples) else None,
+        "train_rms": _rms(error[used]),
+        "outliers": int(dropped.sum()),
+        "outliers_unseen": int((~training).sum() - beyond.sum()),
+        "extrapolation_rms": None if seen.unseen is None else _rms(error[beyond]),
+        "spread": _rms(data.q - data.q.mean(0)),
+        "objective": fitted.objective,
+        "sigma": fitted.sigma,
+        "rate": None if rate is None else float(rate.detach()),
+        "parameters": sum(p.numel() for p in fitted.model.parameters()),
+        **fitted.notes,
+    }
+
+
+def _rms(x: Tensor) -> float | None:
+    value = float(x.detach().square().mean().sqrt())
+    return value if np.isfinite(value) else None

@@ -1,0 +1,118 @@
+"""`look`: sampling, noise, outliers, baseline and structure of the data, before any decision."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import roughness
+from herglotz.data.spikes import spikes, without
+from herglotz.data.windows import Triples
+from herglotz.models import ContactLagrangian
+from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
+from herglotz.training.baseline_motion import fit_baseline_motion
+from herglotz.training.config import FitConfig
+from herglotz.training.one_step_fit import fit_one_step, one_step_problem
+from herglotz.training.plan import Plan
+from herglotz.training.smoothing_fit import SMOOTHED
+from herglotz.training.stages import Stages
+from herglotz.training.structure import kept_structure, start_of_features, structure_is_free
+from herglotz.training.task import NOISY, Task, drag_starts_the_fit
+from herglotz.training.trajectory_fit import check_size
+
+PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
+EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
+
+
+@dataclass(frozen=True)
+class Probe:
+    """A short one-step fit with a flexible correction; its remaining error is noise."""
+
+    model: ContactLagrangian
+    rms: float  # one-step error, in units of q
+    residuals: int
+    unknowns: int
+
+    @property
+    def enough(self) -> bool:
+        """Whether there are two residuals an unknown, so that the error means something."""
+        return self.residuals >= 2 * self.unknowns
+
+
+@dataclass(frozen=True)
+class Look:
+    """The properties of the data that a plan depends on."""
+
+    data: Trajectories  # all, angles unwrapped
+    train: Trajectories  # the first part of every trajectory
+    unseen: Trajectories | None  # the rest; None: nothing is held out
+    kept: Trajectories  # of the first part all but single spikes
+    spikes: Tensor  # (N_train,) bool
+    outliers: bool  # more than single spikes are suspected
+    noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
+    settings: FitConfig  # the user's, with the level and the structure that the data call for
+    base: Baseline  # sizes and starting values
+    structure: str | None  # what was found about several coordinates, in words; None: it was not asked
+    baseline_motion: tuple[Triples, float] | None  # where the baseline explains exact data: its motions, their error
+    probe: Probe | None  # None: the objective is known without it
+
+
+def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None) -> Look:
+    """Measure what the choice of a plan, or a given plan, needs.
+
+    Raises
+    ------
+    InputError
+        If the data cannot be used, or do not suit the settings.
+    """
+    settings = user_settings.resolved(data)
+    if not settings.use_inputs:
+        data = replace(data, u=None)
+    data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
+    train, unseen = (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
+    check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
+    dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
+    kept, drag = without(train, dropped), drag_starts_the_fit(settings)
+    outliers = settings.robust == "on" or bool(dropped.any())
+    outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
+    base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
+    structure = None
+    if plan is not None:
+        settings, base = plan.applied(settings), plan.started(base)
+    elif structure_is_free(kept, user_settings):
+        settings, base, structure = kept_structure(kept, base, settings, stages)
+    elif settings.features:
+        base = start_of_features(kept, base, settings)
+    task = Task(kept, base, settings, stages)
+    motion = _baseline_motion(task) if (plan is None or plan.network == "covered") else None
+    wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
+    probe = _probe(task) if wanted and settings.supervision == "q" else None
+    return Look(
+        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, noise=roughness(kept),
+        settings=settings, base=base, structure=structure, baseline_motion=motion, probe=probe,
+    )  # fmt: skip
+
+
+def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
+    """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
+    c = task.config
+    other = c.features or c.known or c.alike or c.mass_width or c.supervision != "q" or task.data.u is not None
+    if c.objective not in ("auto", "residual") or other:
+        return None
+    model = task.build("correction")
+    if model.correction is None or model.s_enters_motion:
+        return None
+    worst = min(EXPLAINED * task.exact, NOISY * task.size)
+    motion = fit_baseline_motion(task.data, task.base, worst)
+    return None if motion is None else (motion.triples(task.data, task.base), max(motion.error, task.exact))
+
+
+def _probe(task: Task) -> Probe:
+    model = task.build("correction")
+    problem = one_step_problem(task, model, task.exact)
+    _, rms = fit_one_step(task, problem, "one-step probe", PROBE)
+    residuals = len(task.data.triples(task.base.max_step)) * task.data.dof
+    return Probe(model, rms, residuals, len(problem.start()))

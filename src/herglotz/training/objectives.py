@@ -1,0 +1,125 @@
+"""The three objectives of a plan: one-step errors, whole trajectories, and smoothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from torch import Tensor
+
+from herglotz.models import ContactLagrangian
+from herglotz.training.first_states import states_of_pairs
+from herglotz.training.look import PROBE, Look
+from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_step, one_step_problem
+from herglotz.training.plan import Plan
+from herglotz.training.problems.one_step import OneStep
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.smoothing_fit import fit_smoothing
+from herglotz.training.task import Task
+from herglotz.training.trajectory_fit import fit_states, fit_trajectories
+
+LOOSE = 0.02  # σ of the short fits that others start from, relative to the motion's size: they shall not follow noise
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """The result of an objective, for `evaluate`."""
+
+    model: ContactLagrangian
+    states: Tensor  # (N_train, 2n+1) states at the training samples
+    objective: str
+    sigma: float
+    notes: dict[str, Any]
+    used: Tensor | None = None  # (N_train,) samples that were not found to be outliers; None: all
+
+
+def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
+    """Minimise one-step errors; then fit the states, so that the free run does not start from two noisy samples."""
+    raw = plan.objective == "raw"
+
+    def problem(model: ContactLagrangian) -> OneStep:
+        return one_step_problem(
+            task, model, task.exact, metric="raw" if raw else "position", expected=seen.baseline_motion
+        )
+
+    iterations = task.config.iterations
+    if plan.restarts > 1 or plan.network == "covered":
+        model, iterations = best_restart(task, plan.network, plan.restarts, problem)
+    else:
+        model = task.build(plan.network) if seen.probe is None else seen.probe.model
+    result, rms = fit_one_step(task, problem(model), "one-step error", iterations)
+    noise = task.exact if raw else max(rms / NOISE_OF_R, task.exact)
+    notes: dict[str, Any] = {"iterations": result.iterations, "reason": result.reason}
+    if seen.baseline_motion is not None:
+        notes["baseline_error"] = seen.baseline_motion[1]
+    s = None
+    if task.config.supervision != "q":
+        assert task.data.s is not None
+        notes["unit_of_s"] = unit = float(result.x[-1].exp())
+        s = task.data.s / unit
+    found = fit_states(task, model, noise, s)
+    notes["follows_data"] = found is not None
+    states = states_of_pairs(model, task.data) if found is None else found.states()
+    return Fitted(model, states, "raw" if raw else "residual", noise, notes)
+
+
+def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
+    """Fit parameters and states to whole trajectories, from a short one-step fit."""
+    model, sigma = _one_step_start(task, plan)
+    found = fit_trajectories(task, model, sigma)
+    if found is None:  # the model keeps the parameters of the one-step fit
+        notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}
+        return Fitted(model, states_of_pairs(model, task.data), "trajectory", sigma, notes)
+    fit, problem = found.fit, found.fit.problem
+    problem.parameters.set(fit.theta)
+    notes = {
+        "departure": found.departure,
+        "held_out_rms": _plain(found.held_out),
+        "reason": fit.result.reason,
+        "robust": problem.freedom is not None,
+        "segment_steps": problem.grid.longest,
+        "follows_data": True,
+    }
+    return Fitted(model, fit.states(), "trajectory", problem.sigma, notes, problem.used)
+
+
+def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
+    """Fit parameters and every state, with a little noise in every step, from a short one-step fit."""
+    model, sigma = _one_step_start(task, plan)
+    found = fit_smoothing(task, model, sigma)
+    if found is None:
+        notes = {"reason": "the model has no step near the data", "follows_data": False}
+        return Fitted(model, states_of_pairs(model, task.data), "smoothing", sigma, notes)
+    fit, problem = found.fit, found.fit.problem
+    problem.parameters.set(fit.theta)
+    notes = {
+        "departure": found.departure,
+        "held_out_rms": _plain(found.held_out),
+        "reason": fit.result.reason,
+        "robust": problem.freedom is not None,
+        "follows_data": fit.follows_data(),
+        "process": problem.process,
+    }
+    return Fitted(model, problem.states(fit.x), "smoothing", problem.sigma, notes)
+
+
+OBJECTIVES: dict[str, Callable[[Task, Look, Plan], Fitted]] = {
+    "residual": fit_by_one_step,
+    "raw": fit_by_one_step,
+    "trajectory": fit_by_trajectory,
+    "smoothing": fit_by_smoothing,
+}
+
+
+def _one_step_start(task: Task, plan: Plan) -> tuple[ContactLagrangian, float]:
+    """A model without correction from a short one-step fit, and the noise of q that the plan or this fit gives."""
+    model = task.build(plan.network)
+    problem = one_step_problem(task, model, LOOSE * task.size, freedom=FREEDOM if plan.outliers else None)
+    _, rms = fit_one_step(task, problem, "one-step start", PROBE)
+    return model, plan.sigma or rms / NOISE_OF_R
+
+
+def _plain(held_out: dict[float, Tensor]) -> dict[str, float]:
+    """RMS over the folds, by prior strength."""
+    return {f"{k:g}": float(v.square().mean().sqrt()) for k, v in held_out.items()}

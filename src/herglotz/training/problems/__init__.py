@@ -1,0 +1,1 @@
+"""Objectives as sums of squares: one step, whole trajectories, smoothing."""

@@ -1,0 +1,115 @@
+"""What every objective of a fit shares: its data, the robust loss, and the prior on the parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.training.inputs import step_inputs
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.prior import Prior
+from herglotz.training.problems.robust import loss, root_weights
+
+
+class LeastSquares:
+    """Σ ρ(r) + prior(θ), with r the residuals over their standard deviations and ρ(r) = ½r² or Student's t.
+
+    An objective derives `cost` and `normal_equations` (`solvers.levenberg_marquardt.SumOfSquares`) from these parts.
+
+    Parameters
+    ----------
+    model
+        Its current parameters are the start; the model is not changed.
+    data
+        Trajectories of positions, and of inputs where the model takes them.
+    sigma
+        Standard deviation of the noise of q, in units of q.
+    prior
+        Penalty on the parameters; None: there is none.
+    freedom
+        Degrees of freedom ν of Student's t (`robust`); None: least squares.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        *,
+        sigma: float,
+        prior: Prior | None = None,
+        freedom: float | None = None,
+    ):
+        self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
+        self.P = len(self.parameters.get())
+        self.sigma, self.prior, self.freedom = sigma, prior, freedom
+        self.u = step_inputs(model, data)  # (N, m)
+
+    def loss(self, *residuals: Tensor) -> Tensor:
+        """Σ ρ(r) over all residuals, a scalar."""
+        return torch.stack([loss(r, self.freedom) for r in residuals]).sum()
+
+    def root_weights(self, r: Tensor) -> Tensor:
+        """√w(r): what multiplies rows of J and r in the robust normal equations; 1 for least squares."""
+        return root_weights(r, self.freedom)
+
+    def prior_cost(self, theta: Tensor) -> Tensor:
+        """The prior's ½|r|², a scalar."""
+        return theta.new_zeros(()) if self.prior is None else self.prior.cost(theta)
+
+    def prior_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The prior's (½|r|², JᵀJ, Jᵀr)."""
+        if self.prior is None:
+            return theta.new_zeros(()), theta.new_zeros(self.P, self.P), theta.new_zeros(self.P)
+        return self.prior.normal_equations(theta)
+
+
+class StatesProblem(LeastSquares):
+    """An objective over the parameters and states (q, p[, s]) on a grid of model steps, the parameters first.
+
+    s is an unknown only where the positions depend on it: d = 2n + 1 numbers a state there, else 2n.
+    """
+
+    def __init__(self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, **settings: Any):
+        super().__init__(model, data, **settings)
+        self.grid = grid
+        self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
+        if self.u is not None:
+            self.u = self.u[grid.row]  # (S, K, m)
+        self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
+        self.action = float((self.speed * self.scale).sum())  # natural size of s
+
+    def with_s(self, states: Tensor) -> Tensor:
+        """States (..., 2n+1) from the unknowns (..., d), with s = 0 where s is none of them."""
+        return torch.cat([states, states.new_zeros(*states.shape[:-1], 2 * self.n + 1 - self.d)], -1)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|², a scalar; infinite where a step has no solution."""
+        raise NotImplementedError
+
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
+        """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
+        raise NotImplementedError
+
+
+class StatesOnly:
+    """A problem over parameters and states with the parameters held: only the states are fitted."""
+
+    def __init__(self, problem: StatesProblem, theta: Tensor):
+        self.problem, self.theta = problem, theta
+
+    def full(self, states: Tensor) -> Tensor:
+        """All unknowns of the problem."""
+        return torch.cat([self.theta, states])
+
+    def cost(self, x: Tensor) -> Tensor:
+        """Of all unknowns; only the states differ from call to call."""
+        return self.problem.cost(self.full(x))
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Any, Tensor]:
+        """Those of the states alone."""
+        return self.problem.normal_equations(self.full(x), held=True)

@@ -1,0 +1,263 @@
+"""Objectives of one step: how far each recorded q_{k+1} is from the position that the model predicts.
+
+r_k = J⁻¹R_k with R_k the discrete Herglotz residual and J = ∂R_k/∂q_{k+1}, which is M where R = 0. To first order r_k
+is the error of the predicted position, it does not change under a gauge transformation, and it cannot be made small
+by shrinking M. The raw residual R_k can, and does: it is offered only so that this can be seen (docs/verification.md).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.data.trajectories import Trajectories
+from herglotz.data.windows import Triples, join
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import solve
+from herglotz.training.distributed import LaneSums, add_over_processes, own_parts, world
+from herglotz.training.problems.least_squares import LeastSquares
+from herglotz.training.problems.recorded_action import action, action_derivative
+
+OBJECTIVES = ("position", "raw")
+MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost more than all the rest
+CHUNK = 4096  # triples whose Jacobian is held in memory at once: 4096 · 2 · 300 parameters are 20 MB
+
+
+class OneStep(LeastSquares):
+    """Σ ρ(r/σ) + prior over the parameters and `latents` further unknowns, with r a function of three samples.
+
+    A subclass supplies `start`, `_rows` (what `_local` takes of some triples) and `_local` (the residuals of one triple
+    or of a batch of them).
+    """
+
+    latents: int
+    triples: Triples
+    chunk: int
+
+    def start(self) -> Tensor:
+        """All unknowns: parameters, then the latents."""
+        raise NotImplementedError
+
+    def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]:
+        raise NotImplementedError
+
+    def _local(self, x: Tensor, *rows: Any) -> Tensor:
+        raise NotImplementedError
+
+    def _carried(self, x: Tensor, *, derivative: bool) -> Any:  # noqa: ARG002
+        """What is computed along whole trajectories before the triples: nothing."""
+        return None
+
+    def _linearised(self, x: Tensor, part: Tensor, carried: Any) -> tuple[Tensor, Tensor]:
+        """Residuals (T, k) of some triples and their Jacobian (T, k, unknowns)."""
+        rows = self._rows(part, carried)
+        axes = tuple(None if y is None else 0 for y in rows)
+        return self._local(x, *rows), vmap(jacrev(self._local), (None, *axes))(x, *rows)
+
+    @property
+    def deviation(self) -> Tensor:
+        """The standard deviation of every r, (T, 1)."""
+        return self.triples.h0.new_full((self.rows, 1), self.sigma)
+
+    @property
+    def rows(self) -> int:
+        """Number of triples."""
+        return len(self.triples)
+
+    def all_residuals(self, x: Tensor) -> Tensor:
+        """R of every triple, (T, k), in units of q."""
+        with torch.no_grad():
+            return self._local(self._theta(x), *self._rows(slice(None), self._carried(x, derivative=False)))
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """The errors of the recorded positions, (T, n), in units of q (of p for the raw metric)."""
+        return self.all_residuals(x)[:, : self.n]
+
+    def cost(self, x: Tensor) -> Tensor:
+        """Σ ρ(r/σ) + prior."""
+        return self.loss(self.all_residuals(x) / self.deviation) + self.prior_cost(x[: self.P])
+
+    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(cost, ∂cost/∂x) without a Jacobian, for Adam; `rows`: of some triples, made to stand for all."""
+        rank, processes = world()
+        own = (torch.arange(self.rows) if rows is None else rows)[rank::processes].to(x.device)
+        x = x.detach().requires_grad_()
+        cost = self.loss(self._local(x, *self._rows(own, None)) / self.deviation[own])
+        if rows is not None:
+            cost = cost * (self.rows / len(rows))
+        if rank == 0:
+            cost = cost + self.prior_cost(x[: self.P])
+        (gradient,) = torch.autograd.grad(cost, x)
+        cost = cost.detach()
+        add_over_processes(cost, gradient)
+        return cost, gradient
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr), accumulated over chunks of triples."""
+        sums = LaneSums(x.new_zeros(len(x), len(x)), x.new_zeros(len(x)), x.new_zeros(()))
+        carried, deviation = self._carried(x, derivative=True), self.deviation
+        for lane, part in own_parts(self.rows, self.chunk, x.device):
+            r, J = self._linearised(x, part, carried)
+            J = (J / deviation[part][..., None]).reshape(-1, len(x))
+            r = (r / deviation[part]).reshape(-1)
+            cost = self.loss(r)
+            if self.freedom is not None:
+                by = self.root_weights(r)
+                J, r = by[:, None] * J, by * r
+            sums.add(lane, J.T @ J, J.T @ r, cost)
+        A, b, cost = sums.total()
+        of_prior = self.prior_equations(x[: self.P])
+        A[: self.P, : self.P] += of_prior[1]
+        b[: self.P] += of_prior[2]
+        return cost + of_prior[0], A, b
+
+    def pieces(self) -> Iterator[tuple[Tensor, Callable[[Tensor], Tensor]]]:
+        """The triples of each of this process's chunks, and their r/σ as a function of the parameters.
+
+        For models whose motion has no s.
+        """
+        for _, part in own_parts(self.rows, self.chunk, self.triples.h0.device):
+            rows = self._rows(part, None)
+            yield part, lambda theta, rows=rows, by=self.deviation[part]: (self._local(theta, *rows) / by).reshape(-1)
+
+    def _theta(self, x: Tensor) -> Tensor:
+        """What `_local` takes of the unknowns: all of them."""
+        return x
+
+    def _inputs(self, rows: Tensor) -> tuple[Tensor | None, Tensor | None]:
+        """Inputs of the two steps of the triples that start at these rows; None, None for a model without inputs."""
+        return (None, None) if self.u is None else (self.u[rows], self.u[rows + 1])
+
+
+class ResidualProblem(OneStep):
+    """½ Σ |r_k|² / σ² + prior over parameters and, where s enters the motion, one latent s per trajectory.
+
+    Parameters
+    ----------
+    model, data, sigma, prior, freedom
+        As for `LeastSquares`. s is integrated along each trajectory from its latent start.
+    metric
+        "position" for J⁻¹R, "raw" for R.
+    max_step
+        Leave out triples that span a longer step (gaps).
+    expected
+        Triples that were not recorded, and their standard deviation (`baseline_motion`). `residuals` leaves them out.
+    most
+        Use at most so many recorded triples, evenly spread; None: all. Where s enters the motion all are used.
+    chunk
+        Triples whose Jacobian is held in memory at once.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        *,
+        sigma: float = 1.0,
+        metric: str = "position",
+        max_step: float | None = None,
+        expected: tuple[Triples, float] | None = None,
+        most: int | None = None,
+        chunk: int = CHUNK,
+        **settings: Any,
+    ):
+        super().__init__(model, data, sigma=sigma, **settings)
+        self.metric, self.chunk, self.carries_s = metric, chunk, model.s_enters_motion
+        self.triples = data.triples(max_step)
+        if most is not None and not self.carries_s:
+            self.triples = self.triples.spread_out(most)
+        self.expected, self.error = 0, sigma
+        if expected is not None:
+            self.triples, self.expected, self.error = join(self.triples, expected[0]), len(expected[0]), expected[1]
+        self.latents = len(data) if self.carries_s else 0
+        self.many = data.dof >= MANY and not self.carries_s and metric == "position"
+
+    @property
+    def recorded(self) -> int:
+        """How many of the triples are data; those that are only expected follow them."""
+        return len(self.triples) - self.expected
+
+    @property
+    def deviation(self) -> Tensor:
+        """The standard deviation of every r, (T, 1)."""
+        kinds = (self.recorded, self.sigma), (self.expected, self.error)
+        return torch.cat([self.triples.h0.new_full((count, 1), s) for count, s in kinds])
+
+    def start(self) -> Tensor:
+        """Parameters, then the latents (zero)."""
+        theta = self.parameters.get()
+        return torch.cat([theta, theta.new_zeros(self.latents)])
+
+    def residuals(self, x: Tensor) -> Tensor:
+        """R of the recorded triples, (T, n), in units of q (or of p for the raw metric)."""
+        return self.all_residuals(x)[: self.recorded]
+
+    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """See `OneStep`; where s enters the motion by the normal equations, which hold the recurrence's derivative."""
+        if not self.carries_s:
+            return super().cost_and_gradient(x, rows)
+        assert rows is None  # FitConfig checked
+        cost, _, gradient = self.normal_equations(x)
+        return cost, gradient
+
+    def _theta(self, x: Tensor) -> Tensor:
+        return x[: self.P]
+
+    def _carried(self, x: Tensor, *, derivative: bool) -> tuple[Tensor, Tensor | None] | None:
+        """S at every sample, (N,), and ds/dx, (N, unknowns)."""
+        if not self.carries_s:
+            return None
+        theta, latent = x[: self.P], x[self.P :]
+        with torch.no_grad():
+            s = action(self.parameters, theta, self.data, latent)
+        return s, action_derivative(self.parameters, theta, self.data, s) if derivative else None
+
+    def _rows(self, part: Tensor | slice, carried: tuple[Tensor, Tensor | None] | None) -> tuple[Tensor | None, ...]:
+        t = self.triples
+        i = t.index[part]
+        s0 = torch.zeros_like(t.h0[part]) if carried is None else carried[0][i]
+        return t.q0[part], t.q1[part], t.q2[part], s0, t.h0[part], t.h1[part], *self._inputs(i)
+
+    def _linearised(self, x: Tensor, part: Tensor, carried: Any) -> tuple[Tensor, Tensor]:
+        theta, rows = x[: self.P], self._rows(part, carried)
+        if self.many:
+            return self._local(theta, *rows), self._jacobian_of_many(theta, *rows)
+        r, J = super()._linearised(theta, part, carried)
+        if carried is None:
+            return r, J
+        axes = tuple(None if y is None else 0 for y in rows)
+        r_s = vmap(jacrev(self._local, 4), (None, *axes))(theta, *rows)
+        J = torch.cat([J, torch.zeros_like(J[..., :1]).expand(*J.shape[:-1], self.latents)], -1)
+        return r, J + r_s[..., None] * carried[1][self.triples.index[part]][:, None, :]
+
+    def _local(self, x: Tensor, *rows: Any) -> Tensor:
+        """J⁻¹R (or R) of one triple or of a batch of them."""
+        q0, q1, q2, s0, h0, h1, u0, u1 = rows
+        before = self.parameters.partials(x, q0, q1, s0, h0, 1, u0)
+        after = self.parameters.partials(x, q1, q2, s0 + before.L, h1, 2, u1)
+        p = momentum_plus(before)
+        R = momentum_residual(after, p)
+        if self.metric == "raw":
+            return R
+        return solve(momentum_jacobian(after, p), R)
+
+    def _jacobian_of_many(self, theta: Tensor, *rows: Any) -> Tensor:
+        """J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
+        q0, q1, q2, s0, h0, h1, u0, u1 = rows
+
+        def residual(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor, *u: Tensor) -> Tensor:
+            before = self.parameters.partials(theta, q0, q1, torch.zeros_like(h0), h0, 1, *u[:1])
+            after = self.parameters.partials(theta, q1, q2, torch.zeros_like(h1), h1, 1, *u[1:])
+            return momentum_residual(after, momentum_plus(before))
+
+        inputs = () if u0 is None or u1 is None else (u0, u1)
+        R = vmap(jacrev(residual), (None, *(0,) * (5 + len(inputs))))(theta, q0, q1, q2, h0, h1, *inputs)
+        with torch.no_grad():
+            p = momentum_plus(self.parameters.partials(theta, q0, q1, s0, h0, 1, u0))
+            J = momentum_jacobian(self.parameters.partials(theta, q1, q2, s0, h1, 2, u1), p)
+        return torch.linalg.solve_ex(J, R)[0]

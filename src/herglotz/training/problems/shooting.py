@@ -1,0 +1,239 @@
+"""Trajectory fitting by multiple shooting: what noisy positions need, because one-step errors amplify their noise.
+
+Unknowns are the parameters and the state (q, p[, s]) at the start of every segment. Residuals are
+
+    (q_model − q_data) / σ     at every sample,
+    (end of a segment − start of the next) / weight     between segments,
+    (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
+
+and the prior. Derivatives run through every implicit step (`lifted_newton.parameter_derivatives`). Segments grow
+until each trajectory is one.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+from herglotz.training.distributed import everywhere
+from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.least_squares import StatesProblem
+from herglotz.training.solvers.lifted_newton import Path, parameter_derivatives, solve_path
+
+
+class ShootingProblem(StatesProblem):
+    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states.
+
+    Parameters
+    ----------
+    model, data, sigma, prior
+        As for `LeastSquares`.
+    grid
+        The segments.
+    freedom
+        Degrees of freedom ν of Student's t for the residuals of data and joints (`robust`); None: least squares.
+    used
+        (N,) which samples have a say; all without it. The others are outliers that were found.
+    s
+        (N,) s at every sample in the model's unit, where it is known: trajectories start from it, not from about 0.
+    """
+
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        grid: SegmentGrid,
+        *,
+        used: Tensor | None = None,
+        s: Tensor | None = None,
+        **settings: Any,
+    ):
+        super().__init__(model, data, grid, **settings)
+        self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
+        self.weight = self.used[grid.sample].to(data.q)[:, None]  # (N', 1)
+        # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
+        relative = self.sigma / self.scale
+        action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
+        self.s = s
+        self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
+        self._solved: tuple[Tensor, Path | None] | None = None
+        self.path: Path | None = None  # the last trajectory solved: where the next solve starts
+
+    def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
+        """Join states (S, n), (S, n), (S,) into the unknowns' layout (S, d)."""
+        parts = [q, p] if self.d == 2 * self.n else [q, p, (torch.zeros_like(q[:, 0]) if s is None else s)[:, None]]
+        return torch.cat(parts, -1)
+
+    def pack(self, theta: Tensor, states: Tensor) -> Tensor:
+        """Flat unknowns from parameters (P,) and segment states (S, d)."""
+        return torch.cat([theta, states.reshape(-1)])
+
+    def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Inverse of `pack`."""
+        return x[: self.P], x[self.P :].reshape(-1, self.d)
+
+    def solve(self, x: Tensor) -> Path | None:
+        """The trajectories of all segments at x, or None where a step has no solution."""
+        if self._solved is not None and torch.equal(self._solved[0], x):
+            return self._solved[1]  # an accepted step has been solved for its cost
+        theta, states = self.unpack(x)
+        start = self.with_s(states)
+        tol = 1e3 * torch.finfo(x.dtype).eps
+        with torch.no_grad():
+            path = None
+            if self.path is not None:
+                path = solve_path(self.parameters, theta, start, self.grid.h, self.path.x, tol, u=self.u)
+            if path is None:
+                path = self._step_through(theta, start, tol)
+        self._solved = x.clone(), path
+        return path
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|²; infinite where a step fails."""
+        path = self.solve(x)
+        if path is None:
+            return x.new_full((), torch.inf)
+        fit, joints = self._residuals(path.x)
+        anchor = self._anchor(x)
+        return self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(x[: self.P])
+
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
+        theta, _ = self.unpack(x)
+        path = self.solve(x)
+        if not everywhere(path is not None) or path is None:
+            unknowns = len(x) - self.P * held
+            return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
+        self.path = path
+        grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
+        Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
+        fit, joints = self._residuals(path.x)
+        cost = self.loss(fit, joints)
+        by_fit, by_joint = self.weight * self.root_weights(fit), self.root_weights(joints)
+        fit, joints = by_fit * fit, by_joint * joints
+        S = grid.segments
+        A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
+        segment = grid.node // (grid.h.shape[1] + 1)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.sigma)[..., None]  # (N', n, P + d)
+        for k in range(S):
+            own = segment == k
+            self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
+        for k in (grid.joined_to >= 0).nonzero()[:, 0].tolist():
+            before = int(grid.joined_to[k])
+            J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
+            columns = torch.cat([self._columns(before, P), self._columns(k, P)[P:]])
+            self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
+        anchored, anchor = self._anchored() - self.P + P, self._anchor(x)
+        A[anchored, anchored] += 1 / self._anchor_weight**2
+        b[anchored] += anchor / self._anchor_weight
+        cost = cost + anchor.square().sum() / 2
+        if held:
+            return cost + self.prior_cost(theta), A, b
+        of_prior = self.prior_equations(theta)
+        A[:P, :P] += of_prior[1]
+        b[:P] += of_prior[2]
+        return cost + of_prior[0], A, b
+
+    def states_at(self, path: Path, samples: Tensor) -> Tensor:
+        """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
+
+        At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
+        later one, because the end of the earlier is somewhere else.
+        """
+        rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
+        rows[self.grid.sample] = self.grid.node
+        if self.freedom is not None:
+            first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
+            rows[self.grid.start_sample] = first
+        return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
+
+    def misfit(self, path: Path) -> Tensor:
+        """q_model − q_data at every sample, (N', n), in units of q."""
+        return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+
+    def joint_residuals(self, path: Path) -> Tensor:
+        """End of each segment less the start of the next, (S, d), over the joint's weight."""
+        return self._residuals(path.x)[1]
+
+    def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
+
+        Both carry the square roots of the weights: those of a robust loss, and 0 for samples that are not used.
+        """
+        r = self.misfit(path) / self.sigma
+        by = self.weight * self.root_weights(r)
+        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] * (by / self.sigma)[..., None]
+        order = self.grid.sample.argsort()
+        segment = self.grid.node // (self.grid.h.shape[1] + 1)
+        J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
+        J[..., : self.P] = Z[..., : self.P]
+        for i in range(self.d):
+            J[torch.arange(len(order)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
+        return (by * r)[order].flatten(), J[order].flatten(0, 1)
+
+    def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
+        miss = x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+        fit = self.weight * miss / self.sigma
+        before = self.grid.joined_to.clamp_min(0)
+        ends = x[before, self.grid.end[before], : self.d]
+        joints = (ends - x[:, 0, : self.d]) / self.joint_weight
+        return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+
+    @property
+    def _anchor_weight(self) -> float:
+        """Standard deviation of the first s of a trajectory: its natural size or, where s is known, as a joint's."""
+        return self.action if self.s is None else float(self.joint_weight[-1])
+
+    def _anchor(self, x: Tensor) -> Tensor:
+        """Residuals of the first s of each trajectory."""
+        first = x[self._anchored()]
+        if self.s is not None and len(first):
+            first = first - self.s[self.grid.start_sample[self.grid.joined_to < 0]]
+        return first / self._anchor_weight
+
+    def _anchored(self) -> Tensor:
+        """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
+        first = (self.grid.joined_to < 0).nonzero()[:, 0]
+        return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
+
+    def _columns(self, segment: int, P: int) -> Tensor:
+        """Columns of the unknowns that a segment's trajectory depends on: P parameters, then its own state."""
+        device = self.data.q.device
+        own = torch.arange(P + segment * self.d, P + (segment + 1) * self.d, device=device)
+        return torch.cat([torch.arange(P, device=device), own])
+
+    @staticmethod
+    def _add(A: Tensor, b: Tensor, J: Tensor, r: Tensor, columns: Tensor) -> None:
+        A[columns[:, None], columns[None, :]] += J.T @ J
+        b[columns] += J.T @ r
+
+    def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
+        """Solve by stepping, when there is no nearby trajectory to start from."""
+        n = self.n
+        stepper = Stepper(self.parameters.at(theta))
+        out = stepper.rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h, inputs=self.u)
+        if not bool(out.ok.all()):
+            return None
+        guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
+        return solve_path(self.parameters, theta, start, self.grid.h, guess, tol, u=self.u)
+
+    def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
+        """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
+        S, K = self.grid.h.shape
+        d = self.d
+        q1 = path.x[:, 1:, : self.n]
+        B = theta.new_zeros(S, K, d, 0)
+        if not held:
+            B = parameter_derivatives(self.parameters, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
+        eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
+        Z = [torch.cat([torch.zeros_like(B[:, 0]), eye], -1)]
+        pad = theta.new_zeros(S, d, d)
+        for k in range(K):
+            Z.append(path.A[:, k, :d, :d] @ Z[-1] + torch.cat([B[:, k], pad], -1))
+        return torch.stack(Z, 1)

@@ -1,0 +1,184 @@
+"""Smoothing: every state of a trajectory an unknown, steps with a little noise.
+
+Minimises, over the states X_k = (q, p[, s]) at all nodes (and over the parameters θ, where they are fitted too),
+
+    ½ Σ |q_k − q_data|²/σ² + ½ Σ |(Φ̃_θ(X_k) − X_{k+1})/w|² [+ prior(θ)],
+
+by Gauss–Newton. The matrix is block tridiagonal, bordered by the parameters: the cost grows with the number of samples,
+not with its cube. With θ held this is the fixed-interval smoother of Rauch, Tung & Striebel (1965), iterated for a
+nonlinear step (Bell 1994). w > 0 lets the motion leave the model a little at every step, so that a push, or a force the
+model does not know, is followed; with w → 0 it is the fit of the start states alone.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.mechanics import legendre_minus, partials
+from herglotz.models import ContactLagrangian
+from herglotz.training.distributed import everywhere, of_first
+from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.least_squares import StatesProblem
+from herglotz.training.solvers.bordered import Bordered
+from herglotz.training.solvers.lifted_newton import all_steps, parameter_derivatives
+
+DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, not the data, make the diagonal
+
+
+class SmoothingProblem(StatesProblem):
+    """The sum of squares above, over parameters and the states of all nodes.
+
+    Parameters
+    ----------
+    model, data, sigma, prior
+        As for `LeastSquares`.
+    grid
+        Whole trajectories, one segment each.
+    process
+        Standard deviation of what a step leaves of the model in p, relative to sigma, in the natural units of both; the
+        same share of the natural size in s, and h/√3 of p's in q, as a random force would add.
+    freedom
+        Degrees of freedom ν of Student's t for the residuals of data and steps (`robust`); None: least squares.
+    """
+
+    def __init__(
+        self, model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, *, process: float, **settings: Any
+    ):
+        super().__init__(model, data, grid, **settings)
+        self.process, n, d = process, self.n, self.d
+        self.node = grid.node[grid.sample.argsort()]  # (N,) where in (S·M,) each sample is
+        S, M = grid.segments, grid.longest + 1
+        node = torch.arange(M, device=data.q.device)
+        self.inside = (node <= grid.end[:, None])[..., None].to(data.q)  # (S, M, 1) padding has 0
+        self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
+        self.seen[self.node], self.target[self.node] = 1.0, data.q
+        self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
+        scale, speed = self.scale, self.speed
+        # What a force that the model does not know adds to p in a step, to q by the way, and to s.
+        p = (speed / scale).expand(*grid.h.shape, n)
+        s = (scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
+        self.w = process * self.sigma * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
+        self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
+
+    def start(self) -> Tensor:
+        """Positions on straight lines between samples, momenta by FL⁻, s = 0; (P + S·M·d,) with the parameters."""
+        theta, grid, n = self.parameters.get(), self.grid, self.n
+        S, K = grid.h.shape
+        x = self.data.q.new_zeros(S, K + 1, self.d)
+        for b in range(S):
+            own = (grid.node // (K + 1) == b).nonzero()[:, 0]
+            node, rows = grid.node[own] - b * (K + 1), grid.sample[own]
+            t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
+            every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))
+            right = torch.searchsorted(node, every).clamp(1, len(node) - 1)
+            here, there = node[right - 1], node[right]
+            share = ((t[every] - t[here]) / (t[there] - t[here]))[:, None]
+            x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
+        with torch.no_grad():
+            _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
+        x[:, :-1, n : 2 * n] = p
+        last = (grid.end - 1)[:, None].clamp_min(0)
+        after = torch.arange(K + 1, device=p.device) >= grid.end[:, None]  # the last node, and padding, as before it
+        held = p.gather(1, last[..., None].expand(-1, -1, n)).expand(-1, K + 1, -1)
+        x[..., n : 2 * n] = torch.where(after[..., None], held, x[..., n : 2 * n])
+        return torch.cat([theta, x.flatten()])
+
+    def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Parameters (P,) and states (S, M, d)."""
+        return x[: self.P], x[self.P :].reshape(self.grid.segments, -1, self.d)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|²; infinite where a step has no solution."""
+        stepped = self._stepped(x)
+        if stepped is None:
+            return x.new_full((), torch.inf)
+        theta, states = self.unpack(x)
+        fit, defect = self._residuals(states, stepped[0])
+        return self.loss(fit, defect) + self._anchor(states).square().sum() / 2 + self.prior_cost(theta)
+
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Bordered, Tensor]:
+        """(cost, JᵀJ, Jᵀr). `held`: of the states alone, θ as it is."""
+        theta, states = self.unpack(x)
+        stepped, (S, M, d), P = self._stepped(x), states.shape, 0 if held else self.P
+        diagonal, upper, lower = x.new_zeros(3, S, M, d, d)
+        border, corner = x.new_zeros(S, M, d, P), x.new_zeros(P, P)
+        top, gradient = x.new_zeros(P), x.new_zeros(S, M, d)
+        if not everywhere(stepped is not None) or stepped is None:
+            unknown = torch.cat([top, gradient.flatten()])
+            return x.new_full((), torch.inf), Bordered(corner, border, (diagonal, upper, lower)), unknown
+        y, A = stepped[0], stepped[1][..., :d, :d]
+        fit, defect = self._residuals(states, y)
+        by_fit = self.seen * self.root_weights(fit) / self.sigma  # (S, M, n)
+        by_step = self.inside[:, 1:] * self.root_weights(defect) / self.w  # (S, K, d)
+        weighted, weight = by_step * self.root_weights(defect) * defect, by_step.square()[..., None]
+        WA = weight * A
+        diagonal[..., : self.n, : self.n] += torch.diag_embed(by_fit.square())
+        diagonal[:, :-1] += A.mT @ WA
+        diagonal[:, 1:] += torch.diag_embed(weight[..., 0])
+        diagonal += torch.diag_embed((1 - self.inside).expand(-1, -1, d))  # padding stays where it is
+        upper[:, :-1], lower[:, 1:] = -WA.mT, -WA
+        gradient[..., : self.n] = by_fit * self.root_weights(fit) * fit
+        gradient[:, :-1] += (A.mT @ weighted[..., None])[..., 0]
+        gradient[:, 1:] -= weighted
+        if d > 2 * self.n:
+            diagonal[:, 0, -1, -1] += 1 / self.action**2
+            gradient[:, 0, -1] += self._anchor(states) / self.action
+        if not held:
+            q1 = y[..., : self.n]
+            B = parameter_derivatives(self.parameters, theta, self.with_s(states), q1, self.grid.h, self.u)[..., :d, :]
+            WB = weight * B
+            corner, top = torch.einsum("skdp,skdr->pr", B, WB), torch.einsum("skdp,skd->p", B, weighted)
+            border[:, :-1] += A.mT @ WB
+            border[:, 1:] -= WB
+        cost = self.loss(fit, defect) + self._anchor(states).square().sum() / 2
+        if held:
+            cost = cost + self.prior_cost(theta)
+        else:
+            of_prior = self.prior_equations(theta)
+            cost, corner, top = cost + of_prior[0], corner + of_prior[1], top + of_prior[2]
+        corner, border, diagonal, upper, lower = of_first(corner, border, diagonal, upper, lower)
+        return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
+
+    def misfit(self, x: Tensor) -> Tensor:
+        """Q − q_data at every sample, (N, n), in units of q."""
+        return self.unpack(x)[1].flatten(0, 1)[self.node, : self.n] - self.data.q
+
+    def defects(self, x: Tensor) -> Tensor:
+        """(Φ̃(X_k) − X_{k+1})/w of every step, (S, K, d); 0 where there is none."""
+        stepped = self._stepped(x)
+        assert stepped is not None
+        return self._residuals(self.unpack(x)[1], stepped[0])[1]
+
+    def states(self, x: Tensor) -> Tensor:
+        """States (q, p, s) at every sample, (N, 2n+1); where s does not enter the motion it counts along from 0."""
+        theta, states = self.unpack(x)
+        full = self.with_s(states)
+        if self.d == 2 * self.n:
+            with torch.no_grad():
+                L_d = self.parameters.at(theta, self.u)
+                P = partials(L_d, full[:, :-1, : self.n], full[:, 1:, : self.n], 0 * self.grid.h, self.grid.h)
+            for k in range(self.grid.longest):  # L_d = L_d(s = 0) + (c − 1) s
+                full[:, k + 1, -1] = P.c[:, k] * full[:, k, -1] + P.L[:, k]
+        return full.flatten(0, 1)[self.node]
+
+    def _stepped(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Φ̃ of every state but the last, and its derivative."""
+        if self._stepped_at is None or not torch.equal(self._stepped_at[0], x):
+            theta, states = self.unpack(x)
+            with torch.no_grad():
+                stepped = all_steps(self.parameters.at(theta, self.u), self.with_s(states), self.grid.h)
+            self._stepped_at = x.clone(), stepped  # an accepted step has been solved for its cost
+        return self._stepped_at[1]
+
+    def _residuals(self, states: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
+        """Of the data, (S, M, n), and of the steps, (S, K, d); 0 where there is no sample or no step."""
+        fit = self.seen * (states[..., : self.n] - self.target) / self.sigma
+        return fit, self.inside[:, 1:] * (y[..., : self.d] - states[:, 1:]) / self.w
+
+    def _anchor(self, states: Tensor) -> Tensor:
+        """Residuals of the first s of each trajectory, (S,); none where s does not enter the motion."""
+        return states[:, 0, 2 * self.n :].flatten() / self.action

@@ -1,0 +1,1 @@
+"""Optimisers and the linear algebra under them."""

@@ -1,0 +1,103 @@
+"""Adam and AdamW with a cosine schedule, on all rows or on minibatches: for comparison, and for very many rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Protocol
+
+import torch
+from torch import Tensor
+
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
+
+DECAY = 1e-2  # of AdamW's weights (Loshchilov & Hutter 2019)
+QUIET, PATIENCE = 1e-8, 50  # so many costs in a row that differ by less than this, relative, end the search
+
+
+class Differentiable(Protocol):
+    """A scalar objective with its gradient, a sum over rows."""
+
+    @property
+    def rows(self) -> int:
+        """How many there are."""
+        ...
+
+    def cost(self, x: Tensor) -> Tensor:
+        """The whole cost, a scalar."""
+        ...
+
+    def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """(cost, ∂cost/∂x); with `rows`, their share of it made to stand for all."""
+        ...
+
+
+def adam(
+    problem: Differentiable,
+    x: Tensor,
+    *,
+    max_iterations: int = 2000,
+    learning_rate: float = 3e-3,
+    decay: float = 0.0,
+    batch: int | None = None,
+    seed: int = 0,
+    callback: Callable[[int, float, Tensor], None] | None = None,
+) -> OptimiserResult:
+    """Adam with a cosine schedule; returns the best finite point visited.
+
+    Parameters
+    ----------
+    problem
+        The objective.
+    x
+        (P,) start.
+    max_iterations, learning_rate
+        Length and peak of the cosine schedule. The search ends earlier where the cost has stopped to change.
+    decay
+        Of the weights, as in AdamW.
+    batch
+        Rows a step, drawn without replacement, each once a round; None: all. The cost of all of them is taken, and the
+        best point chosen by it, once a round.
+    seed
+        Of the order of the rows.
+    callback
+        Called with (iteration, best cost, best x).
+    """
+    current = x.clone().requires_grad_()
+    optimiser = torch.optim.AdamW([current], lr=learning_rate, weight_decay=decay)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max_iterations)
+    best, best_x, history, reason = float("inf"), x, [], "max_iterations"
+    last, quiet, iteration = float("nan"), 0, 0
+    rounds = None if batch is None or batch >= problem.rows else _rounds(problem.rows, batch, seed)
+    for iteration in range(1, max_iterations + 1):
+        rows, last_of_round = (None, True) if rounds is None else next(rounds)
+        here = current.detach()
+        cost, gradient = problem.cost_and_gradient(here, rows)
+        if rows is not None and (last_of_round or iteration in (1, max_iterations)):
+            cost, last_of_round = problem.cost(here), True
+        if not bool(torch.isfinite(cost)) or not bool(torch.isfinite(gradient).all()):
+            reason = "not_finite"
+            break
+        if last_of_round:
+            if float(cost) < best:
+                best, best_x = float(cost), here.clone()
+                history.append(best)
+            quiet = quiet + 1 if abs(float(cost) - last) <= QUIET * abs(last) else 0
+            last = float(cost)
+        current.grad = gradient
+        optimiser.step()
+        schedule.step()
+        if callback is not None:
+            callback(iteration, best, best_x)
+        if quiet >= PATIENCE:
+            reason = "converged"
+            break
+    return OptimiserResult(best_x, best, reason, iteration, history)
+
+
+def _rounds(count: int, batch: int, seed: int) -> Iterator[tuple[Tensor, bool]]:
+    """Batches of row numbers, and whether each is the last of its round; the same on every machine."""
+    make = torch.Generator().manual_seed(seed)
+    while True:
+        batches = torch.randperm(count, generator=make).split(batch)
+        for i, rows in enumerate(batches):
+            yield rows, i == len(batches) - 1

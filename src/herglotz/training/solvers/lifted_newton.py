@@ -1,0 +1,113 @@
+"""All steps of a trajectory solved at once: Newton on the whole trajectory instead of one step after another.
+
+With a guess X for every state, each sweep evaluates all K steps Φ̃(X_k) and their derivatives A_k in one batch and
+then carries the defects forward, e_{k+1} = A_k e_k + Φ̃(X_k) − X_{k+1}. It converges quadratically, needs two to four
+sweeps from the trajectory of a slightly different parameter vector, and costs a few batched evaluations where
+stepping costs K small ones (Albersmeyer & Diehl 2010, the lifted Newton method).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.func import jacrev, vmap
+
+from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
+from herglotz.stepping import Status, solve_step
+from herglotz.training.distributed import add_over_processes, own_parts
+from herglotz.training.parameter_vector import FixedModel, ParameterVector
+
+CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
+
+
+@dataclass(frozen=True)
+class Path:
+    """A solved batch of trajectories and the derivatives of their steps."""
+
+    x: Tensor  # (S, K+1, 2n+1) states q, p, s
+    A: Tensor  # (S, K, 2n+1, 2n+1) DΦ̃ of each step
+
+
+def solve_path(
+    parameters: ParameterVector,
+    theta: Tensor,  # (P,)
+    start: Tensor,  # (S, 2n+1) first states
+    h: Tensor,  # (S, K)
+    guess: Tensor,  # (S, K+1, 2n+1)
+    tol: float,
+    sweeps: int = 12,
+    u: Tensor | None = None,  # (S, K, m) input of every step
+) -> Path | None:
+    """The trajectories from `start`, or None where the sweeps do not converge."""
+    x = torch.cat([start[:, None], guess[:, 1:]], 1)
+    previous = float("inf")
+    for _ in range(sweeps):
+        stepped = all_steps(parameters.at(theta, u), x, h)
+        if stepped is None:
+            return None
+        y, A = stepped
+        defect = y - x[:, 1:]
+        size = float(defect.abs().amax(dim=(0, 1)).div(x.abs().amax(dim=(0, 1)) + 1e-300).max())
+        if size <= tol or (size <= 1e3 * tol and size >= previous / 2):
+            return Path(torch.cat([start[:, None], y], 1) if size == 0 else x, A)
+        e = [torch.zeros_like(start)]
+        for k in range(h.shape[1]):
+            e.append((A[:, k] @ e[-1][..., None])[..., 0] + defect[:, k])
+        x = x + torch.stack(e, 1)
+        previous = size
+        if not bool(torch.isfinite(x).all()):
+            return None
+    return None
+
+
+def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+    """Φ̃ at every state but the last, and its derivative; None if any step fails."""
+    n = (x.shape[-1] - 1) // 2
+    q0, p0, s0 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]
+    tol = 64 * torch.finfo(x.dtype).eps
+    solution = solve_step(L_d, q0, p0, s0, h, x[:, 1:, :n], tol)
+    if not bool((solution.status == Status.CONVERGED).all()):
+        return None
+    P = solution.P
+    y = torch.cat([solution.q1, momentum_plus(P), (s0 + P.L)[..., None]], -1)
+    return y, step_derivative(P, p0)
+
+
+def parameter_derivatives(
+    parameters: ParameterVector,
+    theta: Tensor,  # (P,)
+    x: Tensor,  # (S, K+1, 2n+1) states that the steps start from; the last is not used
+    q1: Tensor,  # (S, K, n) positions that they lead to
+    h: Tensor,  # (S, K)
+    u: Tensor | None = None,  # (S, K, m)
+) -> Tensor:
+    """∂Φ̃(x_k)/∂θ of every step, (S, K, 2n+1, P), by the implicit-function theorem.
+
+    With F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ; p1 and s1 follow.
+    """
+    S, K, n = *h.shape, q1.shape[-1]
+    q0, p0, s0 = (y.flatten(0, 1) for y in (x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]))
+    ends, steps, inputs = q1.flatten(0, 1), h.flatten(), None if u is None else u.flatten(0, 1)
+
+    def step_functions(
+        theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
+    ) -> Tensor:
+        P = parameters.partials(theta, q0, q1, s0, h, 1, u)
+        return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
+
+    per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
+    out = x.new_zeros(S * K, 2 * n + 1, len(theta))
+    for _, part in own_parts(S * K, CHUNK, x.device):
+        here, own = (q0[part], ends[part], p0[part], s0[part], steps[part]), None if inputs is None else inputs[part]
+        G = per_step(theta, *here, own)  # (part, 2n+1, P)
+        with torch.no_grad():
+            P = partials(parameters.at(theta, own), here[0], here[1], here[3], here[4], order=2)
+            dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, here[2]), G[:, :n])[0]
+            p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
+            dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
+            ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
+        out[part] = torch.cat([dq1, dp1, ds1], 1)
+    add_over_processes(out)
+    return out.reshape(S, K, 2 * n + 1, len(theta))

@@ -1,0 +1,95 @@
+"""The data, settings and record that every stage of a fit shares, and the model that it starts from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.training.baseline import Baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.stages import Stages
+
+WIDER = 3  # a single layer has this multiple of units: it reaches a tenth of the error of two layers in the same time
+NOISY = 3e-4  # a one-step error above this share of the motion's size is noise: 40 iterations reach it on exact data
+EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
+
+
+@dataclass(frozen=True)
+class Task:
+    """The data of a fit, the first look at them, its settings, and the record of its stages."""
+
+    data: Trajectories  # what is fitted: the training part without single spikes
+    base: Baseline
+    config: FitConfig
+    stages: Stages
+
+    @property
+    def size(self) -> float:
+        """The largest |q|, in units of q."""
+        return max(self.base.scale)
+
+    @property
+    def exact(self) -> float:
+        """σ of exact data, in units of q."""
+        return EXACT[self.config.dtype] * self.size
+
+    def build(self, network: str, seed: int | None = None) -> ContactLagrangian:
+        """The model that a fit starts from; see `build_model`."""
+        return build_model(self.base, self.config if seed is None else replace(self.config, seed=seed), network)
+
+
+def drag_starts_the_fit(config: FitConfig) -> bool:
+    """Whether drag and a constant potential start the fit: where s d·q̇ is in L and the user does not say what else."""
+    settings = config.features or config.known or config.alike or config.objective == "raw" or config.supervision != "q"
+    return config.level == "affine" and not settings
+
+
+def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagrangian:
+    """A model with the network that the objective needs: the correction, the potential's, or a plain one alone.
+
+    Where the baseline's motions have "covered" the whole range, the correction is one layer of `WIDER` times as many
+    units.
+    """
+    alone, n = network == "plain", len(base.angles)
+    width = config.correction_width if network != "potential" and config.order == 2 else 0
+    features = ("1", *config.features) if drag_starts_the_fit(config) else () if alone else config.features
+    model = ContactLagrangian(
+        ModelConfig(
+            angles=base.angles,
+            level=config.level,
+            scale=base.scale,
+            speed=base.speed,
+            stiffness=(0.0,) * n if config.alike else base.stiffness,
+            tilt=(0.0,) * n if config.alike else base.tilt,
+            rate=base.rate,
+            potential_width=config.potential_width if network == "potential" and config.order == 2 else 0,
+            damping_width=config.damping_width,
+            correction_width=width * (WIDER if network == "covered" else 1),
+            correction_depth=1 if network == "covered" else 2,
+            baseline=not alone,
+            seed=config.seed,
+            activation=config.activation,
+            mass_width=0 if alone else config.mass_width,
+            action_width=config.action_width,
+            coulomb=config.coulomb,
+            inputs=base.inputs if config.level == "forced" else 0,
+            input_map=config.input_map,
+            input_zero=config.level == "forced" and base.inputs > 0,
+            features=features,
+            known=() if alone else config.known,
+            alike=config.alike and not alone,
+            diagonal=config.diagonal and not alone,
+            coupled=config.coupled,
+            order=config.order,
+        )
+    )
+    if model.inputs and not config.input_map:
+        assert model.friction is not None
+        model.friction.input_map.data.copy_(torch.tensor(base.input_map, dtype=torch.float64).reshape(n, -1))
+    for name, values in base.start.items():
+        numbers = model.get_parameter(name).data.view(-1)
+        numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)  # order 4 has the baseline's features first
+    return model.to(dtype=config.torch_dtype, device=config.device)

@@ -1,0 +1,83 @@
+"""The models that the tests of exported files share, and the eager stepper beside them."""
+
+from typing import Any
+
+import torch
+
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+
+SIZES = (("q", 2, 1.0), ("p", 2, 1.0), ("s", 1, 0.5))
+BOX = {name + end: [sign * x] * n for name, n, x in SIZES for end, sign in (("_low", -1), ("_high", 1))}
+SMALL = {key: [0.5 * x for x in values[:1]] for key, values in BOX.items()}
+
+
+def model_of(n, level, correction=0, dtype=torch.float64):
+    """A model whose every parameter is random."""
+    ones, make = (1.0,) * n, torch.Generator().manual_seed(n)
+    angles = tuple(i % 2 == 0 for i in range(n))
+    config = ModelConfig(
+        angles, level, ones, ones, ones, (0.0,) * n, potential_width=4, damping_width=4, correction_width=correction
+    )
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    return model.to(dtype)
+
+
+def damped(level, dtype, inputs=0):
+    """One coordinate, and motions that die out at rate 0.3 (at all levels but the conservative one)."""
+    one, make = (1.0,), torch.Generator().manual_seed(1)
+    config = ModelConfig(
+        (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs,
+        input_zero=inputs > 0,
+    )  # fmt: skip
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    return model.to(dtype)
+
+
+def beside(model):
+    """The eager stepper with Newton to rounding: at its own tolerance (64 eps of q) it is itself 1e-12 off."""
+    double = next(model.parameters()).dtype == torch.float64
+    return Stepper(model, tol=1e-15 if double else None)
+
+
+def states_of(n, batch, dtype=torch.float64, seed=0):
+    x = torch.randn(batch, 2 * n + 1, generator=torch.Generator().manual_seed(seed), dtype=torch.float64).to(dtype)
+    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+
+
+TERMS: dict[str, tuple[int, dict[str, Any]]] = {
+    "order 4": (1, {"order": 4}),
+    "order 4, features": (2, {"order": 4, "features": ("cos(q1 - q2) v1 v2", "q2 v1")}),
+    "order 4, three coordinates": (3, {"order": 4, "features": ("r^-1", "q3 v1 v2")}),
+    "features": (2, {"features": ("cos(q1 - q2)", "sin(q1) v2^2", "q2^3")}),
+    "m(q)": (2, {"mass_width": 3}),
+    "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
+    "coupled": (2, {"level": "forced", "coupled": True, "coulomb": True}),
+}
+
+
+def with_terms(case) -> Any:
+    n, settings = TERMS[case]
+    ones = (1.0,) * n
+    config = {"potential_width": 0, "rate": 0.3, "level": "linear"} | settings
+    angles = tuple(i == 0 and n < 3 for i in range(n))
+    model = ContactLagrangian(
+        ModelConfig(angles=angles, scale=ones, speed=ones, stiffness=ones, tilt=(0.0,) * n, **config)
+    )
+    make = torch.Generator().manual_seed(2)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+    return model
+
+
+def near(n, batch):
+    """Starts at which every case has a step; for powers of r, away from r = 0."""
+    q, p, s = states_of(n, batch)
+    return State(1.0 + 0.2 * q, 0.3 * p, s)

@@ -1,0 +1,67 @@
+"""The one Newton iteration: samples apart, bad starts, singular Jacobians, and its twin in plain numbers."""
+
+import pytest
+import torch
+
+from herglotz.mechanics.newton import Point, Rules, attached, find_root, largest, newton
+from herglotz.mechanics.newton_one import newton_one
+
+EPS = torch.finfo(torch.float64).eps
+
+
+def arctangent(x):
+    """Its full Newton steps overshoot from |x| > 1.39: without backtracking they diverge."""
+    return x.atan() - 0.3, torch.diag_embed(1 / (1 + x * x))
+
+
+def test_backtracking_and_samples_apart():
+    # fails if a step is taken that makes things worse, or one sample's fraction of a step is another's
+    start = torch.tensor([[20.0], [0.1], [-400.0]], dtype=torch.float64)
+    root = find_root(arctangent, start)
+    assert root.converged.tolist() == [True] * 3
+    torch.testing.assert_close(root.x[:, 0], torch.full((3,), 0.3, dtype=torch.float64).tan(), rtol=0, atol=4 * EPS)
+    for i in range(3):
+        assert torch.equal(find_root(arctangent, start[i : i + 1]).x[0], root.x[i])
+
+
+def test_what_cannot_be_solved_is_given_up():
+    # fails if a singular Jacobian is an exception, or a sample without a solution is called converged
+    def equations(x):
+        return x * x + torch.tensor([[1.0], [-4.0], [0.0]], dtype=torch.float64), torch.diag_embed(2 * x)
+
+    root = find_root(equations, torch.tensor([[0.7], [3.0], [0.0]], dtype=torch.float64))
+    assert root.converged.tolist() == [False, True, False]
+    assert root.solved[:, 0].isnan().tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("keep", [False, True])
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_one_sample_takes_the_same_iterations_in_plain_numbers(n, keep):
+    # fails if a rule of one of the two is not that of the other
+    A = torch.eye(n, dtype=torch.float64) + 0.3 * torch.ones(n, n, dtype=torch.float64).tril(-1)
+    scale = torch.arange(1.0, n + 1, dtype=torch.float64)
+
+    def equation(x, second):
+        y = x @ A.T
+        return Point((y * scale).atan() - 0.3, (scale / (1 + (y * scale) ** 2))[..., None] * A if second else None)
+
+    x = torch.full((1, n), 9.0, dtype=torch.float64)
+    rules = Rules(4 * EPS, 60, keep=keep)
+    one = newton_one(equation, x, rules, lambda *_: (1.0, 1e3 * EPS))
+    many = newton(
+        equation, x, rules, lambda x, *_: (torch.ones_like(x[..., 0]), 1e3 * EPS * torch.ones_like(x[..., 0]))
+    )
+    assert one.iterations == many.iterations > 3
+    assert bool(one.done.all() & many.done.all())
+    torch.testing.assert_close(one.x, many.x, rtol=0, atol=4 * EPS)
+    assert float(largest(equation(one.x, False).F)) < 1e-15
+
+
+def test_a_solution_gets_its_derivative():
+    # fails if the slope that is attached has the wrong sign, or the value moves
+    a = torch.tensor([2.0], dtype=torch.float64, requires_grad=True)
+    root = find_root(lambda x: (x * x - a.detach(), torch.diag_embed(2 * x)), torch.ones(1, dtype=torch.float64))
+    x = attached(root.x, root.J, root.x * root.x - a)
+    torch.testing.assert_close(x, torch.tensor([2.0**0.5], dtype=torch.float64), rtol=0, atol=EPS)
+    (slope,) = torch.autograd.grad(x.sum(), a)
+    torch.testing.assert_close(slope, 0.5 / x.detach(), rtol=0, atol=EPS)

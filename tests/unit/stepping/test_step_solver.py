@@ -1,0 +1,238 @@
+"""A single step: one answer by every path, samples apart, small steps in float32."""
+
+import pytest
+import torch
+
+from herglotz.mechanics import autograd_partials, momentum_jacobian, momentum_residual, partials
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Status, Stepper, solve, solve_step
+
+LEVELS = {
+    "correction": ModelConfig(correction_width=6),
+    "affine": ModelConfig(level="affine"),
+    "two": ModelConfig(
+        level="affine",
+        angles=(True, False),
+        **{k: (1.0, 1.0) for k in ("scale", "speed", "stiffness", "tilt")},  # pyright: ignore[reportArgumentType]
+    ),
+}
+TOL = 64 * torch.finfo(torch.float64).eps
+
+
+def random_model(config, dtype=torch.float64):
+    model = ContactLagrangian(config)
+    make = torch.Generator().manual_seed(3)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=parameter.dtype)
+    return model.to(dtype)
+
+
+def states(n, batch=6, dtype=torch.float64):
+    make = torch.Generator().manual_seed(4)
+    q, p = (torch.randn(batch, n, generator=make, dtype=torch.float64).to(dtype) for _ in range(2))
+    return State(q, p, torch.randn(batch, generator=make, dtype=torch.float64).to(dtype))
+
+
+class Counted:
+    """A discrete Lagrangian that counts its evaluations by order."""
+
+    def __init__(self, L_d):
+        self.L_d, self.orders = L_d, []
+
+    def __call__(self, q0, q1, s0, h):
+        return self.L_d(q0, q1, s0, h)
+
+    def partials(self, q0, q1, s0, h, order=1):
+        self.orders.append(order)
+        return partials(self.L_d, q0, q1, s0, h, order)
+
+
+def torch_func_step(L_d, q0, p0, s0, h, iterations=6):
+    """The step as it is written first: vmap, grad and jacrev, a fixed number of Newton iterations."""
+    from torch.func import grad, jacrev, vmap
+
+    def one(q0, p0, s0):
+        def F(q1):
+            D1, D3 = grad(L_d, (0, 2))(q0, q1, s0, h)
+            return D1 + (1 + D3) * p0
+
+        q1 = q0
+        for _ in range(iterations):
+            q1 = q1 - torch.linalg.solve(jacrev(F)(q1), F(q1))
+        return q1, grad(L_d, 1)(q0, q1, s0, h), s0 + L_d(q0, q1, s0, h)
+
+    return vmap(one)(q0, p0, s0)
+
+
+@pytest.mark.parametrize("name", LEVELS)
+def test_both_orders_and_a_plain_newton_agree(name):
+    # fails if a kept Jacobian changes the answer, or its P, residual or status belongs to another point
+    model, (q, p, s) = random_model(LEVELS[name]), states(LEVELS[name].dof)
+    h = torch.tensor(0.2, dtype=torch.float64)
+    with torch.no_grad():
+        full = solve_step(model, q, p, s, h, q, TOL)
+        for guess in (q, full.q1 + 1e-4 * p, full.q1 + 1e-9, full.q1):
+            fast = solve_step(model, q, p, s, h, guess, TOL, order=1)
+            torch.testing.assert_close(fast.q1, full.q1, rtol=1e-13, atol=1e-13)
+            torch.testing.assert_close(fast.P.D2, partials(model, q, fast.q1, s, h).D2, rtol=1e-13, atol=1e-13)
+            assert fast.status.tolist() == [Status.CONVERGED] * 6
+            assert bool((fast.residual <= TOL * 10).all())
+        q1 = q
+        for _ in range(8):
+            P = autograd_partials(model, q, q1, s, h, 2)
+            step = torch.linalg.solve(momentum_jacobian(P, p), momentum_residual(P, p)[..., None])[..., 0]
+            q1 = q1 - step
+        torch.testing.assert_close(full.q1, q1, rtol=1e-13, atol=1e-13)
+
+
+def test_the_torch_func_twin_gives_the_same_step():
+    # fails if a single step and the step as one would write it first differ
+    n, h = 2, 0.2
+
+    def L_d(q0, q1, s0, h):
+        v, q = (q1 - q0) / h, (q0 + q1) / 2
+        potential = torch.cos(q).sum() + 0.1 * torch.sin(q[0] * q[1])
+        return h * (0.5 * (v * v).sum() + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[0])
+
+    def batched(q0, q1, s0, h):
+        v, q = (q1 - q0) / h[..., None], (q0 + q1) / 2
+        potential = torch.cos(q).sum(-1) + 0.1 * torch.sin(q[..., 0] * q[..., 1])
+        return h * (0.5 * (v * v).sum(-1) + potential - 0.2 * s0 - 0.05 * torch.sin(s0) * v[..., 0])
+
+    start = states(n)
+    out = Stepper(batched).step(start, h)
+    for a, b in zip(out.state, torch_func_step(L_d, *start, h), strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-13, atol=1e-13)
+
+
+def test_a_good_guess_costs_one_second_derivative():
+    # fails if every iteration of a rollout evaluates the Hessian again
+    counted = Counted(random_model(LEVELS["correction"]))
+    with torch.no_grad():
+        Stepper(counted).rollout(*states(1), h=0.02, steps=40)
+    second, first = counted.orders.count(2), counted.orders.count(1)
+    assert second <= 40 + 12  # more than one only at the start, where the guess is poor
+    assert second + first <= 40 * 3
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_bad_samples_cost_their_neighbours_nothing(order):
+    # fails if NaN, inf or a hopeless sample changes a neighbour's answer, or keeps the batch iterating
+    counted = Counted(random_model(LEVELS["affine"]))
+    q, p, s = states(1)
+    h = torch.tensor(0.2, dtype=torch.float64)
+    with torch.no_grad():
+        good = solve_step(counted, q, p, s, h, q, TOL, order=order)
+        spoiled_q, spoiled_p = q.clone(), p.clone()
+        spoiled_q[1], spoiled_p[3], spoiled_p[4] = torch.nan, torch.inf, -torch.inf
+        counted.orders.clear()
+        bad = solve_step(counted, spoiled_q, spoiled_p, s, h, spoiled_q, TOL, order=order)
+    assert bad.iterations <= good.iterations
+    assert bad.status.tolist() == [0, Status.DIVERGED, 0, Status.DIVERGED, Status.DIVERGED, 0]
+    for i in (0, 2, 5):
+        torch.testing.assert_close(bad.q1[i], good.q1[i], rtol=1e-14, atol=1e-14)
+
+
+def test_backtracking_with_a_kept_jacobian():
+    # fails if a sample that needs short steps is given up, or drags its neighbours through them
+    def stiff(q0, q1, s0, h):
+        # F = −q1 − tanh(50 (q1 − 1)) / 10 at q0 = 0: flat, then steep; full Newton steps overshoot
+        return (-q0 * (q1 + torch.tanh(50 * (q1 - 1)) / 10)).sum(-1) + 0 * s0 * h
+
+    q = torch.zeros(3, 1, dtype=torch.float64)
+    p = torch.tensor([[0.3], [1.0], [1.05]], dtype=torch.float64)
+    s, h = torch.zeros(3, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
+    with torch.no_grad():
+        both = [solve_step(stiff, q, p, s, h, q, TOL, order=order) for order in (1, 2)]
+    for solution in both:
+        assert solution.status.tolist() == [Status.CONVERGED] * 3
+        F = -(solution.q1 + torch.tanh(50 * (solution.q1 - 1)) / 10) + p
+        assert float(F.abs().max()) < 1e-13
+
+
+def bent(q0, q1, s0, h):
+    """A step equation of n coordinates, F = q0-gradient, with J singular at q1 = 0, flat and steep stretches."""
+    first = (-q0 * (q1**3 + torch.tanh(20 * (q1 - 1)) / 10)).sum(-1)
+    return first - 0.3 * (q0[..., 0] * q1[..., -1] ** 2) + 0 * s0 * h
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_one_sample_alone_takes_the_way_that_it_takes_in_a_batch(n, order):
+    # fails if the loop in plain numbers decides otherwise: line search, kept Jacobian, floor, NaN, singular J, limit
+    make = torch.Generator().manual_seed(5)
+    q = torch.zeros(12, n, dtype=torch.float64)
+    p, guess = (torch.randn(12, n, generator=make, dtype=torch.float64) for _ in range(2))
+    guess[0], p[1], p[2, 0], p[3], guess[4] = 0.0, torch.nan, torch.inf, 0.0, 1e6
+    s, h = torch.zeros(12, dtype=torch.float64), torch.tensor(1.0, dtype=torch.float64)
+    statuses = set()
+    for limit in (5, 40):
+        whole = solve_step(bent, q, p, s, h, guess, TOL, limit, order)
+        for i in range(12):
+            alone = solve_step(bent, q[i], p[i], s[i], h, guess[i], TOL, limit, order)
+            assert int(alone.status) == int(whole.status[i]), i
+            statuses.add(int(alone.status))
+            torch.testing.assert_close(alone.q1, whole.q1[i], rtol=1e-12, atol=1e-12, equal_nan=True)
+            assert alone.iterations <= whole.iterations
+    assert statuses == {Status.CONVERGED, Status.MAX_ITERATIONS, Status.SINGULAR, Status.DIVERGED}
+
+
+def test_the_solution_of_two_equations():
+    # fails if the elimination for n = 2 lacks its row exchange, or hides a singular matrix
+    make = torch.Generator().manual_seed(6)
+    A, b = (torch.randn(50, 2, k, generator=make, dtype=torch.float64) for k in (2, 1))
+    A[0, 0, 0], A[1, 0, 0], A[2] = 0.0, 1e-18, 1e-200 * A[2]
+    torch.testing.assert_close(solve(A, b[..., 0]), torch.linalg.solve(A, b)[..., 0], rtol=1e-10, atol=1e-12)
+    singular = torch.tensor([[[1.0, 2.0], [2.0, 4.0]], [[0.0, 0.0], [0.0, 0.0]]], dtype=torch.float64)
+    assert not bool(torch.isfinite(solve(singular, torch.ones(2, 2, dtype=torch.float64))).all(-1).any())
+
+
+# The explicit step is compensated in p as well: no growth. The implicit one rounds p1 = D2 L_d at every step.
+@pytest.mark.parametrize(("level", "bound"), [("correction", 400 * 4 * 1.2e-7 * 3), ("linear", 2.5e-7)])
+def test_small_steps_in_float32_keep_the_velocity(level, bound):
+    # fails if a small step is solved for q1: then (q1 − q0)/h is rounding (trap 6)
+    config = LEVELS["correction"] if level == "correction" else ModelConfig()
+    h, steps = 1e-6, 400
+    single, double = random_model(config, torch.float32), random_model(config).float().double()
+    start = states(1, dtype=torch.float32)
+    with torch.no_grad():
+        out = Stepper(single).rollout(*start, h=h, steps=steps)
+        h_single = float(torch.tensor(h, dtype=torch.float32))
+        exact = Stepper(double).rollout(*(x.double() for x in start), h=h_single, steps=steps)
+        naive = Stepper(Counted(single), explicit=False).rollout(*start, h=h, steps=steps)
+    assert bool(out.ok.all())
+    error, before = ((x.p.double() - exact.p).abs().max() for x in (out, naive))
+    assert float(error) < bound
+    assert not float(before) < 1e4 * float(error)
+    moved = (exact.q[:, -1] - exact.q[:, 0]).abs().max()
+    drift = (out.q.double()[:, -1] - exact.q[:, -1]).abs().max()
+    assert float(drift) < 1.5e-7  # half a unit in the last place of the position, however many steps
+    assert float(drift) < 1e-2 * float(moved)
+
+
+def test_gradient_of_a_small_float32_step():
+    # fails if the derivative of the increment form misses the dependence on q0 at fixed Δ
+    model = random_model(LEVELS["correction"], torch.float32)
+    twin = random_model(LEVELS["correction"]).float().double()
+    start = states(1, dtype=torch.float32)
+
+    def gradient(model, start):
+        leaves = [x.clone().requires_grad_() for x in start]
+        out = Stepper(model).step(State(*leaves), 0.125).state
+        return torch.autograd.grad(
+            (out.q.sum() + 2 * out.p.sum() + out.s.sum()), [*leaves, *filter(lambda w: w.numel(), model.parameters())]
+        )
+
+    pairs = zip(gradient(model, start), gradient(twin, [x.double() for x in start]), strict=True)
+    for a, b in pairs:
+        torch.testing.assert_close(a.double(), b, rtol=2e-4, atol=2e-5)
+
+
+def test_gradients_with_respect_to_h_and_the_state():
+    # fails if h, q, p or s is cut off from the solved step
+    model = random_model(LEVELS["affine"])
+    q, p, s = states(1, batch=2)
+    h = torch.tensor([0.2, 0.3], dtype=torch.float64)
+    step = lambda q, p, s, h: tuple(Stepper(model).step(State(q, p, s), h).state)  # noqa: E731
+    assert torch.autograd.gradcheck(step, [x.requires_grad_() for x in (q, p, s, h)], atol=1e-8)

@@ -1,0 +1,74 @@
+"""The verdict of a fit: against the precision of the data, in words that name a remedy."""
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.data.roughness import precision
+from herglotz.scenes import scene
+from herglotz.training import FitConfig, fit
+from herglotz.training.verdict import AT_THE_NOISE, in_words
+
+GOOD = {"follows_data": True, "objective": "trajectory"}
+
+
+@pytest.mark.parametrize(
+    ("windows", "unseen", "free", "verdict"),
+    [
+        (0.011, 0.012, 0.013, "fits to the noise"),
+        (0.011, None, None, "fits to the noise"),
+        (0.011, 0.012, 0.02, "fits, worse than the noise by a factor of 2:"),
+        (0.011, 0.012, 5.0, "fits, worse than the noise by a factor of 5e+02:"),  # chaos: it rejects nothing
+        (0.2, 0.012, 0.013, "does not fit"),
+        (0.011, 0.2, 0.013, "does not fit"),
+        (0.011, 0.012, math.inf, "does not fit"),
+        (math.nan, 0.012, 0.013, "does not fit"),
+        (math.inf, 0.012, 0.013, "does not fit"),
+    ],
+)
+def test_words(windows, unseen, free, verdict):
+    # fails if an error is left out of the comparison, a broken free run passes, or a NaN compares as small
+    text = in_words(windows, unseen, free, noise=0.01, spread=1.0, metrics=GOOD)
+    assert text.startswith(verdict)
+    assert ("Try " in text) == (verdict == "does not fit")
+
+
+def test_a_model_without_states_does_not_fit():
+    # fails if a fit that says it follows no data is praised for its one-step errors
+    text = in_words(0.01, 0.01, 0.01, noise=0.01, spread=1.0, metrics={**GOOD, "follows_data": False})
+    assert text.startswith("does not fit")
+
+
+@pytest.mark.parametrize("noise", [1e-3, 1e-2, 0.1])
+@pytest.mark.parametrize("h", [0.1, 0.5])
+def test_precision_is_the_noise(noise, h):
+    # fails if coarse motion (thirteen samples a period at h = 0.5) counts as noise; over 5 seeds the ratio was within
+    # 0.90 … 1.08
+    data = simulate(scene("damped_pendulum"), trajectories=4, steps=100, h=h, noise=noise, seed=1)
+    assert precision(data) == pytest.approx(noise, rel=0.2)
+
+
+def test_a_fit_at_the_noise_says_so():
+    # fails if windows start from the recorded samples, the unseen part from unfitted states, or units differ
+    data = simulate(scene("damped_pendulum"), trajectories=3, steps=60, h=0.2, noise=0.01, seed=3)
+    run = fit(data, FitConfig(departures=(2e-3,)), progress=False)
+    assert run.metrics["verdict"].startswith("fits to the noise"), run.metrics["verdict"]
+    assert run.metrics["window_rms"] < AT_THE_NOISE * 0.01
+    assert run.metrics["unseen_window_rms"] < AT_THE_NOISE * 0.01
+
+
+def test_a_model_that_lacks_a_force_is_told():
+    # fails if training errors alone judge: a pendulum pushed by nobody's word of it is no damped pendulum
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=80, h=0.2, noise=0.002, seed=3)
+    pushed = replace(data, q=data.q + 0.5 * torch.sin(2.3 * data.t)[:, None])
+    run = fit(pushed, FitConfig(departures=(2e-4,), objective="trajectory", iterations=10), progress=False)
+    assert not run.metrics["verdict"].startswith("fits to the noise"), run.metrics["verdict"]
+
+
+def test_short_data_have_no_precision():
+    # fails if fewer than nine samples raise, or are taken for exact
+    t = torch.arange(6, dtype=torch.float64) * 0.1
+    assert math.isinf(precision(Trajectories.of(t, t.cos()[:, None], (6,), angles=(False,))))
