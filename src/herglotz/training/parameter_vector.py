@@ -62,7 +62,7 @@ class FixedModel:
     @property
     def capabilities(self) -> Capabilities:
         """The model's."""
-        return self.flat.model.capabilities
+        return self.parameters.model.capabilities
 
     def at(self, u: Tensor) -> FixedModel:
         """The discrete Lagrangian of a step whose inputs are u, (..., m)."""

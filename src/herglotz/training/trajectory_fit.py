@@ -27,6 +27,7 @@ from herglotz.training.task import Task
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
 MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
+FOLLOWED = 0.05  # of the spread of q: segments that miss less follow the motion, and grow on to simulation error
 FLOOR = 1e-6  # of the largest |q|: errors below it are no reason to stop growing segments
 WIDER = (30.0, 900.0)  # times weaker priors: the next ranges start where the default one ends, the last at 5 baselines
 HALVED = 2.0  # factor by which a weaker prior has to lower the error of the shortest segments
@@ -179,11 +180,13 @@ class SegmentStages:
         last, best = first, first.noise
         freedom = first.problem.freedom
         used = None if bool(first.problem.used.all()) else first.problem.used
+        q = self.task.data.q
+        followed = FOLLOWED * float((q - q.mean(0)).square().mean().sqrt())
         for length in self.lengths[1:]:
             if not self.frozen:
                 sigma = last.noise if freedom else max(sigma, last.noise)
             longer = self.fit(length, sigma, freedom, last, used)
-            if longer is None or (not self.frozen and longer.noise > LOST * max(best, FLOOR * self.task.size)):
+            if longer is None or (not self.frozen and longer.noise > max(LOST * max(best, FLOOR * self.task.size), followed)):
                 break  # no parameters follow the data for so long: chaos, or forces that the model does not know
             last, best = longer, min(best, longer.noise)
         return last
