@@ -63,6 +63,9 @@ def test_decay_to_rest_ends_at_rest(settings):
     assert out.sigma[-1] < 1e-289
 
 
+REPEATS = 20  # some 30 ms: clocks of processor time that advance by 4 ms resolve a factor of 2
+
+
 def test_no_step_is_slower_than_twice_the_first():
     # fails if arithmetic with denormals slows a motion that has come to rest (a factor of 10 to 100)
     stepper = herglotz.compile(build(potential_width=0, correction_width=4, rate=0.5))
@@ -71,7 +74,8 @@ def test_no_step_is_slower_than_twice_the_first():
         best = math.inf
         for _ in range(3):  # the same steps again: another program's share of the processor is not ours
             begin = time.process_time()
-            out = stepper.rollout(*x, h=H, steps=5_000)
+            for _ in range(REPEATS):
+                out = stepper.rollout(*x, h=H, steps=5_000)
             best = min(best, time.process_time() - begin)
         x = out.final
         times.append(best)

@@ -37,7 +37,7 @@ def cases():
         yield pytest.param(name, marks=marks)
 
 
-@pytest.mark.parametrize("name", cases())
+@pytest.mark.parametrize("name", list(cases()))
 def test_default_settings_reach_the_noise(name):
     # fails if the default settings stop short of what the data hold
     noise, settings = RECORDINGS[name]

@@ -138,7 +138,7 @@ def test_export_takes_whatever_was_chosen(pendulum_run, tmp_path, capsys):
     loose = next(k for k, c in enumerate(found.candidates) if c.setting.tol)
     capsys.readouterr()
     assert main(["export", str(tmp_path / f"{loose}"), "--out", str(tmp_path / "step.pt2")]) == 0
-    assert "tolerance 1e-07 that tune chose: PyTorch and C only" in capsys.readouterr().out
+    assert "The tolerance 1e-07 of tune applies to PyTorch and C only" in capsys.readouterr().out
 
 
 def test_a_smaller_correction_is_tried_at_the_own_step_and_a_larger_one_is_not(pendulum_run):

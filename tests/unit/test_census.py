@@ -111,7 +111,6 @@ def test_circles_are_found_through_packages_and_only_where_they_are():
     ]
 
 
-@pytest.mark.xfail(reason="three circles of files are being taken apart")
 def test_no_file_imports_itself_in_a_circle():
     # fails if two files of src import each other, directly or through others
     assert census.circles(census.imports(census.sources(None))) == []

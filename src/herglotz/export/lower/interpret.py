@@ -92,6 +92,7 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.neg.default: lambda x: c.multiply(x, -1.0),
         aten.reciprocal.default: lambda x: c.divide(1.0, x),
         aten.pow.Tensor_Scalar: c.power,
+        aten.pow.Tensor_Tensor: c.powers,
         aten.tanh_backward.default: lambda g, t: c.multiply(g, c.subtract(1.0, c.multiply(t, t))),
         aten.sigmoid_backward.default: lambda g, s: c.multiply(g, c.multiply(s, c.subtract(1.0, s))),
         aten.gt.Tensor: c.greater, **dict.fromkeys(WHERE, c.choose),
@@ -207,6 +208,15 @@ class _Numbers:
         for _ in range(abs(whole)):
             out = self.multiply(out, x)
         return out if whole >= 0 else self.divide(1.0, out)
+
+    def powers(self, x: np.ndarray, exponents: np.ndarray) -> np.ndarray:
+        """Powers that are constants, one for each entry of the last axis."""
+        x = np.broadcast_to(x, np.broadcast_shapes(x.shape, exponents.shape))
+        by = np.broadcast_to(exponents, x.shape).reshape(-1, x.shape[-1])
+        if any(isinstance(e, Ref) for e in by.flat) or bool((by != by[:1]).any()):
+            raise InputError("a power whose exponent is no constant cannot be written as C; export as .pt2 instead")
+        by = by[0]
+        return np.stack([self.power(x[..., k], float(by[k])) for k in range(x.shape[-1])], -1)
 
     def function(self, name: str, x: np.ndarray) -> np.ndarray:
         fold = lambda a: None if isinstance(a, Ref) else MATHEMATICS[name](a)  # noqa: E731

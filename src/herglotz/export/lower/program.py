@@ -7,12 +7,15 @@ operands that lie in a row of memory each; everything else is one scalar a line.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
+
+from herglotz.errors import InputError
 
 LOOP = 8  # results from which on a loop is written; shorter rows are faster and no longer as scalars
 DENSE = 64  # nonzero weights from which on a matrix product is a call
@@ -278,7 +281,18 @@ def fold_multiply(a: Atom, b: Atom) -> Atom | None:
 
 
 def literal(value: float) -> str:
-    """A constant, which `herglotz.export.c_header` rounds and marks by the number type."""
+    """A constant, which `herglotz.export.c_header` rounds and marks by the number type.
+
+    Raises
+    ------
+    InputError
+        If the number is not finite, as the inverse of a singular mass is (erratum E4: no step is defined).
+    """
+    if not math.isfinite(value):
+        raise InputError(
+            f"a constant of the step equation is {value}: the mass matrix is singular or a parameter overflowed, "
+            "so the model has no step; fit it again"
+        )
     text = repr(float(value))
     return f"R({text})" if value >= 0 else f"(-R({text[1:]}))"
 
