@@ -94,6 +94,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
+    parser.add_argument(
+        "--sticking", action="store_true",
+        help="dry friction that can hold a joint still: axes without a spring (forced; stepped by PyTorch alone)",
+    )  # fmt: skip
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument(
         "--order", type=int, choices=(2, 4), default=2,
@@ -122,7 +126,8 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, order=arguments.order, substeps=arguments.substeps,
+        diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
+        substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)

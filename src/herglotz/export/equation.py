@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from herglotz.errors import InputError
 from herglotz.export.trace import Graph, example_batch, traced
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
@@ -127,6 +128,11 @@ class Equations:
     @classmethod
     def of(cls, model: ContactLagrangian | Equations) -> Equations:
         """Those of a copy of the model, which no export can change or train."""
+        if isinstance(model, ContactLagrangian) and model.capabilities.sticking:
+            raise InputError(
+                "this model's dry friction is set-valued, which files do not step; step it with PyTorch, or fit "
+                "without sticking"
+            )
         return model if isinstance(model, Equations) else cls(copy.deepcopy(model).eval().requires_grad_(False))
 
     @cached_property

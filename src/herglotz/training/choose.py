@@ -32,6 +32,10 @@ def _named(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
     return None if config.objective == "auto" else "the user named it"
 
 
+def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    return "a joint that stands still says nothing about its forces in one step" if config.sticking else None
+
+
 def _structured(seen: Look, config: FitConfig) -> str | None:
     return seen.structure if config.objective == "auto" != seen.settings.objective else None
 
@@ -64,6 +68,7 @@ def _exact(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 RULES = (
     Rule("Are s or p fitted too?", "residual", _supervised),
     Rule("Did the user name the objective?", "as named", _named),
+    Rule("Can friction hold a joint?", "trajectory", _sticking),
     Rule("Does a dictionary of features explain the steps?", "as found", _structured),
     Rule("Does the baseline's equation of motion explain the steps?", "residual", _explained),
     Rule("Does a flexible model miss single steps?", "trajectory", _noisy),
@@ -84,7 +89,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
         level=c.level, objective=objective, network=network, order=c.order, features=c.features,
-        forces={"coulomb": c.coulomb, "coupled": c.coupled, "diagonal": c.diagonal}, start={**own, **base.start},
+        forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal},
+        start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
         reasons={
             "level": _level_reason(seen, user_settings),

@@ -71,6 +71,9 @@ class FitConfig:
         Units of the full level's map of s.
     coulomb
         Dry friction beside the viscous one at the forced level.
+    sticking
+        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`): for axes without a
+        spring. Whole trajectories are fitted, from a start with smooth friction; PyTorch alone steps the model.
     robust
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
@@ -122,6 +125,7 @@ class FitConfig:
     mass_width: int = 0
     action_width: int = 4
     coulomb: bool = False
+    sticking: bool = False
     robust: str = "auto"
     supervision: str = "q"
     restarts: int | None = None
@@ -148,8 +152,10 @@ class FitConfig:
             )
         _choice("dtype", self.dtype, tuple(DTYPES))
         _choice("activation", self.activation, ACTIVATIONS)
-        if (self.coulomb or self.input_map) and self.level not in ("forced", "auto"):
-            raise InputError(f"coulomb and input_map are forces; set level='forced', not '{self.level}'")
+        if self.sticking and self.objective not in ("auto", "trajectory"):
+            raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
+        if (self.coulomb or self.sticking or self.input_map) and self.level not in ("forced", "auto"):
+            raise InputError(f"coulomb, sticking and input_map are forces; set level='forced', not '{self.level}'")
         if self.input_map and not self.use_inputs:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
@@ -202,8 +208,10 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            level = "forced" if driven or self.coulomb or self.coupled else "linear"
+            level = "forced" if driven or self.coulomb or self.coupled or self.sticking else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
+        if self.sticking:
+            config = replace(config, coulomb=True)
         if driven and config.level != "forced":
             raise InputError(
                 f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "

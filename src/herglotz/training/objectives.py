@@ -16,7 +16,7 @@ from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.smoothing_fit import fit_smoothing
-from herglotz.training.task import Task
+from herglotz.training.task import Task, with_sticking
 from herglotz.training.trajectory_fit import fit_states, fit_trajectories
 
 LOOSE = 0.02  # σ of the short fits that others start from, relative to the motion's size: they shall not follow noise
@@ -67,6 +67,8 @@ def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
 def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
     """Fit parameters and states to whole trajectories, from a short one-step fit."""
     model, sigma = _one_step_start(task, plan)
+    if task.config.sticking:
+        model = with_sticking(model)
     found = fit_trajectories(task, model, sigma)
     if found is None:  # the model keeps the parameters of the one-step fit
         notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}

@@ -58,7 +58,7 @@ class Structure(NamedTuple):
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
     """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
     c = user_settings
-    named = c.features or c.known or c.alike or c.diagonal or c.mass_width or c.coulomb
+    named = c.features or c.known or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking
     plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm"
     driven = data.u is not None and c.use_inputs
     several = 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)

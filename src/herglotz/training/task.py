@@ -14,6 +14,7 @@ from herglotz.training.stages import Stages
 
 WIDER = 3  # a single layer has this multiple of units: it reaches a tenth of the error of two layers in the same time
 NOISY = 3e-4  # a one-step error above this share of the motion's size is noise: 40 iterations reach it on exact data
+LEAST_GRIP = 0.01  # of set-valued friction at the start of a fit, over the typical speed: small beside what is found
 EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
 
 
@@ -93,3 +94,20 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
         numbers = model.get_parameter(name).data.view(-1)
         numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)  # order 4 has the baseline's features first
     return model.to(dtype=config.torch_dtype, device=config.device)
+
+
+def with_sticking(model: ContactLagrangian) -> ContactLagrangian:
+    """The model with set-valued dry friction in place of smooth friction, which a fit starts from.
+
+    Friction at 0 has no slope there; its forces start at `LEAST_GRIP` of the typical speed (mass 1) at least.
+    """
+    other = ContactLagrangian(replace(model.config, sticking=True))
+    known, least = dict(model.named_parameters()), LEAST_GRIP * max(model.config.speed)
+    with torch.no_grad():
+        for name, value in other.named_parameters():
+            value.copy_(known[name])
+        assert other.friction is not None
+        other.friction.coulomb.clamp_(min=least)
+        other.friction.breakaway.clamp_(min=least / 100)
+    kept = next(model.parameters())
+    return other.to(dtype=kept.dtype, device=kept.device)

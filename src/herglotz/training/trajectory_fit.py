@@ -180,13 +180,15 @@ class SegmentStages:
         last, best = first, first.noise
         freedom = first.problem.freedom
         used = None if bool(first.problem.used.all()) else first.problem.used
-        q = self.task.data.q
-        followed = FOLLOWED * float((q - q.mean(0)).square().mean().sqrt())
+        followed, q = 0.0, self.task.data.q
+        if self.model.capabilities.sticking:  # no restoring force: errors grow with the length, and are the objective
+            followed = FOLLOWED * float((q - q.mean(0)).square().mean().sqrt())
         for length in self.lengths[1:]:
             if not self.frozen:
                 sigma = last.noise if freedom else max(sigma, last.noise)
             longer = self.fit(length, sigma, freedom, last, used)
-            if longer is None or (not self.frozen and longer.noise > max(LOST * max(best, FLOOR * self.task.size), followed)):
+            most = max(LOST * max(best, FLOOR * self.task.size), followed)
+            if longer is None or (not self.frozen and longer.noise > most):
                 break  # no parameters follow the data for so long: chaos, or forces that the model does not know
             last, best = longer, min(best, longer.noise)
         return last
