@@ -17,8 +17,8 @@ def axis():
 
 
 def test_the_friction_of_a_servo_axis_is_found(axis):
-    # fails if segments stop growing, or friction at the start of the fit has no slope. Seeds 0 to 4: the numbers are off
-    # by 0.002 to 0.023, the free run by 0.001 to 0.032 of the spread
+    # fails if segments stop growing, or friction at the start of the fit has no slope. At seeds 0 to 4 the numbers are
+    # off by 0.002 to 0.023, the free run by 0.001 to 0.032 of the spread
     true = scene("servo_axis").parameters
     friction = axis.model.friction
     found = {

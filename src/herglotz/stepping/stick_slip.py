@@ -67,12 +67,12 @@ class StickSlip:
         delta = self.increment(z)
         return delta if self.equation.increments else self.equation.q0 + delta
 
-    def __call__(self, z: Tensor, second: bool) -> Point:
-        """G, and ∂G/∂z if `second`."""
+    def __call__(self, x: Tensor, second: bool) -> Point:
+        """G at z = x, and ∂G/∂z if `second`."""
         order = 2 if second else self.equation.order
-        point = self.equation(self.unknown(z), second)
-        P, sticks = point.rest, self.increment(z) == 0
-        G = unheld_residual(P, self.equation.p0) - torch.where(sticks, self.stiffness * z, 0.0)
+        point = self.equation(self.unknown(x), second)
+        P, sticks = point.rest, self.increment(x) == 0
+        G = unheld_residual(P, self.equation.p0) - torch.where(sticks, self.stiffness * x, 0.0)
         if order != 2:
             return Point(G, None, P)
         J = torch.where(sticks[..., None, :], 0.0, unheld_jacobian(P, self.equation.p0))
