@@ -70,8 +70,10 @@ class StickSlip:
     def __call__(self, x: Tensor, second: bool) -> Point:
         """G at z = x, and ∂G/∂z if `second`."""
         order = 2 if second else self.equation.order
-        point = self.equation(self.unknown(x), second)
-        P, sticks = point.rest, self.increment(x) == 0
+        unknown = self.unknown(x)
+        point = self.equation(unknown, second)
+        # As the forces see it: q0 + Δ may round to q0.
+        P, sticks = point.rest, unknown == (0.0 if self.equation.increments else self.equation.q0)
         G = unheld_residual(P, self.equation.p0) - torch.where(sticks, self.stiffness * x, 0.0)
         if order != 2:
             return Point(G, None, P)
