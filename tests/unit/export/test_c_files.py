@@ -69,7 +69,7 @@ def test_two_models_of_one_prefix_are_refused(tmp_path):
 
 
 def test_order_4_stays_small(tmp_path):
-    # fails if jets are unrolled number by number: measured 0.2 MB and 2 s of processor time
+    # fails if jets are unrolled number by number: measured 0.2 MB
     features = ("cos(q1 - q2) v1 v2", "cos(q1)", "sin(2q2)")
     model = small(2, level="linear", order=4, potential_width=0, features=features)
     path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm")

@@ -39,6 +39,9 @@ CASES: dict[str, dict[str, Any]] = {
     },
 }  # fmt: skip
 
+# Derivatives that the default suite compiles, which takes 5 to 15 s each: every kind of term is in one of them.
+ALWAYS = ("affine, tanh", "full, correction", "motors", "velocities", "order 4, coupled motors")
+
 
 @pytest.fixture(autouse=True, scope="module")
 def _cache(tmp_path_factory):
@@ -116,7 +119,21 @@ def test_every_level_agrees_with_the_eager_stepper(case):
         assert relative(getattr(single, name), getattr(ours, name)[0]) <= 1e-12, name
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.slow
+@pytest.mark.parametrize("case", ["coupled", "velocities", "order 4", "order 4, coupled motors"])
+def test_a_thousand_steps_of_features_and_joints_agree(case):
+    # fails if rounding of features, of coupled friction or of order 4 adds up (test_c_matrix.py has the other terms)
+    model, states, options = problem(case, 1000)
+    with torch.no_grad():
+        eager = Stepper(model, tol=4e-16).rollout(*states, **options)
+    ours = compiled_of(case).rollout(*states, **options)
+    assert eager.ok.all()
+    assert ours.ok.all()
+    for name in ("q", "p", "s"):
+        assert relative(getattr(ours, name), getattr(eager, name)) <= 1e-12, name
+
+
+@pytest.mark.parametrize("case", [pytest.param(c, marks=[] if c in ALWAYS else pytest.mark.slow) for c in CASES])
 def test_the_derivative_of_a_step_is_that_of_the_eager_stepper(case):
     # fails if a block is written to another's place, the map of the inputs is left out, or a term has no derivative
     model, state, options = problem(case, 1)
