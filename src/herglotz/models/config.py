@@ -62,6 +62,12 @@ class ModelConfig:
     order: int = 2
 
     def __post_init__(self):
+        self._check_sizes()
+        self._check_forces()
+        self._check_structure()
+        self._check_features()
+
+    def _check_sizes(self) -> None:
         if self.level not in LEVELS:
             raise InputError(f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}")
         if self.activation not in ACTIVATIONS:
@@ -76,12 +82,23 @@ class ModelConfig:
                 raise InputError(f"{name} needs one number a coordinate ({len(self.angles)}), got {given}")
         if self.level == "full" and self.action_width < 1:
             raise InputError(f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'")
+
+    def _check_forces(self) -> None:
         if self.level != "forced" and (self.coulomb or self.inputs or self.input_map):
             raise InputError(f"coulomb and inputs are forces; set level='forced', not '{self.level}'")
         if self.sticking and not self.coulomb:
             raise InputError("sticking is of dry friction; set coulomb=True")
         if self.level != "forced" and self.coupled:
             raise InputError(f"coupled is friction between joints; set level='forced', not '{self.level}'")
+        if self.input_zero and not self.inputs:
+            raise InputError("input_zero is the zero of inputs; set inputs to their number")
+        if self.inputs < 0:
+            raise InputError(f"inputs counts the motors and cannot be negative, got {self.inputs}")
+        if self.input_map and len(self.input_map) != self.dof * self.inputs:
+            wanted = self.dof * self.inputs
+            raise InputError(f"input_map needs n · inputs = {wanted} numbers, row by row; got {len(self.input_map)}")
+
+    def _check_structure(self) -> None:
         if self.order not in (2, 4):
             raise InputError(f"order must be 2 or 4, got {self.order}")
         networks = self.potential_width or self.mass_width or self.correction_width or not self.baseline
@@ -91,14 +108,6 @@ class ModelConfig:
             raise InputError("a model without a baseline has no features; leave features, known, alike, diagonal out")
         if self.diagonal and self.mass_width:
             raise InputError("a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False")
-        self._check_features()
-        if self.input_zero and not self.inputs:
-            raise InputError("input_zero is the zero of inputs; set inputs to their number")
-        if self.inputs < 0:
-            raise InputError(f"inputs counts the motors and cannot be negative, got {self.inputs}")
-        if self.input_map and len(self.input_map) != self.dof * self.inputs:
-            wanted = self.dof * self.inputs
-            raise InputError(f"input_map needs n · inputs = {wanted} numbers, row by row; got {len(self.input_map)}")
 
     def _check_features(self) -> None:
         products = {text: parse(text, self.angles) for text in expand((*self.features, *self.known), self.angles)}

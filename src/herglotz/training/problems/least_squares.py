@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import torch
@@ -68,7 +69,7 @@ class LeastSquares:
         return self.prior.normal_equations(theta)
 
 
-class StatesProblem(LeastSquares):
+class StatesProblem(LeastSquares, ABC):
     """An objective over the parameters and states (q, p[, s]) on a grid of model steps, the parameters first.
 
     s is an unknown only where the positions depend on it: d = 2n + 1 numbers a state there, else 2n.
@@ -87,13 +88,15 @@ class StatesProblem(LeastSquares):
         """States (..., 2n+1) from the unknowns (..., d), with s = 0 where s is none of them."""
         return torch.cat([states, states.new_zeros(*states.shape[:-1], 2 * self.n + 1 - self.d)], -1)
 
+    @abstractmethod
     def cost(self, x: Tensor) -> Tensor:
         """½|r|², a scalar; infinite where a step has no solution."""
-        raise NotImplementedError
+        ...
 
+    @abstractmethod
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
         """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
-        raise NotImplementedError
+        ...
 
 
 class StatesOnly:

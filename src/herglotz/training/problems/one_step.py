@@ -7,6 +7,7 @@ by shrinking M. The raw residual R_k can, and does: it is offered only so that t
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -28,7 +29,7 @@ MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost
 CHUNK = 4096  # triples whose Jacobian is held in memory at once: 4096 · 2 · 300 parameters are 20 MB
 
 
-class OneStep(LeastSquares):
+class OneStep(LeastSquares, ABC):
     """Σ ρ(r/σ) + prior over the parameters and `latents` further unknowns, with r a function of three samples.
 
     A subclass supplies `start`, `_rows` (what `_local` takes of some triples) and `_local` (the residuals of one triple
@@ -39,15 +40,16 @@ class OneStep(LeastSquares):
     triples: Triples
     chunk: int
 
+    @abstractmethod
     def start(self) -> Tensor:
         """All unknowns: parameters, then the latents."""
-        raise NotImplementedError
+        ...
 
-    def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]:
-        raise NotImplementedError
+    @abstractmethod
+    def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]: ...
 
-    def _local(self, x: Tensor, *rows: Any) -> Tensor:
-        raise NotImplementedError
+    @abstractmethod
+    def _local(self, x: Tensor, *rows: Any) -> Tensor: ...
 
     def _carried(self, x: Tensor, *, derivative: bool) -> Any:  # noqa: ARG002
         """What is computed along whole trajectories before the triples: nothing."""
