@@ -8,6 +8,7 @@ import time
 from pathlib import Path
 
 from herglotz.data import Trajectories
+from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.evaluate import evaluate
@@ -19,6 +20,7 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 
 
+@one_thread()
 def fit(
     data: Trajectories,
     config: FitConfig | None = None,

@@ -12,6 +12,7 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.threads import one_thread
 from herglotz.training.inputs import step_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
@@ -113,6 +114,7 @@ class Prediction:
         }
 
 
+@one_thread()
 def predict(
     run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
 ) -> Prediction:

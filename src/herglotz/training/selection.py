@@ -15,6 +15,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
+from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
@@ -109,6 +110,7 @@ class Selection:
         return json.dumps({"chosen": self.chosen.level, "levels": rows}, indent=2, allow_nan=False) + "\n"
 
 
+@one_thread()
 def select(
     data: Trajectories,
     levels: Sequence[str] | None = None,
