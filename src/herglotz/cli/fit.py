@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import count, finite, print_json, print_table
-from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, parse_angles
+from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, columns_of, parse_angles
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -129,7 +129,7 @@ def run(arguments: argparse.Namespace) -> int:
         diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
         substeps=arguments.substeps,
     )  # fmt: skip
-    data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
+    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments)).thinned(arguments.every)
     made = _make(out)
     try:
         save_run(fit(data, config, out=out, resume=arguments.resume), out)
