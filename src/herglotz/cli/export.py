@@ -54,16 +54,16 @@ def run(arguments: argparse.Namespace) -> int:
 
     result = load_run(arguments.source)
 
-    from herglotz.cli.states import last_fitted
+    from herglotz.cli.states import last_fitted, time_of_last_fitted
     from herglotz.export import export_aoti, export_c, export_onnx, export_pt2, load_exported
     from herglotz.export.c_header import read_metadata
 
     write = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}[arguments.format]
-    q, p, s = last_fitted(result, 0)
+    (q, p, s), t0 = last_fitted(result, 0), time_of_last_fitted(result, 0)
     metadata = {
         "names": list(result.data.names),
         "time_unit": result.data.time_unit,
-        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s)},
+        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t0},
         "metrics": result.metrics,
         "h_range": list(arguments.h_range or result.h_range),
     }

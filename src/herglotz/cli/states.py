@@ -22,5 +22,13 @@ def last_fitted(run: Run, trajectory: int) -> State:
     data = run.data
     if not 0 <= trajectory < len(data):
         raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
-    row = data.offsets[trajectory] + max(run.train_lengths[trajectory], 1) - 1
-    return State(*(x[row].detach() for x in run.states))
+    return State(*(x[_row(run, trajectory)].detach() for x in run.states))
+
+
+def time_of_last_fitted(run: Run, trajectory: int) -> float:
+    """Return the time of that sample."""
+    return float(run.data.t[_row(run, trajectory)])
+
+
+def _row(run: Run, trajectory: int) -> int:
+    return run.data.offsets[trajectory] + max(run.train_lengths[trajectory], 1) - 1
