@@ -161,12 +161,10 @@ def read_source(path: Path, trajectory: int) -> Source:
     from herglotz.stepping import State
 
     if path.is_dir() or path.suffix.lower() not in SUFFIXES:
-        from herglotz.cli.states import last_fitted, time_of_last_fitted
         from herglotz.training import load_run
 
         run_, data = (found := load_run(path)), found.data
-        start = last_fitted(run_, trajectory)
-        t0 = time_of_last_fitted(run_, trajectory)
+        start, t0 = run_.last_fitted(trajectory)
         box = Box(run_.box, data.angles, start.q.dtype)
         labels = (data.names, data.units, data.angles, data.time_unit)
         return Source(run_.stepper, start, t0, run_.h, *labels, box, run_.h_range)
@@ -211,7 +209,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     """Return the inputs (K, m), where there are any, and the times (K + 1,)."""
     import torch
 
-    from herglotz.cli.driving import driven, even_times, recorded
+    from herglotz.data.driving import driven, even_times, recorded
 
     steps, path = arguments.steps, arguments.inputs
     if path is None:

@@ -22,7 +22,7 @@ GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectories:
     """B trajectories of n coordinates, stored one after the other.
 
@@ -93,6 +93,9 @@ class Trajectories:
             source=source,
             columns=columns,
         )
+
+    def __repr__(self) -> str:
+        return f"Trajectories({self.summary()})"
 
     def __len__(self) -> int:
         """Return B, the number of trajectories."""

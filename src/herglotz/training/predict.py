@@ -38,7 +38,7 @@ class Trained(Protocol):
     def stepper(self) -> Stepper: ...  # noqa: D102
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
     """A recording beside the model's free run.
 
@@ -51,6 +51,10 @@ class Prediction:
     every: int  # stride by which the recording was thinned, so that its steps are not shorter than the model's
     most_substeps: int  # largest number of model steps in a recorded step
     outside: float  # share of model steps that are shorter or longer than those of the training data
+
+    def __repr__(self) -> str:
+        rms = "failed" if self.rms is None else f"{self.rms:.3g}"
+        return f"Prediction({', '.join(self.data.names)} of {self.data.source or 'data'}; RMS {rms})"
 
     @property
     def prediction(self) -> Tensor:

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from herglotz.cli.driving import driven, even_times, recorded
 from herglotz.data import Trajectories, save
+from herglotz.data.driving import driven, even_times, recorded
 from herglotz.errors import InputError
 
 T = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.5], dtype=torch.float64)
@@ -27,7 +27,7 @@ def test_inputs_act_when_they_were_recorded():  # fails if the first K inputs ar
 @pytest.mark.parametrize(
     ("t0", "steps", "h", "message"),
     [
-        (0.3, 1, None, "no sample at the start t = 0.3; the recording spans 0 to 0.5: give --t0"),
+        (0.3, 1, None, "no sample at the start t = 0.3; the recording spans 0 to 0.5: give t0"),
         (0.2, 3, None, r"3 steps from t = 0.2 need 6 samples, it has 5"),
         (0.2, 4, 0.1, r"the rollout lasts from 0.2 to 0.6, but the recording spans 0 to 0.5"),
         (-0.1, 2, 0.1, r"the rollout lasts from -0.1 to 0.1, but"),
@@ -39,7 +39,7 @@ def test_a_rollout_beyond_the_recording_is_refused(t0, steps, h, message):  # fa
 
 
 def test_the_recording_of_the_trajectory(tmp_path):  # fails if trajectory 0 drives all, or minutes are read as seconds
-    second = Trajectories.of(T, T, u=RECORDING.u * 2)
+    second = Trajectories.of(T, T, u=2 * torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0]).double())
     save(tmp_path / "u.npz", Trajectories.cat([RECORDING, second]))
     assert float(recorded(tmp_path / "u.npz", 1, "s").u[0]) == 2  # type: ignore[index]
     with pytest.raises(InputError, match="there is no trajectory 2; choose one from 0 to 1"):
