@@ -161,8 +161,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     if drawn:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print(f"Next: herglotz verify {out}")
-    if not result.config.sticking:  # files refuse such models
-        print(f"      herglotz export {out} --out {out.name}.pt2")
+    print(f"      herglotz export {out} --out {out.name}.pt2")
 
 
 def _draw(result: Run, out: Path) -> list[Path]:
