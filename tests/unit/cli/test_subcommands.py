@@ -196,7 +196,7 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 6
+    assert len(written) == 5
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
 
