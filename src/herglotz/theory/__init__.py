@@ -2,6 +2,7 @@
 
 from herglotz.theory.action import Action, curve_action, herglotz_action
 from herglotz.theory.boundary import Curve, boundary_value, initial_value
+from herglotz.theory.check import TheoremCheck, check
 from herglotz.theory.constrained import ConstrainedStepper
 from herglotz.theory.continuous import contact_vector_field, derivatives, evolution_vector_field, herglotz_acceleration
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
@@ -98,9 +99,11 @@ __all__ = [
     "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
+    "TheoremCheck",
     "bivector",
     "boundary_value",
     "cayley",
+    "check",
     "commutation_defect",
     "contact_complement",
     "contact_curvature",
