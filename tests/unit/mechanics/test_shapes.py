@@ -54,7 +54,7 @@ def test_a_forgotten_sum_is_refused(door):
 def test_a_number_instead_of_a_tensor_is_refused():
     # fails if a Python number, which has no graph, ends in a traceback from torch
     with pytest.raises(InputError, match="the function returned a float"):
-        partials(lambda q0, q1, s0, h: 1.0, Q, Q, S, 0.1)  # noqa: ARG005
+        partials(lambda q0, q1, s0, h: 1.0, Q, Q, S, 0.1)  # noqa: ARG005  # pyright: ignore
 
 
 def test_functions_of_the_theory_are_held_to_the_same():
@@ -89,7 +89,7 @@ def test_scalars_have_a_remedy(state, message):
         InputError,
         match=message.replace("q and p", "q0 and q1").replace("q must", "q0 must").replace("p must", "q1 must"),
     ):
-        partials(oscillator, *state, 0.1)
+        partials(oscillator, *state, 0.1)  # pyright: ignore
 
 
 def test_a_step_a_sample_with_one_position_for_all():
