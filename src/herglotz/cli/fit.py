@@ -177,8 +177,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print(f"Verdict: {m['verdict']}")
     print(f"Next: herglotz verify {out}")
-    if not result.config.sticking:  # files refuse such models
-        print(f"      herglotz export {out} --out {out.name}.pt2")
+    print(f"      herglotz export {out} --out {out.name}.pt2")
 
 
 def features_in_words(names: tuple[str, ...], most: int = 5) -> str:
