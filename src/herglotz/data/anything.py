@@ -13,6 +13,7 @@ from torch import Tensor
 
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.readers import load
+from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
@@ -46,6 +47,8 @@ def as_trajectories(
         if (h, time, coordinates, inputs, group) != (None,) * 5 or drop:
             raise InputError("trajectories have their columns already; of the options, only angles changes them")
         return _marked(data, angles)
+    if callable(data) and not hasattr(data, "columns"):
+        raise InputError(f"a function is no recording; {OF_AN_L_D}")
     names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
     if isinstance(data, (str, Path)):
         return _marked(load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}), angles)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
@@ -11,10 +11,12 @@ from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.motion import plot_data, plot_trajectory
 from herglotz.plots.parachute import plot_fall, plot_printed_map
+from herglotz.plots.parachute_motion import physical_fall, printed_map
 from herglotz.plots.phase import plot_phase_portrait
 from herglotz.plots.selection import plot_selection
 from herglotz.plots.style import save_figure
 from herglotz.plots.training import plot_training
+from herglotz.verify.subject import named
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -27,6 +29,44 @@ FIGURES = {
     "training.png": plot_training,
 }
 UNFORCED = {"momentum_vs_dS.png", "hj_residual.png"}  # figures of S^k, which a model with forces does not have
+
+
+THEORY = {
+    "momentum_vs_dS.png": plot_momentum_vs_generating_function,
+    "hj_residual.png": plot_hamilton_jacobi_residual,
+}
+
+
+def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None) -> list[Path]:
+    """Draw the figures of S^k and of the discrete Hamilton–Jacobi equation into `folder`, made if it is missing.
+
+    Parameters
+    ----------
+    source
+        Anything that `verify` takes and that has an L_d: a scene or its name, a run or its folder, an L_d with h, a
+        pair (L_d, states) with h. The scene "parachute" adds the paper's two figures: the printed map, and a fall.
+    folder
+        Where the PNG files go.
+    h
+        Step; default that of the source.
+
+    Raises
+    ------
+    InputError
+        If the source is none of these or has forces, whose map has no S^k; or the folder cannot be made.
+    """
+    source = named(source)
+    L_d = getattr(source, "model", getattr(source, "L_d", source))
+    if getattr(L_d, "friction", None) is not None or getattr(source, "external", None) is not None:
+        raise InputError("with friction or other forces a step is no contact map: there is no S^k to draw")
+    drawn = {name: plot(source, h=h) for name, plot in THEORY.items()}
+    if getattr(source, "name", "") == "parachute":
+        drawn["parachute_map.png"] = plot_printed_map(printed_map()[1])
+        drawn["parachute_fall.png"] = plot_fall(physical_fall()[1])
+    folder = _made(folder)
+    for name, figure in drawn.items():
+        save_figure(figure, folder / name)
+    return [folder / name for name in drawn]
 
 
 def save_figures(run: Run, folder: PathLike) -> list[Path]:
@@ -43,20 +83,26 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
     InputError
         If the folder cannot be made or written to.
     """
-    folder = Path(folder)
     skipped = UNFORCED if run.model.friction is not None else ()
     drawn = {name: plot(run) for name, plot in FIGURES.items() if name not in skipped}
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    folder = _made(folder)
     for name, figure in drawn.items():
         save_figure(figure, folder / name)
     return [folder / name for name in drawn]
 
 
+def _made(folder: PathLike) -> Path:
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    return folder
+
+
 __all__ = [
     "FIGURES",
+    "THEORY",
     "plot_bands",
     "plot_data",
     "plot_fall",
@@ -69,4 +115,5 @@ __all__ = [
     "plot_trajectory",
     "save_figure",
     "save_figures",
+    "save_theory_figures",
 ]

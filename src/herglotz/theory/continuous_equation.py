@@ -17,7 +17,6 @@ C. Offen, J. Comput. Appl. Math. 421 (2023) 114780, for learned Lagrangians; P. 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -123,7 +122,7 @@ class ContinuousEquation:
 
     def field(self, q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """X̃: (q̇, ṗ, ṡ), shapes (..., n), (..., n), (...); NaN where a step that is needed fails."""
-        X, _, _ = self._sum(State(q, p, s), 0.0, 1)
+        X, _ = self._sum(State(q, p, s), 0.0, 1)
         return split(X[..., :-1] / self.h)
 
     def hamiltonian(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
@@ -154,79 +153,86 @@ class ContinuousEquation:
 
     def between(self, state: State, theta: float) -> tuple[State, Tensor, Tensor]:
         """Φ̃^θ(state) for 0 ≤ θ ≤ 1, its conformal factor, and the estimated error."""
-        x, error, _ = self._sum(state, theta, 0)
+        x, error = self._sum(state, theta, 0)
         return State(*split(x[..., :-1])), x[..., -1].exp(), error
 
-    @cached_property
-    def _stepper(self) -> Stepper:
-        return Stepper(self.L_d)
+    def _sum(self, state: State, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
+        return _summed(_Iterates(self, state), 0, theta, derivative)
 
-    def _sum(self, state: State, theta: float, derivative: int) -> tuple[Tensor, Tensor, Tensor]:
-        """Σ weights · (q, p, s, ln σ), (..., 2n+2), the error estimate (...) and m (...)."""
-        most = MOST if self.order is None else self.order // 2
-        x, sound = self._iterates(state, most)
-        found, centre = [], x[..., most, :]
-        for m in range(1, most + 1):
-            nodes = torch.arange(-m, m + 1, dtype=torch.float64)
-            w = weights(nodes, theta)[derivative].to(x)
-            # differences to the centre: their sum with weights that add up to 0 or 1 loses no digits to it
-            apart = x[..., most - m : most + m + 1, :] - centre[..., None, :]
-            total = (w[:, None] * apart).sum(-2) + (centre if derivative == 0 else 0.0)
-            whole = sound[..., most - m : most + m + 1].all(-1)
-            found.append(torch.where(whole[..., None], total, torch.nan))
-        values = torch.stack(found)
-        size = (x[..., most + 1, :] - centre).abs().detach()
-        size = torch.where(size.isfinite(), size, 0.0)
-        size = size + 1e-3 * size.amax(-1, keepdim=True)
-        change = ((values[1:] - values[:-1]).abs() / torch.where(size > 0, size, 1.0)).amax(-1).detach()
-        change = torch.cat(
-            [
-                torch.full_like(change[:1], torch.inf)
-                if len(change)
-                else values.new_full((1, *x.shape[:-2]), torch.inf),
-                change,
-            ]
-        )
-        change = change.nan_to_num(torch.inf)
-        best = change.argmin(0) if self.order is None else torch.full(x.shape[:-2], most - 1, device=x.device)
-        pick = best[None, ..., None].expand(1, *values.shape[1:])
-        return values.gather(0, pick)[0], change.gather(0, best[None])[0], best + 1
 
-    def _iterates(self, state: State, most: int) -> tuple[Tensor, Tensor]:
-        """x_{−m} … x_m with ln σ_j (σ_0 = 1), (..., 2m+1, 2n+2), and which of them exist."""
+class _Iterates:
+    """The iterates of a state, made when they are asked for: x_j with ln σ_j, (..., 2n+2), j of either sign."""
+
+    def __init__(self, equation: ContinuousEquation, state: State):
         state = State(*check_state(state))
-        zero = torch.zeros_like(state.s)
-        points, sound = [_with(state, zero)], [torch.ones_like(state.s, dtype=torch.bool)]
-        now, log_c, good = state, zero, sound[0]
-        for _ in range(most):
-            step = self._stepper.step(now, self.h)
-            now, log_c = step.state, log_c + step.c.log()
-            good = good & (step.status == Status.CONVERGED)
-            points.append(_with(now, log_c))
-            sound.append(good)
-        first, log_c, good, now = points[1].detach(), zero, sound[0], state
+        self.L_d, self.h, self.stepper = equation.L_d, equation.h, Stepper(equation.L_d)
+        self.most, self.fixed = (MOST, False) if equation.order is None else (equation.order // 2, True)
+        first = torch.cat([join(*state), torch.zeros_like(state.s)[..., None]], -1)
+        self.nodes = {0: (first, torch.zeros_like(state.s, dtype=torch.uint8))}
+
+    def node(self, j: int) -> tuple[Tensor, Tensor]:
+        """x_j and the status of the steps that lead to it."""
+        while j > max(self.nodes):
+            self._add(max(self.nodes), 1)
+        while j < min(self.nodes):
+            self._add(min(self.nodes), -1)
+        return self.nodes[j]
+
+    def forget(self, before: int) -> None:
+        """Drop what lies before a node."""
+        self.nodes = {j: x for j, x in self.nodes.items() if j >= before}
+
+    def _add(self, last: int, sign: int) -> None:
+        x, status = self.nodes[last]
+        state, log_c = State(*split(x[..., :-1])), x[..., -1]
         n = state.q.shape[-1]
-        guess = 2 * points[0].detach() - first  # uniform motion backwards
-        for _ in range(most):
-            start = torch.cat([guess[..., :n], guess[..., 2 * n : 2 * n + 1]], -1)
-            step = inverse_step(self.L_d, now, self.h, torch.where(start.isfinite(), start, 0.0))
-            now, log_c = step.state, log_c - step.c.log()
-            good = good & (step.status == Status.CONVERGED)
-            points.insert(0, _with(now, log_c))
-            sound.insert(0, good)
-            guess = 2 * points[0].detach() - points[1].detach()
-        return torch.stack(points, -2), torch.stack(sound, -1)
+        other = self.nodes.get(last - sign)
+        guess = None if other is None else (2 * x - other[0]).detach()  # uniform motion
+        if sign > 0:
+            start = None if guess is None else torch.where(guess.isfinite(), guess, x)[..., :n]
+            step = self.stepper.step(state, self.h, start)
+        else:
+            start = None
+            if guess is not None:
+                guess = torch.where(guess.isfinite(), guess, x)
+                start = torch.cat([guess[..., :n], guess[..., 2 * n : 2 * n + 1]], -1)
+            step = inverse_step(self.L_d, state, self.h, start)
+        row = torch.cat([join(*step.state), (log_c + sign * step.c.log())[..., None]], -1)
+        self.nodes[last + sign] = (row, torch.where(status == Status.CONVERGED, step.status, status))
+
+
+def _summed(iterates: _Iterates, centre: int, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
+    """Σ weights · (q, p, s, ln σ) at centre + θ, (..., 2n+2), and the error estimate (...)."""
+    middle, found = iterates.node(centre)[0], []
+    for m in range(1, iterates.most + 1):
+        window = [iterates.node(j) for j in range(centre - m, centre + m + 1)]
+        w = weights(torch.arange(-m, m + 1, dtype=torch.float64), theta)[derivative].tolist()
+        # differences to the centre: their sum with weights that add up to 0 or 1 loses no digits to it
+        total = sum(weight * (x - middle) for weight, (x, _) in zip(w, window, strict=True))
+        sound = torch.stack([status == Status.CONVERGED for _, status in window]).all(0)
+        total = total + (middle if derivative == 0 else 0.0)
+        found.append(torch.where(sound[..., None], total, torch.nan))
+    values = torch.stack(found)
+    size = (iterates.node(centre + 1)[0] - middle).abs().detach()
+    size = torch.where(size.isfinite(), size, 0.0)
+    size = size + 1e-3 * size.amax(-1, keepdim=True)
+    change = ((values[1:] - values[:-1]).abs() / torch.where(size > 0, size, 1.0)).amax(-1).detach()
+    change = torch.cat([torch.full_like(values[:1, ..., 0], torch.inf), change]).nan_to_num(torch.inf)
+    best = torch.full_like(change[0], len(found) - 1, dtype=torch.long) if iterates.fixed else change.argmin(0)
+    pick = best[None, ..., None].expand(1, *values.shape[1:])
+    return values.gather(0, pick)[0], change.gather(0, best[None])[0]
 
 
 class FractionalStepper(OneStepMethod):
-    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of its L_d, then a part of one.
+    """Steps of any length along the motion of a `ContinuousEquation`: whole steps of its L_d, and parts between them.
 
-    A multiple of the equation's h costs its steps; another h the steps of both neighbourhoods, 2·9 and more. The status
-    is `UNRESOLVED` where two orders differ by more than `tolerance`, relative to a step.
+    A rollout keeps the iterates of its start: it costs the whole steps over its time, 9 on either side of it, and sums.
+    The status is `UNRESOLVED` where two orders differ by more than `tolerance`, relative to a whole step.
     """
 
     def __init__(self, equation: ContinuousEquation, *, tolerance: float = 1e-6, throw: bool = False):
         self.equation, self.tolerance, self.throw = equation, tolerance, throw
+        self._last: tuple[Tensor, _Iterates, float, Tensor] | None = None  # the last q, its motion, time and ln σ
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
         """One step of a scalar h > 0."""
@@ -234,32 +240,29 @@ class FractionalStepper(OneStepMethod):
         size = check_h(h, state.q)
         if size.ndim:
             raise InputError(f"a step at another h than the model's needs a scalar h, got shape {tuple(size.shape)}")
-        whole, theta = _parts(float(size) / self.equation.h)
-        now, c = state, torch.ones_like(state.s)
-        status, residual = torch.zeros_like(state.s, dtype=torch.uint8), torch.zeros_like(state.s)
-        for _ in range(whole):
-            part = self.equation._stepper.step(now, self.equation.h)
-            now, c = part.state, c * part.c
-            status = torch.where(status == Status.CONVERGED, part.status, status)
-            residual = torch.maximum(residual, part.residual)
+        last = self._last
+        if last is None or last[0] is not state.q:
+            last = (state.q, _Iterates(self.equation, state), 0.0, torch.zeros_like(state.s))
+        _, iterates, time, log_c = last
+        time = time + float(size) / self.equation.h
+        whole, theta = _parts(time)
+        x, status = iterates.node(whole)
+        error = torch.zeros_like(state.s)
         if theta:
-            now, more, error = self.equation.between(now, theta)
-            c, residual = c * more, torch.maximum(residual, error)
+            x, error = _summed(iterates, whole, theta, 0)
             lost = ~(error <= self.tolerance) & (status == Status.CONVERGED)
             status = torch.where(lost, torch.full_like(status, Status.UNRESOLVED), status)
+        iterates.forget(whole - iterates.most)
         if self.throw:
-            throw_failure(status, residual)
-        return Step.of(now, c, status, residual, 0)
+            throw_failure(status, error)
+        step = Step.of(State(*split(x[..., :-1])), (x[..., -1] - log_c).exp(), status, error, 0)
+        self._last = (step.state.q, iterates, time, x[..., -1])
+        return step
 
 
-def _parts(ratio: float) -> tuple[int, float]:
-    """The whole steps of a ratio, and the rest, 0 where it is a multiple."""
-    whole = round(ratio)
-    if abs(ratio - whole) <= WHOLE * max(ratio, 1.0) and whole > 0:
+def _parts(time: float) -> tuple[int, float]:
+    """The whole steps of a time in steps, and the rest, 0 where it is a multiple."""
+    whole = round(time)
+    if abs(time - whole) <= WHOLE * max(time, 1.0):
         return whole, 0.0
-    whole = int(ratio)
-    return whole, ratio - whole
-
-
-def _with(state: State, log_c: Tensor) -> Tensor:
-    return torch.cat([join(*state), log_c[..., None]], -1)
+    return int(time), time - int(time)

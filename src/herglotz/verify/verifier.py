@@ -64,8 +64,9 @@ def verify(
     Parameters
     ----------
     target
-        A scene or its name, a run or its folder, an exported stepper or its `.pt2` file, or a pair (L_d, states) or
-        (stepper, states), with states (q, p, s) of shapes (B, n), (B, n), (B,).
+        A scene or its name, a run or its folder, an exported stepper or its `.pt2` file, an L_d alone (`h` given;
+        states are drawn), or a pair (L_d, states) or (stepper, states), with states (q, p, s) of shapes (B, n), (B, n),
+        (B,).
     h
         Step; default that of the target, required for a pair.
     samples, steps, seed
