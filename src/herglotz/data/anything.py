@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -47,7 +48,7 @@ def as_trajectories(
         if (h, time, coordinates, inputs, group) != (None,) * 5 or drop:
             raise InputError("trajectories have their columns already; of the options, only angles changes them")
         return _marked(data, angles)
-    if callable(data) and not hasattr(data, "columns"):
+    if isinstance(data, FunctionType):
         raise InputError(f"a function is no recording; {OF_AN_L_D}")
     names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
     if isinstance(data, (str, Path)):

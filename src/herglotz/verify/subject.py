@@ -106,7 +106,8 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     if callable(target):
         if h is None:
             raise InputError("h must be given with an L_d, e.g. h=0.1")
-        return _pair(target, drawn_states(target, _step_size(h, h), samples, make), h)
+        L_d: Any = target
+        return _pair(L_d, drawn_states(L_d, _step_size(h, h), samples, make), h)
     raise InputError(
         f"cannot verify a {type(target).__name__}; "
         "give a scene, a run, an exported file, an L_d or a pair (L_d or stepper, states)"

@@ -53,7 +53,7 @@ def test_a_model_alone_has_its_own_sizes():
         ),
         (lambda: verify(hz.Stepper(pendulum), h=0.1), "a stepper alone has no states"),
         (
-            lambda: hz.simulate(pendulum, trajectories=2, steps=5, h=0.1),
+            lambda: hz.simulate(pendulum, trajectories=2, steps=5, h=0.1),  # pyright: ignore
             r"simulate takes a scene, got a function; .*Stepper\(L_d\)",
         ),
         (lambda: hz.fit(pendulum), r"a function is no recording; .*Trajectories\.of"),
