@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 # Copies, so that help does not import PyTorch; a test compares them.
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
+HOLDS = ("zero", "first", "smooth")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
@@ -96,7 +98,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument(
         "--sticking", action="store_true",
-        help="dry friction that can hold a joint still: axes without a spring (forced; stepped by PyTorch alone)",
+        help="dry friction that can hold a joint still: axes without a spring (forced)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--hold", choices=HOLDS,
+        help="what the inputs do between samples: nothing, straight lines, or cubics (default: what the file says, or "
+        "what explains the data best)",
     )  # fmt: skip
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument(
@@ -129,7 +136,8 @@ def run(arguments: argparse.Namespace) -> int:
         diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
         substeps=arguments.substeps,
     )  # fmt: skip
-    data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
+    data = load(arguments.data, angles=parse_angles(arguments.angles))
+    data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     made = _make(out)
     try:
         save_run(fit(data, config, out=out, resume=arguments.resume), out)

@@ -203,11 +203,12 @@ def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -
         u = torch.tensor(arguments.u, dtype=dtype).expand(steps, -1)
     else:
         recorded = load(recorded_at)[0]
-        if recorded.u is None:
+        of_steps = recorded.inputs_of_steps()
+        if of_steps is None:
             raise InputError(f"--inputs {arguments.inputs}: holds no inputs; name their columns u, u_* or torque")
         if recorded.samples <= steps:
             raise InputError(f"--inputs {arguments.inputs}: {steps} steps need more than {recorded.samples} samples")
-        u = recorded.u[:steps].to(dtype)
+        u = of_steps[:steps].to(dtype)
         h = recorded.t.diff()[:steps].to(dtype) if arguments.h is None else h
     return u, h
 

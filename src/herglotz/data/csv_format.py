@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,8 @@ from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import group_rows, number, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
+
+HOLD = r"#\s*hold:\s*(\w+)"  # the comment that says what inputs do between samples
 
 
 def read_csv(
@@ -25,7 +29,8 @@ def read_csv(
 
     The header's cells are `name` or `name[unit]`. `t` or `time` is the time; `trajectory` or `trial`, if there, groups
     the rows; `s` is the action, `p`/`p_*` momenta, `u`/`u_*`/`torque` inputs; velocities (`v`, `velocity`, `*_dot`) are
-    left aside; every other column is a coordinate. Lines that start with # and blank lines are skipped.
+    left aside; every other column is a coordinate. Lines that start with # and blank lines are skipped, but for
+    `# hold: zero` (or `first`, `smooth`), which says what the inputs do between samples (`herglotz.data.holds`).
     A coordinate in rad is taken for an angle.
 
     Returns
@@ -47,7 +52,9 @@ def read_csv(
         raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
     wanted = (coordinates,) if isinstance(coordinates, str) else coordinates
     columns = assign(_cells(header), f"{Path(path)}, row {at}", time, wanted)
-    return _build(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]), angles)
+    found = _build(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]), angles)
+    said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
+    return replace(found, hold=said[0]) if said else found
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
@@ -74,6 +81,7 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     _check_header(Path(path), header, trajectories)
     table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1).tolist()
     names = trajectories.trajectory.tolist()
+    comments = [*comments, f"hold: {trajectories.hold}"] if trajectories.hold else comments
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
     lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table, strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())

@@ -88,7 +88,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     sigma = None if one_step or probe is None or not probe.enough else probe.rms / NOISE_OF_R
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
-        level=c.level, objective=objective, network=network, order=c.order, features=c.features,
+        level=c.level, objective=objective, network=network, order=c.order, features=c.features, hold=seen.data.hold,
         forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
@@ -98,6 +98,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "network": why_network,
             "order": _structure_reason(seen, c.order == user_settings.order),
             "features": _structure_reason(seen, c.features == user_settings.features),
+            "hold": seen.hold,
             "forces": _structure_reason(seen, seen.structure is None),
             "start": "least squares on finite differences" if not base.start else "one linear problem",
             "outliers": _outlier_reason(seen),

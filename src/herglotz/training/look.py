@@ -15,6 +15,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
+from herglotz.training.hold import with_hold
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.smoothing_fit import SMOOTHED
@@ -52,6 +53,7 @@ class Look:
     kept: Trajectories  # of the first part all but single spikes
     spikes: Tensor  # (N_train,) bool
     outliers: bool  # more than single spikes are suspected
+    hold: str  # why the inputs do between samples what they do
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
@@ -72,6 +74,8 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     if not settings.use_inputs:
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
+    seen = data if settings.train_fraction == 1 else data.split_time(settings.train_fraction)[0]
+    data, why_hold = with_hold(data, "" if plan is None else plan.hold, seen)
     train, unseen = (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -91,8 +95,8 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
-        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, noise=roughness(kept),
-        settings=settings, base=base, structure=structure, baseline_motion=motion, probe=probe,
+        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
+        noise=roughness(kept), settings=settings, base=base, structure=structure, baseline_motion=motion, probe=probe,
     )  # fmt: skip
 
 

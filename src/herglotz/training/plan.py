@@ -26,6 +26,7 @@ class Plan:
     network: str  # correction, covered (one wide layer), potential or plain
     order: int  # of the rule, 2 or 4
     features: tuple[str, ...]  # what L may hold beside its terms
+    hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
     forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
     start: dict[str, tuple[float, ...]]  # starting values of parameters by name
     outliers: bool  # the first one-step fit takes Student's t

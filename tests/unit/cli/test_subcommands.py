@@ -15,6 +15,7 @@ import herglotz.cli.flags
 import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.data import load
+from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
 from herglotz.scenes import scene_names
 from herglotz.training import load_run
@@ -62,7 +63,7 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit, flags = herglotz.cli.fit, herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION) == (fit.ROBUST, fit.SUPERVISION)
+    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
 
