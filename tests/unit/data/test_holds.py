@@ -1,6 +1,7 @@
 """What inputs do between samples: values, thinning, files, and the hold that explains recorded steps."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from herglotz.scenes import scene
 from herglotz.training.hold import with_hold
 
 
-def recorded(hold="", count=40):
+def recorded(hold="", count=40) -> Any:
     """Two trajectories at uneven times whose input is a cubic of time."""
     make = torch.Generator().manual_seed(0)
     t = torch.rand(2, count, generator=make, dtype=torch.float64).add_(0.2).cumsum(1).flatten() / 5
@@ -27,7 +28,7 @@ def test_a_hold_is_exact_on_its_polynomials(hold, powers):
     row, part = torch.arange(80)[inside], torch.full((78,), 0.3, dtype=torch.float64)
     time = data.t[row] + 0.3 * (data.t[row + 1] - data.t[row])
     for k in range(powers):
-        found = replace(data, u=(data.t**k)[:, None]).inputs_of_steps(row, part)
+        found: Any = replace(data, u=(data.t**k)[:, None]).inputs_of_steps(row, part)
         torch.testing.assert_close(found[:, 0], time**k, rtol=1e-9, atol=1e-12)
     assert torch.equal(data.inputs_of_steps()[39], data.u[39])
 
