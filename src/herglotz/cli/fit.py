@@ -97,8 +97,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument(
-        "--sticking", action="store_true",
-        help="dry friction that can hold a joint still: axes without a spring (forced)",
+        "--sticking", action=argparse.BooleanOptionalAction, default=None,
+        help="dry friction that can hold a joint still (forced); default: where driven data show it",
     )  # fmt: skip
     parser.add_argument(
         "--hold", choices=HOLDS,

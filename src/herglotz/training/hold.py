@@ -1,8 +1,8 @@
 """What the inputs do between samples, where neither the data nor the user say it: the hold that explains the steps.
 
-Each hold makes other inputs of the steps, and one linear problem (accelerations against stiffness, friction and inputs)
-is solved for each with as many unknowns. A hold other than "zero" is taken where it explains the accelerations better,
-beyond the spread of that difference over blocks of time.
+Each hold makes other inputs of the steps, and one linear problem (`dry_friction.acceleration_terms` and the signs of
+the velocities) is solved for each with as many unknowns. A hold other than "zero" is taken where it explains the
+accelerations better, beyond the spread of that difference over blocks of time.
 """
 
 from __future__ import annotations
@@ -14,9 +14,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS
-from herglotz.training.baseline import differences
+from herglotz.training.dry_friction import BLOCKS, acceleration_terms
 
-BLOCKS = 10  # of time, whose errors are compared
 CLEARLY = 2.0  # standard errors of the difference
 
 
@@ -48,15 +47,8 @@ def with_hold(data: Trajectories, wanted: str, train: Trajectories) -> tuple[Tra
 
 def _errors(train: Trajectories) -> Tensor:
     """Mean squares over blocks of time, (BLOCKS,)."""
-    _, t, v, a, columns = differences(train, False)
-    extra = []
-    for i, angle in enumerate(train.angles):
-        q = t.q1[:, i]
-        rows = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
-        extra += [*rows, v[:, i] * v[:, i].abs(), v[:, i].sign()]
-    more = torch.stack(extra, -1)[:, None].expand(-1, train.dof, -1)
-    own = torch.eye(train.dof, dtype=a.dtype, device=a.device).repeat_interleave(len(extra) // train.dof, 1)
-    A = torch.cat([columns, more * own], -1).flatten(0, 1)
-    size = A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
-    left = (A / size) @ torch.linalg.lstsq(A / size, a.reshape(-1, 1)).solution - a.reshape(-1, 1)
+    a, columns, v = acceleration_terms(train)
+    A, y = torch.cat([columns, torch.diag_embed(v.sign())], -1).flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+    left = A @ torch.linalg.lstsq(A, y, driver="gelsd").solution - y
     return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])

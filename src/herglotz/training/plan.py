@@ -84,4 +84,4 @@ def _show(value: Any) -> str:
         return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
     if value is None:
         return "to be measured"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value) or "none"
