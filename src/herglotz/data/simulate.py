@@ -106,7 +106,7 @@ def simulate(
         source=f"simulate({scene.name}, h={h:g}, seed={seed})",
     )
     if u is not None:
-        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]))
+        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]), hold="zero")
     return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
 
 

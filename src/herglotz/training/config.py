@@ -73,8 +73,9 @@ class FitConfig:
     coulomb
         Dry friction beside the viscous one at the forced level.
     sticking
-        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`): for axes without a
-        spring. Whole trajectories are fitted, from a start with smooth friction; PyTorch alone steps the model.
+        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
+        are fitted, from a start with smooth friction. None: where nothing is said of level, objective and friction, and
+        driven data show dry friction (`herglotz.training.dry_friction`).
     robust
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
@@ -126,7 +127,7 @@ class FitConfig:
     mass_width: int = 0
     action_width: int = 4
     coulomb: bool = False
-    sticking: bool = False
+    sticking: bool | None = None
     robust: str = "auto"
     supervision: str = "q"
     restarts: int | None = None

@@ -16,7 +16,7 @@ from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.stepping import State, solve
 from herglotz.training import Run
-from herglotz.training.inputs import step_inputs
+from herglotz.training.inputs import grid_inputs, step_inputs
 from herglotz.training.problems.grid import segment_grid
 from herglotz.verify.dissipation import dissipation
 from herglotz.verify.report import Check
@@ -101,8 +101,8 @@ def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
     if not all(bool(torch.isfinite(x).all()) for x in states):
         return math.inf
     with torch.no_grad():
-        u = step_inputs(run.model, run.data)
-        inputs = None if u is None else u[grid.row].to(states[0].dtype)
+        u = grid_inputs(run.model, run.data, grid)
+        inputs = None if u is None else u.to(states[0].dtype)
         out = run.stepper.rollout(*states, h=grid.h.to(states[0].dtype), inputs=inputs)
     error = out.q.flatten(0, 1)[grid.node].to(q.dtype) - q[grid.sample]
     value = _rms(error / spread)

@@ -19,6 +19,7 @@ import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.cli.parser import build_parser
 from herglotz.data import load
+from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
 from herglotz.plots.style import FORMATS
 from herglotz.scenes import scene_names
@@ -67,7 +68,8 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit, flags = herglotz.cli.fit, herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION, FitConfig().departures) == (fit.ROBUST, fit.SUPERVISION, fit.DEPARTURES)
+    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
+    assert FitConfig().departures == fit.DEPARTURES
     assert build_parser().parse_args(["fit", "a", "--out", "b"]).iterations == FitConfig().iterations
     assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
