@@ -92,6 +92,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="what is known of L = K - V, with its numbers (the first mass is 1): --known='-9.81 cos(q1)' is a "
         "pendulum's V: no velocity is in it. May be given again",
     )  # fmt: skip
+    parser.add_argument(
+        "--term", action="append", default=[], metavar="NAME", help="a term of herglotz.models.TERMS; may be repeated"
+    )
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument(
@@ -125,9 +128,9 @@ def run(arguments: argparse.Namespace) -> int:
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
-        features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
-        substeps=arguments.substeps,
+        features=tuple(arguments.feature), known=tuple(arguments.known), terms=tuple(arguments.term),
+        alike=arguments.alike, diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking,
+        order=arguments.order, substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)

@@ -11,6 +11,7 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
+from herglotz.models.term import TERMS
 from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
@@ -99,6 +100,8 @@ class FitConfig:
         Each coordinate has a mass of its own, and none is between two: bodies, not the joints of one.
     coupled
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
+    terms
+        Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
@@ -136,6 +139,7 @@ class FitConfig:
     alike: bool = False
     diagonal: bool = False
     coupled: bool = False
+    terms: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
 
@@ -208,7 +212,7 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            level = "forced" if driven or self.coulomb or self.coupled or self.sticking else "linear"
+            level = "forced" if driven or self.has_forces() else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if self.sticking:
             config = replace(config, coulomb=True)
@@ -223,6 +227,11 @@ class FitConfig:
                 f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {len(self.input_map)}"
             )
         return config
+
+    def has_forces(self) -> bool:
+        """Whether the user asked for forces, which the forced level alone has."""
+        named = any(TERMS[name].has_force() for name in self.terms if name in TERMS)
+        return self.coulomb or self.coupled or self.sticking or named
 
     @property
     def torch_dtype(self) -> torch.dtype:

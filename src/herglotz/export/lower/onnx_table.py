@@ -21,6 +21,7 @@ SIMPLE = {
     aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul", aten.bmm.default: "MatMul",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
     aten.maximum.default: "Max", aten.minimum.default: "Min",
+    aten.bitwise_and.Tensor: "And", aten.bitwise_or.Tensor: "Or",
     aten.__and__.Tensor: "And", aten.__or__.Tensor: "Or", aten.eq.Scalar: "Equal", aten.eq.Tensor: "Equal",
     aten.le.Tensor: "LessOrEqual", aten.le.Scalar: "LessOrEqual", aten.lt.Tensor: "Less", aten.lt.Scalar: "Less",
     aten.ge.Tensor: "GreaterOrEqual", aten.ge.Scalar: "GreaterOrEqual", aten.gt.Tensor: "Greater",
