@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -11,9 +11,6 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces
 from herglotz.models.jet import Jet, coordinates
-
-if TYPE_CHECKING:
-    from herglotz.models.config import ModelConfig
 
 
 class Term(nn.Module):
@@ -26,13 +23,13 @@ class Term(nn.Module):
     Parameters
     ----------
     config
-        Of the model that the term joins.
+        The `ModelConfig` of the model that the term joins.
     """
 
     linear = True  # whether the force is linear in v, so that it needs no iteration
     spread: float | None = None  # σ of the prior of every parameter about its start; None: no prior
 
-    def __init__(self, config: ModelConfig):
+    def __init__(self, config: Any):
         super().__init__()
         self.dof = config.dof
 
@@ -60,8 +57,8 @@ class Term(nn.Module):
 TERMS: dict[str, type[Term]] = {}
 
 
-def check_terms(config: ModelConfig) -> None:
-    """Raise `InputError` for a term that nobody registered, or that the model's level cannot have."""
+def check_terms(config: Any) -> None:
+    """Raise `InputError` for a term of a `ModelConfig` that nobody registered, or that its level cannot have."""
     for name in config.terms:
         if name not in TERMS:
             known = ", ".join(TERMS) or "none"
