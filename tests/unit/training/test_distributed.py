@@ -27,8 +27,8 @@ distributed.LEAST = 8  # there are few rows, and each process shall have some
 found = {}
 with process_group():
     for objective, level, optimiser, iterations in (
-        ("residual", "affine", "lm", 3), ("trajectory", "linear", "lm", 6), ("smoothing", "linear", "lm", 3),
-        ("raw", "linear", "adam", 2)
+        ("residual", "affine", "lm", 8), ("trajectory", "linear", "lm", 40), ("smoothing", "linear", "lm", 8),
+        ("raw", "linear", "adam", 3)
     ):
         noise = 0.01 if objective in ("trajectory", "smoothing") else 0.0
         data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, noise=noise, seed=0)
