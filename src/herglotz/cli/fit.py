@@ -67,6 +67,9 @@ def _model_flags(parser: argparse._ArgumentGroup) -> None:
         "--sticking", action=argparse.BooleanOptionalAction, default=None,
         help="dry friction that can hold a joint still (forced); default: where driven data show it",
     )  # fmt: skip
+    parser.add_argument(
+        "--term", action="append", default=[], metavar="NAME", help="a term of herglotz.models.TERMS; may be repeated"
+    )
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
@@ -158,9 +161,10 @@ def run(arguments: argparse.Namespace) -> int:
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
-        features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
-        substeps=arguments.substeps, iterations=arguments.iterations, departures=tuple(arguments.departures),
+        features=tuple(arguments.feature), known=tuple(arguments.known), terms=tuple(arguments.term),
+        alike=arguments.alike, diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking,
+        order=arguments.order, substeps=arguments.substeps, iterations=arguments.iterations,
+        departures=tuple(arguments.departures),
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)

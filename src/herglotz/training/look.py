@@ -121,8 +121,8 @@ def _with_friction(
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
     """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
     c = task.config
-    other = c.features or c.known or c.alike or c.mass_width or c.supervision != "q" or task.data.u is not None
-    if c.objective not in ("auto", "residual") or other:
+    more = c.features or c.known or c.terms or c.alike or c.mass_width
+    if c.objective not in ("auto", "residual") or more or c.supervision != "q" or task.data.u is not None:
         return None
     model = task.build("correction")
     if model.correction is None or model.s_enters_motion:

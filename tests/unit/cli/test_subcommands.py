@@ -120,9 +120,9 @@ def test_fit_says_what_it_found(tmp_path, capsys):
 def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped, or resume fits again
     folder = tmp_path / "run"
     arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
-    arguments += ["--objective", "trajectory", "--level", "affine"]
+    arguments += ["--objective", "trajectory", "--level", "conservative"]  # the cheapest that is no default
     code, found = run_json(capsys, *arguments)
-    assert (found["level"], found["objective"]) == ("affine", "trajectory")
+    assert (found["level"], found["objective"]) == ("conservative", "trajectory")
     assert code == (3 if found["verdict"].startswith("does not fit") else 0)  # rounding decides, in float32
     run = load_run(folder)
     assert next(run.model.parameters()).dtype == torch.float32
