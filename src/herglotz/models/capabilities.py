@@ -24,6 +24,7 @@ class Capabilities:
     dry_friction: bool
     sticking: bool  # dry friction is set-valued
     coupling: bool  # friction between joints
+    drag: bool  # named friction forces
     inputs: int  # m
 
     @property
@@ -34,13 +35,14 @@ class Capabilities:
     @property
     def linear_in_q1(self) -> bool:
         """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
-        return self.order == 2 and self.constant_c and self.constant_mass and not (self.correction or self.dry_friction)
+        bent = self.correction or self.dry_friction or self.drag
+        return self.order == 2 and self.constant_c and self.constant_mass and not bent
 
     @property
     def by_terms(self) -> bool:
         """Whether the step equation is known term by term (`herglotz.stepping.equation`); else jets evaluate it."""
         whole = self.baseline and self.constant_mass and self.known_damping and self.order == 2
-        return whole and not (self.action_flow or self.coupling or self.sticking)
+        return whole and not (self.action_flow or self.coupling or self.sticking or self.drag)
 
     @property
     def explicit(self) -> bool:

@@ -14,6 +14,7 @@ from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
+from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
 from herglotz.models.friction import Friction
@@ -90,6 +91,7 @@ class ContactLagrangian(nn.Module):
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
         self.coupling = CoupledFriction(c.dof) if c.coupled and c.dof > 1 else None
+        self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
 
     @property
     def dof(self) -> int:
@@ -127,6 +129,7 @@ class ContactLagrangian(nn.Module):
             dry_friction=self.friction is not None and not self.friction.linear,
             sticking=self.friction is not None and self.friction.sticking,
             coupling=self.coupling is not None,
+            drag=self.drag is not None,
             inputs=self.inputs,
         )
 
@@ -260,7 +263,8 @@ class ContactLagrangian(nn.Module):
         v = (q1 - q0 if delta is None else delta) / h[..., None]
         c = self.damping(q0, q1, h, order).exp()
         forces = self.friction(v, c, h, order, u)
-        return forces if self.coupling is None else self.coupling(v, c, h, forces)
+        forces = forces if self.coupling is None else self.coupling(v, c, h, forces)
+        return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
 
 
 @dataclass(frozen=True)
