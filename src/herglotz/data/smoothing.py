@@ -16,7 +16,7 @@ from herglotz.data.windows import Triples
 
 DEGREES = (4, 6)
 WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)
-SEEN = 10.0  # weight of the squared residual beyond the noise: an acceleration errs by more of it than the position
+EXCESS = 1.2  # squared residuals beyond so many times the least are motion that the polynomials miss
 NEAR = 0.02  # of a window's half width: steps so short that the rule's own error does not count
 MOST = 2000  # windows that the choice looks at
 
@@ -51,7 +51,9 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     if not tried:
         return None
     noise = min(left for _, _, left, _ in tried)
-    width, degree, _, _ = min(tried, key=lambda x: (noise + SEEN * (x[2] - noise)) * x[3])
+    fair = [x for x in tried if x[2] <= EXCESS * noise]
+    # A residual beyond the noise is a run of one sign, which an acceleration takes over whole; noise averages out.
+    width, degree, _, _ = min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])
     rows = _windows(data, width)
     half, A = _design(data, rows, degree)
     coefficients = torch.linalg.pinv(A) @ data.q[rows].double()

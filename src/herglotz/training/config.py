@@ -99,6 +99,9 @@ class FitConfig:
         Each coordinate has a mass of its own, and none is between two: bodies, not the joints of one.
     coupled
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
+    drag
+        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
+        (forced level). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
@@ -136,6 +139,7 @@ class FitConfig:
     alike: bool = False
     diagonal: bool = False
     coupled: bool = False
+    drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
 
@@ -154,8 +158,9 @@ class FitConfig:
         _choice("activation", self.activation, ACTIVATIONS)
         if self.sticking and self.objective not in ("auto", "trajectory"):
             raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
-        if (self.coulomb or self.sticking or self.input_map) and self.level not in ("forced", "auto"):
-            raise InputError(f"coulomb, sticking and input_map are forces; set level='forced', not '{self.level}'")
+        forces = self.coulomb or self.sticking or self.input_map or self.drag
+        if forces and self.level not in ("forced", "auto"):
+            raise InputError(f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'")
         if self.input_map and not self.use_inputs:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
@@ -208,7 +213,8 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            level = "forced" if driven or self.coulomb or self.coupled or self.sticking else "linear"
+            forced = driven or self.coulomb or self.coupled or self.sticking or self.drag
+            level = "forced" if forced else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if self.sticking:
             config = replace(config, coulomb=True)

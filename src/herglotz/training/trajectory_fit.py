@@ -122,9 +122,18 @@ class SegmentStages:
         self.lengths = segment_lengths(task.data)
 
     def fit(
-        self, length: int, sigma: float, freedom: float | None, before: TrajectoryFit | None, used: Tensor | None = None
+        self,
+        length: int,
+        sigma: float,
+        freedom: float | None,
+        before: TrajectoryFit | None,
+        used: Tensor | None = None,
+        begin: Trajectories | None = None,
     ) -> TrajectoryFit | None:
-        """Segments of one length, from the states of the stage before; None where no path is found."""
+        """Segments of one length, from the states of the stage before or read off `begin`; None where no path is found.
+
+        `begin` is the data or, less noisy, the same smoothed.
+        """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
         problem = ShootingProblem(
@@ -133,7 +142,7 @@ class SegmentStages:
         )  # fmt: skip
         if before is None:
             start = problem.parameters.get()
-            states = first_states(problem, start)
+            states = first_states(problem, start, begin)
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
