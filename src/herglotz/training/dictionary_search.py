@@ -18,10 +18,8 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smooth_triples, smoothed
 from herglotz.models.jet import pairs
-from herglotz.stepping import Stepper
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.inputs import step_inputs
 from herglotz.training.linear_start import LinearFit, NamedForces
 from herglotz.training.named_terms import (
     DRAG,
@@ -48,8 +46,10 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 ROWS = 4000  # triples in the linear problem
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
+LOWER = 0.99  # share of the misfit that is left where halved steps are kept
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
+ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -63,6 +63,7 @@ class Found:
     base: Baseline
     fit: TrajectoryFit
     whole: bool  # every trajectory is one segment
+    spread: float  # of q, RMS
 
     @property
     def rms(self) -> float:
@@ -88,7 +89,7 @@ class DictionarySearch:
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
         self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
-        self.floor = max(EXACT[config.dtype] * max(base.scale), 1e-300)
+        self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
         self.order = 4 if self.precision < SMOOTH * self.spread else 2
 
@@ -189,7 +190,7 @@ class DictionarySearch:
         values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
         whole = fit.problem.grid.segments == len(self.data)
         base = started(task.base, self.data, values, task.config)
-        return Found(terms, task.config, values, base, fit, whole)
+        return Found(terms, task.config, values, base, fit, whole, self.spread)
 
     def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
@@ -218,6 +219,8 @@ class DictionarySearch:
             model, self.data, grid, sigma=max(found.rms, self.floor), prior=prior_of(model, base, None),
             freedom=self.freedom,
         )  # fmt: skip
+        problem.guess_from(old, found.fit.path)
+        problem.patient = False
         return stages, problem
 
     def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None) -> Found | None:
@@ -275,36 +278,23 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for."""
         while True:
             m = found.config.substeps
-            if 2 * m > FINEST or 2 * m * self.data.samples > STEPS:
+            if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
                 return found
-            if self._change(found, 2 * m) <= FINER * max(found.rms, self.floor):
+            if self._change(found, 2 * m) <= max(FINER * found.rms, self.floor):
                 return found
             other = self._refit(found, found.terms, 2 * m)
-            if other is None or not other.rms < 1.05 * found.rms:
-                return found
+            if other is None or not other.rms < LOWER * found.rms:
+                return found  # other values of the parameters make up for the longer steps
             found = self._longer(other)
 
     def _change(self, found: Found, substeps: int) -> float:
         """RMS change of the fitted motion by so many model steps in a recorded one."""
-        problem = found.fit.problem
-        grid = segment_grid(self.data, round(problem.grid.longest / found.config.substeps), found.base.model_step)
-        step = found.base.max_step if substeps == 1 else 1.05 * self.data.typical_step / substeps
-        fine = segment_grid(self.data, round(problem.grid.longest / found.config.substeps), step)
-        problem.parameters.set(found.fit.theta)
-        model, n = problem.parameters.model, self.data.dof
-        start = found.fit.path.x[:, 0]
-        u = step_inputs(model, self.data)
-        q = []
-        for one in (grid, fine):
-            with torch.no_grad():
-                out = Stepper(model).rollout(
-                    start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=one.h, inputs=None if u is None else u[one.row]
-                )
-            q.append(out.q.flatten(0, 1)[one.node][one.sample.argsort()])
-        change = float((q[1] - q[0]).square().mean().sqrt())
-        return change if math.isfinite(change) else math.inf
-
-
-def with_best_friction(search: DictionarySearch, found: Found) -> Found:
-    """Dry friction that can hold a joint still in place of a smooth one, where the data are met better."""
-    return found if not found.terms.dry else replace(found)
+        _, problem = self._problem(found, found.terms, substeps)
+        fit = found.fit
+        states = fit.problem.states_at(fit.path, problem.grid.start_sample)
+        path = problem.solve(problem.pack(fit.theta, states))
+        if path is None:
+            return math.inf
+        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
+        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
+        return float(change.square().mean().sqrt())

@@ -80,7 +80,7 @@ def started(base: Baseline, data: Trajectories, values: Mapping[str, float | tup
     for parameter, names in ((STILL, still), (MOVING, moving), (DRAG, of.drag)):
         if names:
             rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
-    if of.level == "linear":  # one coordinate: its viscous friction is the rate
+    if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
         rate += float(rest.pop("friction.viscous", (0.0,))[0])
     known = _parameters(of, bool(moving))
     rest = {name: x for name, x in ((known(name), x) for name, x in rest.items()) if name and x}

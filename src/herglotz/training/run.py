@@ -19,6 +19,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
+from herglotz.training.equation import Equation, equation_of
 from herglotz.training.predict import Prediction, predict
 
 FORMAT = 1
@@ -74,6 +75,10 @@ class Run:
     def stepper(self) -> Stepper:
         """The trained time stepper, with Newton's tolerance as tuned."""
         return Stepper(self.model, tol=self.setting.get("tol"))
+
+    def equation(self) -> Equation:
+        """The learned equation of motion with standard deviations; see `herglotz.training.equation`."""
+        return equation_of(self)
 
     def predict(self, data: Trajectories, **settings: Any) -> Prediction:
         """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
