@@ -1,4 +1,4 @@
-"""Positions, velocities and accelerations of noisy recordings: a polynomial in time through a window around each sample.
+"""Velocities and accelerations of noisy recordings: a polynomial in time through a window around each sample.
 
 Width and degree are those whose accelerations err least: noise asks for wide windows, motion between samples for narrow
 ones. What is read off starts a fit and does not end one.
@@ -79,7 +79,8 @@ def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples
         weight = (1 - (middle / local.half[every][:, None]).square()).clamp_min(0).square() * t.diff(dim=1)
         u = (weight[..., None] * data.u[rows[:, :-1]].double()).sum(1) / weight.sum(1, keepdim=True)
     like = data.q
-    found = Triples(*(x.to(like) for x in (q0, q1, q2, h, h)), data.trajectory[every], every)
+    q0, q1, q2, h = (x.to(like) for x in (q0, q1, q2, h))
+    found = Triples(q0, q1, q2, h, h, data.trajectory[every], every)
     return found, None if u is None else u.to(like)
 
 

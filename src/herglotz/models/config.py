@@ -26,9 +26,9 @@ class ModelConfig:
     by row), measured from 0 or, with `input_zero`, from a learned zero of each.
     `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
     coordinates have one mass, and their potential is made of features alone; `diagonal`: each coordinate has a mass of
-    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds, and `drag` names
-    friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds
-    what the rule lacks of the exact L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
+    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds, and `drag`
+    names friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds what the rule lacks of the exact
+    L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
     Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
     baseline is needed (trap 2).
     """

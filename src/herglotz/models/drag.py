@@ -20,7 +20,9 @@ from herglotz.errors import InputError
 from herglotz.mechanics import Forces
 
 HIGHEST = 9  # power of a speed or a position
-_TEXT = re.compile(r"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|v(?P<w>\d+)\| )?v(?P<v>\d+)(?:\^(?P<c>\d+))?|load (?P<load>\d+)")
+_TEXT = re.compile(
+    r"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|v(?P<w>\d+)\| )?v(?P<v>\d+)(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
+)
 
 
 @dataclass(frozen=True)

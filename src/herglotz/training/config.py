@@ -160,7 +160,9 @@ class FitConfig:
             raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
         forces = self.coulomb or self.sticking or self.input_map or self.drag
         if forces and self.level not in ("forced", "auto"):
-            raise InputError(f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'")
+            raise InputError(
+                f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'"
+            )
         if self.input_map and not self.use_inputs:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:

@@ -1,15 +1,15 @@
 """The named terms that a recording needs: one linear problem, then whole trajectories with terms added and left out.
 
-The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there trajectories are
-fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the fit, joins while
-that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less leave. Model
-steps are halved while that changes the motion by as much as the data miss it.
+The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
+trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
+fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
+leave. Model steps are halved while that changes the motion by as much as the data miss it.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -124,7 +124,6 @@ class DictionarySearch:
         fit = LinearFit.of(self.data.angles, self.all.features, t, forces)
         columns = self._columns(fit)
         x = fit.solve(columns)
-        n = self.data.dof
         if float(x[0]) == 0:
             return None
         x = x / x[0]

@@ -200,7 +200,9 @@ def _zero(run: Run, j: int) -> str:
     return f"{zero:.3g}"
 
 
-def _baseline(run: Run, lefts, newton: bool, i: int, name: str, angle: bool, power: int, part: Part):
+def _baseline(
+    run: Run, lefts: list[str], newton: bool, i: int, name: str, angle: bool, power: int, part: Part
+) -> tuple[str, str, str, list[Part]]:
     """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
     unit, time = run.data.units[i], run.data.time_unit
     parameter, entry, by = part
@@ -213,7 +215,9 @@ def _baseline(run: Run, lefts, newton: bool, i: int, name: str, angle: bool, pow
     return "L", what, "", [(parameter, entry, factor)]
 
 
-def _feature(run: Run, lefts, newton: bool, text: str, at: tuple[str, int]):
+def _feature(
+    run: Run, lefts: list[str], newton: bool, text: str, at: tuple[str, int]
+) -> Iterator[tuple[str, str, str, list[Part]]]:
     """A feature of the potential: its force on each coordinate, or its part of L."""
     names, units, time = run.data.names, run.data.units, run.data.time_unit
     if not newton:
@@ -270,7 +274,9 @@ def _number(value: float, deviation: float | None) -> str:
     digits, last = (digits + 1, round(deviation * 10.0 ** (digits + 1))) if last == 1 else (digits, last)
     if digits > 12 or digits < -6:
         return f"{value:.6g} ± {deviation:.1g}"
-    return f"{value:.{digits}f}({last})" if digits > 0 else f"{round(value, digits):.0f}({round(deviation, digits):.0f})"
+    return (
+        f"{value:.{digits}f}({last})" if digits > 0 else f"{round(value, digits):.0f}({round(deviation, digits):.0f})"
+    )
 
 
 def _network(run: Run) -> str | None:

@@ -27,7 +27,8 @@ from herglotz.models.jet import pairs
 from herglotz.training.parameter_vector import ParameterVector
 
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
-          "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map", "drag.coefficient")  # fmt: skip
+          "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
+          "drag.coefficient")  # fmt: skip
 ROUNDS = 3
 
 

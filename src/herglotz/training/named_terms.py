@@ -69,7 +69,9 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     )  # fmt: skip
 
 
-def started(base: Baseline, data: Trajectories, values: Mapping[str, float | tuple[float, ...]], of: FitConfig) -> Baseline:
+def started(
+    base: Baseline, data: Trajectories, values: Mapping[str, float | tuple[float, ...]], of: FitConfig
+) -> Baseline:
     """The baseline with these values as starts, for a model of these settings."""
     rest: dict[str, tuple[float, ...]] = {
         name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")

@@ -186,7 +186,7 @@ class SegmentStages:
         return trial if rest is None else rest
 
     def whole(self, first: TrajectoryFit) -> TrajectoryFit | None:
-        """Whole trajectories at once, from parameters that are known well; None where that misses more than segments."""
+        """Whole trajectories at once, from parameters that are known well; None where that misses far more."""
         used = None if bool(first.problem.used.all()) else first.problem.used
         found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, used)
         most = LOST * max(first.noise, FLOOR * self.task.size)
