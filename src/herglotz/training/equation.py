@@ -11,21 +11,34 @@ import math
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
+from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
 
-if TYPE_CHECKING:
-    from herglotz.training.run import Run
 
-WIDTH = 80
+class Run(Protocol):
+    """What an equation is read off: `herglotz.training.Run`."""
+
+    @property
+    def model(self) -> ContactLagrangian:
+        """The trained model."""
+        ...
+
+    @property
+    def data(self) -> Trajectories:
+        """With the names and units of the coordinates."""
+        ...
+
+
+WIDTH = 78  # two blanks stand before each line on screen
 RELATIVE = 1e-12  # smaller deviations are rounding
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -72,37 +85,31 @@ class Equation:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""
-        return {"text": str(self), "terms": [asdict(term) for term in self.terms], "network": self.network}
+        terms = [asdict(term) for term in self.terms]
+        rest = {"lefts": list(self.lefts), "units": self.units, "network": self.network}
+        return {"text": str(self), "terms": terms, **rest}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Equation:
+        """Inverse of `as_dict`."""
+        terms = tuple(Term(**term) for term in values["terms"])
+        return cls(terms, tuple(values["lefts"]), values["units"], values["network"])
 
 
-def equation_of(run: Run, *, deviations: bool = True) -> Equation:
-    """The equation of a run's model.
+def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
+    """The equation of a run's model, in the data's units; the first mass is 1.
 
     Parameters
     ----------
     run
         A finished fit.
-    deviations
-        Compute standard deviations (`herglotz.training.laplace`), where the model has no network and follows its data.
-
-    Returns
-    -------
-    Equation
-        Values in the data's units; the first mass is 1.
+    covariance
+        (P, P) of the parameters in the model's order (`herglotz.training.laplace`), for standard deviations.
     """
-    network = _network(run)
-    spread = None
-    if deviations and network is None and run.metrics.get("follows_data"):
-        from herglotz.training.uncertainty import laplace
-
-        posterior = laplace(run)
-        parameters = posterior.problem.parameters
-        own = torch.tensor(parameters.sizes).cumsum(0).tolist()
-        spread = posterior.covariance[: own[-1], : own[-1]]
-        ends = dict(zip(parameters.names, own, strict=True))
-        first = {name: end - size for (name, end), size in zip(ends.items(), parameters.sizes, strict=True)}
-    else:
-        first = {}
+    spread, first, at = covariance, {}, 0
+    for name, parameter in run.model.named_parameters():
+        first[name] = at
+        at += parameter.numel()
     terms = []
     for left, what, unit, parts in _parts(run):
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
@@ -117,7 +124,7 @@ def equation_of(run: Run, *, deviations: bool = True) -> Equation:
     data = run.data
     units = [f"{name} in {unit}" for name, unit in zip(data.names, data.units, strict=True) if unit != "1"]
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
-    return Equation(tuple(terms), tuple(_lefts(run)), ", ".join(units) or "plain numbers", network)
+    return Equation(tuple(terms), tuple(_lefts(run)), ", ".join(units) or "plain numbers", network_of(run))
 
 
 Part = tuple[str, int, float]  # parameter, entry, factor
@@ -279,7 +286,7 @@ def _number(value: float, deviation: float | None) -> str:
     )
 
 
-def _network(run: Run) -> str | None:
+def network_of(run: Run) -> str | None:
     """What networks add, in words; None without."""
     model, config = run.model, run.model.config
     parts = []

@@ -10,9 +10,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
+from herglotz.data.anything import split_options
+from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
+from herglotz.training.equation import Equation, equation_of
 from herglotz.training.evaluate import evaluate
 from herglotz.training.look import Look, look
 from herglotz.training.objectives import OBJECTIVES
@@ -20,18 +23,21 @@ from herglotz.training.plan import Plan
 from herglotz.training.run import Run
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
+from herglotz.training.uncertainty import laplace
 
 INNER = 0.75  # of the training part that rivals are fitted to; they run free over the rest
 
 
+@one_thread()
 def fit(
-    data: Trajectories,
+    data: Any,
     config: FitConfig | None = None,
     *,
     plan: Plan | None = None,
     out: str | Path | None = None,
     progress: bool | None = None,
     resume: bool = False,
+    **settings: Any,
 ) -> Run:
     """Train a discrete contact Lagrangian on positions.
 
@@ -41,7 +47,8 @@ def fit(
     Parameters
     ----------
     data
-        Trajectories of positions, and of inputs u where there are any; of s and p as `config.supervision` says.
+        Trajectories of positions, and of inputs u where there are any; of s and p as `config.supervision` says. Or what
+        `herglotz.data.as_trajectories` reads: a path, a DataFrame, arrays.
     config
         Settings; default `FitConfig()`.
     plan
@@ -52,6 +59,9 @@ def fit(
         Show progress bars; None: on a terminal only.
     resume
         Go on from the checkpoint in `out`, if there is one.
+    **settings
+        Single settings of `FitConfig`, over those of `config` (`level="affine"`), and how data are to be read
+        (`h=0.01`, `time="t"`, `angles="theta"`, `group="run"`; see `herglotz.data.as_trajectories`).
 
     Returns
     -------
@@ -63,8 +73,17 @@ def fit(
     ------
     InputError
         If the data cannot be used or the settings are wrong.
+
+    Examples
+    --------
+    >>> run = hz.fit("motion.csv", level="affine")
+    >>> run = hz.fit(df, time="t", angles="theta", group="run")
+    >>> run = hz.fit([a, b], h=0.01)
     """
-    started, config = time.perf_counter(), config or FitConfig()
+    started = time.perf_counter()
+    reading, changes = split_options(settings)
+    config = (config or FitConfig()).changed(changes)
+    data = as_trajectories(data, **reading)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
     seen = look(data, config, stages, plan)
@@ -73,8 +92,18 @@ def fit(
     plan = plan or choose(seen, config)
     task = Task(seen.kept, seen.base, seen.settings, stages)
     run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
+    run.metrics["equation"] = _equation(run, plan).as_dict()
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
+
+
+def _equation(run: Run, plan: Plan) -> Equation:
+    """The learned equation, with standard deviations where named terms were fitted to trajectories."""
+    covariance = None
+    if plan.network == "none" and run.metrics["follows_data"]:
+        posterior = laplace(run)
+        covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
+    return equation_of(run, covariance)
 
 
 def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
