@@ -9,7 +9,7 @@ leave. Model steps are halved while that changes the motion by as much as the da
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -112,7 +112,14 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms:
                 break
             found = self._finer(self._longer(more))
-        return self._pruned(found)
+        return self._held(self._pruned(found))
+
+    def _held(self, found: Found) -> Found:
+        """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
+        if not found.terms.dry:
+            return found
+        other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
+        return found if other is None or not other.rms < found.rms else self._finer(self._longer(other))
 
     def _linear(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
         """Terms and values of the linear problem, pruned."""
@@ -178,11 +185,13 @@ class DictionarySearch:
         at[DRY] = [i for i, x in enumerate(names) if x == DRY]
         return at
 
-    def _stages(self, terms: NamedTerms, values: dict, substeps: int) -> SegmentStages:
+    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool = False) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
+        config = replace(config, sticking=sticking and terms.dry)
         base = started(self.base, self.data, values, config)
         task = Task(self.data, base, config, Stages(False, None, "", resume=False))
-        return SegmentStages(task, build_model(base, config, "none"))
+        model = build_model(base, config, "none")
+        return SegmentStages(task, with_sticking(model) if config.sticking else model)
 
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
@@ -202,18 +211,18 @@ class DictionarySearch:
         """The same terms over longer segments, where the model follows the data now."""
         if found.whole:
             return found
-        stages = self._stages(found.terms, found.values, found.config.substeps)
+        stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
         done = found.fit.problem.grid.longest / found.config.substeps
         stages.lengths = [0, *(length for length in stages.lengths if length > 1.01 * done)]
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
     def _problem(self, found: Found, terms: NamedTerms, substeps: int) -> tuple[SegmentStages, ShootingProblem]:
         """The problem with other terms over the same segments."""
-        stages = self._stages(terms, found.values, substeps)
+        stages = self._stages(terms, found.values, substeps, found.config.sticking)
         old, base = found.fit.problem, stages.task.base
         length = round(old.grid.longest / found.config.substeps)
         grid = segment_grid(self.data, length, base.model_step)
-        model = with_sticking(stages.model) if found.config.sticking else stages.model
+        model = stages.model
         problem = ShootingProblem(
             model, self.data, grid, sigma=max(found.rms, self.floor), prior=prior_of(model, base, None),
             freedom=self.freedom,
