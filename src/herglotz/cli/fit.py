@@ -100,6 +100,11 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument(
+        "--drag", action="append", default=[], metavar="TEXT",
+        help="a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', 'v1^3', or a "
+        "constant one, 'load 1' (forced); may be given again",
+    )  # fmt: skip
+    parser.add_argument(
         "--order", type=int, choices=(2, 4), default=2,
         help="of the rule; 4: from the features alone, without networks (default %(default)s)",
     )  # fmt: skip
@@ -126,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
+        diagonal=arguments.diagonal, coupled=arguments.coupled, drag=tuple(arguments.drag), sticking=arguments.sticking, order=arguments.order,
         substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments)).thinned(arguments.every)

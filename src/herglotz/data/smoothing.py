@@ -56,7 +56,7 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     width, degree, _, _ = min(fair, key=lambda x: (noise + x[0] * (x[2] - noise)) * x[3])
     rows = _windows(data, width)
     half, A = _design(data, rows, degree)
-    coefficients = torch.linalg.pinv(A) @ data.q[rows].double()
+    coefficients = _inverse(A) @ data.q[rows].double()
     middle = rows[:, width // 2] == torch.arange(data.samples)
     return LocalPolynomials(width, degree, coefficients, half, middle, rows)
 
@@ -92,10 +92,16 @@ def _quality(data: Trajectories, width: int, degree: int) -> tuple[float, float]
     rows = rows[:: -(-len(rows) // MOST)]
     half, A = _design(data, rows, degree)
     q = data.q[rows].double()
-    inverse = torch.linalg.pinv(A)
+    inverse = _inverse(A)
     left = (q - A @ (inverse @ q)).square().mean() * width / (width - degree - 1)
     gain = (2 * inverse[:, 2] / half[:, None].square()).square().sum(1).mean()
     return float(left), float(gain)
+
+
+def _inverse(A: Tensor) -> Tensor:
+    """The pseudo-inverse of tall matrices of full rank."""
+    Q, R = torch.linalg.qr(A)
+    return torch.linalg.solve_triangular(R, Q.mT, upper=True)
 
 
 def _windows(data: Trajectories, width: int) -> Tensor:

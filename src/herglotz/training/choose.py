@@ -99,7 +99,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     return Plan(
         level=c.level, objective=objective, network=network, order=c.order, features=c.features,
         drag=c.drag, substeps=c.substeps,
-        forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal},
+        forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal,
+                "alike": c.alike},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
         reasons={

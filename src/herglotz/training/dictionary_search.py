@@ -28,6 +28,7 @@ from herglotz.training.named_terms import (
     STILL,
     NamedTerms,
     candidates,
+    own_terms,
     places,
     settings_of,
     started,
@@ -88,6 +89,7 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
+        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
         self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
@@ -103,7 +105,7 @@ class DictionarySearch:
         found = self._grown(terms, values, 1, smoothed(self.data, local))
         if found is None:
             return None
-        found = self._finer(found)
+        found = self._finer(self._held(found))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
@@ -111,15 +113,15 @@ class DictionarySearch:
             more = self._refit(found, self.all.only((*found.terms.names, name)))
             if more is None or not more.rms < found.rms:
                 break
-            found = self._finer(self._longer(more))
-        return self._held(self._pruned(found))
+            found = self._finer(self._held(self._longer(more)))
+        return self._pruned(found)
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
-        if not found.terms.dry:
+        if not found.terms.dry or found.config.sticking:
             return found
         other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
-        return found if other is None or not other.rms < found.rms else self._finer(self._longer(other))
+        return found if other is None or not other.rms < found.rms else self._longer(other)
 
     def _linear(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
         """Terms and values of the linear problem, pruned."""
@@ -128,7 +130,7 @@ class DictionarySearch:
         if len(t) > ROWS:
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
         forces = NamedForces(self.all.drag, self.base.speed, u)
-        fit = LinearFit.of(self.data.angles, self.all.features, t, forces)
+        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
         columns = self._columns(fit)
         x = fit.solve(columns)
         if float(x[0]) == 0:
@@ -157,11 +159,12 @@ class DictionarySearch:
         values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
         for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
             values |= zip(names, values.pop(parameter, ()), strict=True)
+        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
         return terms, values
 
     @property
     def _still(self) -> list[str]:
-        return [x for x in self.all.features if "v" not in x]
+        return [x for x in self.all.features if "v" not in x and x not in self.own]
 
     @property
     def _moving(self) -> list[str]:
@@ -182,6 +185,7 @@ class DictionarySearch:
         for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
             own = [i for i, x in enumerate(names) if x == parameter]
             at |= {term: [i] for term, i in zip(terms, own, strict=True)}
+        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
         at[DRY] = [i for i, x in enumerate(names) if x == DRY]
         return at
 
@@ -245,7 +249,7 @@ class DictionarySearch:
             return None
         _, problem = self._problem(found, self.all, found.config.substeps)
         theta = problem.parameters.get()
-        at = places(problem.parameters, self.all, self.data.dof, self.order)
+        at = places(problem.parameters, self.all)
         x = problem.pack(theta, found.fit.problem.states_at(found.fit.path, problem.grid.start_sample))
         cost, A, b = problem.normal_equations(x)
         if not math.isfinite(float(cost)):
@@ -265,8 +269,8 @@ class DictionarySearch:
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by."""
-        problem, n = found.fit.problem, self.data.dof
-        at = places(problem.parameters, found.terms, n, self.order)
+        problem = found.fit.problem
+        at = places(problem.parameters, found.terms)
         if not at:
             return found
         x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])

@@ -46,7 +46,8 @@ def candidates(data: Trajectories) -> NamedTerms:
     angles, n = data.angles, data.dof
     if n == 1:
         waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
-        features = waves if angles[0] else [f"q1^{k}" for k in range(3, HIGHEST + 1)]
+        powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
+        features = [*own_terms(angles[0]), *(waves if angles[0] else powers)]
     else:
         features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r")]
         if any(angles):
@@ -57,15 +58,22 @@ def candidates(data: Trajectories) -> NamedTerms:
     return NamedTerms(tuple(features), tuple(drag), True)
 
 
+def own_terms(angle: bool) -> dict[str, tuple[str, float]]:
+    """The baseline's terms of one coordinate as features: the parameter of each, and its factor."""
+    if angle:
+        return {"cos(q1)": ("potential.stiffness", -1.0), "sin(q1)": ("potential.tilt", 1.0)}
+    return {"q1^2": ("potential.stiffness", 0.5), "q1": ("potential.tilt", 1.0)}
+
+
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
     """The settings of a model that is made of these terms."""
     driven = data.u is not None and config.use_inputs
     forced = bool(terms.drag) or terms.dry or driven or data.dof > 1
-    lengths = not any(data.angles)
+    lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
         diagonal=lengths and data.dof > 1, coupled=not lengths and data.dof > 1, order=order, substeps=substeps,
-        objective="trajectory",
+        objective="trajectory", alike=data.dof == 1 and (still or order == 2),  # the potential holds features alone
     )  # fmt: skip
 
 
@@ -86,7 +94,8 @@ def started(
         rate += float(rest.pop("friction.viscous", (0.0,))[0])
     known = _parameters(of, bool(moving))
     rest = {name: x for name, x in ((known(name), x) for name, x in rest.items()) if name and x}
-    stiffness, tilt = values["potential.stiffness"], values["potential.tilt"]
+    zero = (0.0,) * data.dof
+    stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
     assert isinstance(stiffness, tuple)
     assert isinstance(tilt, tuple)
     step = base.max_step if of.substeps == 1 else JITTER * data.typical_step / of.substeps
@@ -116,7 +125,7 @@ def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles:
     named = {name: tuple(x.reshape(-1).tolist()) for name, x in parameters.unflatten(theta).items()}
     values: dict[str, float | tuple[float, ...]] = {}
     still, n = named.pop(STILL, ()), len(angles)
-    if of.order == 4:  # −k, b of each angle; k/2, b of the others
+    if of.order == 4 and not of.alike:  # −k, b of each angle; k/2, b of the others
         own, still = still[: 2 * n], still[2 * n :]
         turn = [-1.0 if angle else 2.0 for angle in angles]
         values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
@@ -127,9 +136,10 @@ def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles:
     return values | named
 
 
-def places(parameters: ParameterVector, terms: NamedTerms, n: int, order: int) -> dict[str, list[int]]:
+def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    still = parameters.index(STILL)[2 * n if order == 4 else 0 :].tolist()
+    config = parameters.model.config
+    still = parameters.index(STILL)[2 * config.dof if config.order == 4 and not config.alike else 0 :].tolist()
     at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
     at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
     at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)
