@@ -131,7 +131,8 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, drag=tuple(arguments.drag), sticking=arguments.sticking, order=arguments.order,
+        diagonal=arguments.diagonal, coupled=arguments.coupled, drag=tuple(arguments.drag),
+        sticking=arguments.sticking, order=arguments.order,
         substeps=arguments.substeps,
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments)).thinned(arguments.every)

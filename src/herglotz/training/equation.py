@@ -191,7 +191,9 @@ def _friction(
             yield left, " ".join(of), _unit(unit, powers, time, 2 - f.b - f.c), [("drag.coefficient", g, -1.0)]
     if config.coulomb:
         yield left, f"sgn({name}′)", _unit(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
-        width = run.model.friction.sharpest + run.model.friction.log_stribeck.exp()  # type: ignore[union-attr]
+        friction = run.model.friction
+        assert friction is not None  # dry friction is part of it
+        width = (friction.sharpest + friction.log_stribeck.exp()).detach()
         shape = f"exp(−({name}′/{float(width[i]):.3g})²) sgn({name}′)"
         yield left, shape, _unit(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
     if "friction.input_map" in named:
@@ -203,7 +205,7 @@ def _friction(
 
 def _zero(run: Run, j: int) -> str:
     friction = run.model.friction
-    zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j])
+    zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
     return f"{zero:.3g}"
 
 

@@ -6,12 +6,14 @@ import hashlib
 import json
 import math
 import time
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
+from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
@@ -101,8 +103,9 @@ def _equation(run: Run, plan: Plan) -> Equation:
     """The learned equation, with standard deviations where named terms were fitted to trajectories."""
     covariance = None
     if plan.network == "none" and run.metrics["follows_data"]:
-        posterior = laplace(run)
-        covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
+        with suppress(InputError):  # whole trajectories cannot be followed: no deviations
+            posterior = laplace(run)
+            covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
     return equation_of(run, covariance)
 
 
