@@ -7,7 +7,7 @@ import re
 from typing import NoReturn
 
 import herglotz
-from herglotz.cli import export, fit, plot, predict, rollout, select, simulate, trust, tune, verify
+from herglotz.cli import export, fit, plot, predict, report, rollout, select, simulate, trust, tune, verify
 
 DESCRIPTION = """\
 Learn a discrete contact Lagrangian from measured positions, step it, and prove that it is a contact integrator.
@@ -15,6 +15,7 @@ Learn a discrete contact Lagrangian from measured positions, step it, and prove 
   herglotz simulate damped_pendulum --out pendulum.csv     data with a known answer (or bring your own csv)
   herglotz fit pendulum.csv --out runs/pendulum            train; metrics and figures land in the folder
   herglotz verify runs/pendulum                            check every identity, exit code 1 if one fails
+  herglotz report runs/pendulum                            one HTML page: the equation, errors, whether to believe it
   herglotz export runs/pendulum --out pendulum.pt2         one file that steps with PyTorch alone
 """
 NEGATIVE_NUMBER = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")  # argparse takes -1e-3 for an option
@@ -37,6 +38,6 @@ def build_parser() -> Parser:
     parser = Parser(prog="herglotz", description=DESCRIPTION)
     parser.add_argument("--version", action="version", version=f"herglotz {herglotz.__version__}")
     commands = parser.add_subparsers(title="subcommands", metavar="COMMAND", required=True)
-    for module in (simulate, fit, select, predict, rollout, export, verify, trust, tune, plot):
+    for module in (simulate, fit, select, predict, rollout, export, verify, trust, report, tune, plot):
         module.add(commands)
     return parser

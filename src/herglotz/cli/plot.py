@@ -7,13 +7,14 @@ from pathlib import Path
 
 from herglotz.cli.common import check_output_folder, is_run
 
+FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
 DESCRIPTION = """\
-Draw figures as PNG. Of a RUN: trajectory, phase portrait, momentum against the generating function,
-Hamilton–Jacobi residual, training. Of DATA: its samples.
+Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training. Of DATA: its
+samples. (`herglotz verify RUN --plots` draws the identities of the action.)
 
 examples:
   herglotz plot runs/pendulum
-  herglotz plot pendulum.csv --out figures
+  herglotz plot pendulum.csv --out figures --format pdf
 """
 
 
@@ -25,6 +26,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--out", type=Path, metavar="FOLDER",
         help="folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
     )  # fmt: skip
+    parser.add_argument("--format", choices=FORMATS, default="png", help="kind of file (default %(default)s)")
     parser.set_defaults(run=run)
 
 
@@ -40,7 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         from herglotz.plots import save_figures
 
-        written = save_figures(result, folder)
+        written = save_figures(result, folder, form=arguments.format)
     else:
         from herglotz.data import load
 
@@ -50,7 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
 
         figure = plot_data(data)
         folder.mkdir(parents=True, exist_ok=True)
-        written = [folder / f"{source.stem}.png"]
+        written = [folder / f"{source.stem}.{arguments.format}"]
         save_figure(figure, written[0])
     for path in written:
         print(path)

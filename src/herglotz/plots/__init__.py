@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
+
+from matplotlib.figure import Figure
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
+from herglotz.plots.learned import plot_learned
 from herglotz.plots.motion import plot_data, plot_trajectory
 from herglotz.plots.parachute import plot_fall, plot_printed_map
 from herglotz.plots.phase import plot_phase_portrait
@@ -20,23 +24,27 @@ if TYPE_CHECKING:
     from herglotz.training import Run
 
 FIGURES = {
-    "trajectory.png": plot_trajectory,
-    "phase_portrait.png": plot_phase_portrait,
-    "momentum_vs_dS.png": plot_momentum_vs_generating_function,
-    "hj_residual.png": plot_hamilton_jacobi_residual,
-    "training.png": plot_training,
+    "trajectory": plot_trajectory,
+    "phase_portrait": plot_phase_portrait,
+    "learned": plot_learned,
+    "training": plot_training,
 }
-UNFORCED = {"momentum_vs_dS.png", "hj_residual.png"}  # figures of S^k, which a model with forces does not have
+# Of S^k, which a model with forces does not have: identities that hold to rounding (`herglotz verify --plots`).
+IDENTITIES = {
+    "momentum_vs_dS": plot_momentum_vs_generating_function,
+    "hj_residual": plot_hamilton_jacobi_residual,
+}
 
 
-def save_figures(run: Run, folder: PathLike) -> list[Path]:
-    """Draw every figure of a run and write them as PNG into `folder`, which is made if it is missing.
+def save_figures(
+    run: Run, folder: PathLike, figures: Mapping[str, Callable[[Run], Figure]] = FIGURES, form: str = "png"
+) -> list[Path]:
+    """Draw the figures of a run and write them as png, svg or pdf into `folder`, which is made if it is missing.
 
     Returns
     -------
     list of Path
-        In the order of `FIGURES`; a model with forces has no figures of S^k. All figures are drawn before one is
-        written.
+        In the order of `figures`. All figures are drawn before one is written.
 
     Raises
     ------
@@ -44,8 +52,7 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
         If the folder cannot be made or written to.
     """
     folder = Path(folder)
-    skipped = UNFORCED if run.model.friction is not None else ()
-    drawn = {name: plot(run) for name, plot in FIGURES.items() if name not in skipped}
+    drawn = {f"{name}.{form}": plot(run) for name, plot in figures.items()}
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -57,10 +64,12 @@ def save_figures(run: Run, folder: PathLike) -> list[Path]:
 
 __all__ = [
     "FIGURES",
+    "IDENTITIES",
     "plot_bands",
     "plot_data",
     "plot_fall",
     "plot_hamilton_jacobi_residual",
+    "plot_learned",
     "plot_momentum_vs_generating_function",
     "plot_phase_portrait",
     "plot_printed_map",

@@ -52,7 +52,7 @@ class Plan:
 
     def table(self, width: int = 120) -> str:
         """One decision a line with its reason, for people."""
-        rows = [(name, _show(getattr(self, name)), self.reasons.get(name, "")) for name in DECISIONS]
+        rows = [(name, show(getattr(self, name)), self.reasons.get(name, "")) for name in DECISIONS]
         left, middle = max(len(row[0]) for row in rows), min(24, max(len(row[1]) for row in rows))
         lines = []
         for name, value, reason in rows:
@@ -78,7 +78,8 @@ class Plan:
 DECISIONS = tuple(f.name for f in fields(Plan) if f.name not in ("start", "reasons"))
 
 
-def _show(value: Any) -> str:
+def show(value: Any) -> str:
+    """One decision in words."""
     if isinstance(value, dict):
         return ", ".join(name for name, on in value.items() if on) or "none"
     if isinstance(value, tuple):

@@ -153,6 +153,10 @@ class Run:
         """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
         return _front().verify(self, **settings)
 
+    def report(self, folder: str | Path, against: Any = None) -> list[Path]:
+        """Write report.html, which fetches nothing, and report.md; `against` is another recording to be scored."""
+        return _front().report(self, folder, against)
+
     def summary(self) -> str:
         """What was reached, in a few lines."""
         return summary(self)

@@ -33,7 +33,7 @@ def test_version(capsys):  # fails if the version is not the package's
     assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
 
 
-COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "tune", "plot")
+COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "report", "tune", "plot")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -90,7 +90,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert err.startswith("tiny.csv:\n  column")
     assert "\r" not in err  # no bar where there is no terminal
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
-    assert len(list(folder.glob("*.png"))) == 5
+    assert len(list(folder.glob("*.png"))) == 4
     run = load_run(folder)
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
 
@@ -196,9 +196,17 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 6
+    assert len(written) == 5
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_identities_are_drawn_by_verify(tiny_run, tmp_path, capsys):  # fails if they are lost, or drawn of a scene
+    few = ["--samples", "4", "--steps", "2"]
+    assert main(["verify", str(tiny_run), *few, "--plots", str(tmp_path)]) in (0, 1)
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["hj_residual.png", "momentum_vs_dS.png"]
+    assert main(["verify", "damped_oscillator", *few, "--plots", str(tmp_path)]) == 2
+    assert "--plots draws a run; damped_oscillator is none" in capsys.readouterr().err
 
 
 def test_interrupt(monkeypatch, tiny_csv, tmp_path, capsys):  # fails if Ctrl-C prints a traceback or leaves a folder
