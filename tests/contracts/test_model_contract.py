@@ -60,6 +60,10 @@ MODELS = {
     "features of speed, coupled friction": config(
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True
     ),
+    "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3")),
+    "drag of position, order four": config(
+        2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True
+    ),
     "features of r, known": config(
         3, (False,) * 3, features=("r^-1", "central 2"), known=("0.5 q2^2",), level="affine"
     ),
@@ -165,7 +169,7 @@ def test_the_step_equation_equals_that_of_the_partials(settings, dtype, tol, tra
     model, (q0, q1, s0, h) = random_model(settings, dtype=dtype), points(settings.dof, dtype=dtype)
     model.requires_grad_(trained)
     known = model_equation(model)
-    other = settings.mass_width > 0 or settings.order == 4 or settings.coupled
+    other = settings.mass_width > 0 or settings.order == 4 or settings.coupled or bool(settings.drag)
     assert (known is None) == (settings.level == "full" or other)
     if known is None:
         return

@@ -71,6 +71,11 @@ def _model_flags(parser: argparse._ArgumentGroup) -> None:
         "--term", action="append", default=[], metavar="NAME", help="a term of herglotz.models.TERMS; may be repeated"
     )
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
+    parser.add_argument(
+        "--drag", action="append", default=[], metavar="TEXT",
+        help="a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', 'v1^3', or a "
+        "constant one, 'load 1' (forced); may be given again",
+    )  # fmt: skip
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
 
@@ -162,9 +167,9 @@ def run(arguments: argparse.Namespace) -> int:
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
         features=tuple(arguments.feature), known=tuple(arguments.known), terms=tuple(arguments.term),
-        alike=arguments.alike, diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking,
-        order=arguments.order, substeps=arguments.substeps, iterations=arguments.iterations,
-        departures=tuple(arguments.departures),
+        alike=arguments.alike, diagonal=arguments.diagonal, coupled=arguments.coupled, drag=tuple(arguments.drag),
+        sticking=arguments.sticking, order=arguments.order, substeps=arguments.substeps,
+        iterations=arguments.iterations, departures=tuple(arguments.departures),
     )  # fmt: skip
     data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)

@@ -21,9 +21,9 @@ class Capabilities:
     action_flow: bool  # the full level: the map of s is nonlinear
     position_features: bool  # named features in the potential
     friction: bool  # forces F⁻, F⁺ of friction and inputs
-    nonlinear_force: bool  # dry friction, or a term's force that is not linear in v
+    nonlinear_force: bool  # dry friction, or another force that is not linear in v
     sticking: bool  # dry friction is set-valued
-    coupling: bool  # a force that depends on the velocities of other joints
+    coupling: bool  # a force that depends on the velocities of other joints, or on the position
     inputs: int  # m
 
     @property

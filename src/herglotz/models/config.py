@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from herglotz.errors import InputError
+from herglotz.models.drag import parse_drag
 from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import check_terms
@@ -26,8 +27,9 @@ class ModelConfig:
     by row), measured from 0 or, with `input_zero`, from a learned zero of each.
     `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
     coordinates have one mass, and their potential is made of features alone; `diagonal`: each coordinate has a mass of
-    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds. `order` 4 adds
-    what the rule lacks of the exact L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
+    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds, and `drag`
+    names friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds what the rule lacks of the exact
+    L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
     `terms` are further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
     Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
     baseline is needed (trap 2).
@@ -61,6 +63,7 @@ class ModelConfig:
     alike: bool = False
     diagonal: bool = False
     coupled: bool = False
+    drag: tuple[str, ...] = ()
     order: int = 2
     terms: tuple[str, ...] = ()
 
@@ -94,6 +97,10 @@ class ModelConfig:
             raise InputError("sticking is of dry friction; set coulomb=True")
         if self.level != "forced" and self.coupled:
             raise InputError(f"coupled is friction between joints; set level='forced', not '{self.level}'")
+        if self.level != "forced" and self.drag:
+            raise InputError(f"drag is a friction force; set level='forced', not '{self.level}'")
+        for text in self.drag:
+            parse_drag(text, self.angles)
         if self.input_zero and not self.inputs:
             raise InputError("input_zero is the zero of inputs; set inputs to their number")
         if self.inputs < 0:

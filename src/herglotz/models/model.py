@@ -14,6 +14,7 @@ from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
+from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
 from herglotz.models.friction import Friction
@@ -91,6 +92,7 @@ class ContactLagrangian(nn.Module):
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
         self.coupling = CoupledFriction(c) if c.coupled and c.dof > 1 else None
+        self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
         self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
         self.potential.more = tuple(self.named_terms)
 
@@ -139,9 +141,10 @@ class ContactLagrangian(nn.Module):
             position_features=self.potential.features is not None,
             friction=self.friction is not None,
             nonlinear_force=(self.friction is not None and not self.friction.linear)
+            or self.drag is not None
             or not all(term.linear for term in self.forces_between),
             sticking=self.friction is not None and self.friction.sticking,
-            coupling=bool(self.forces_between),
+            coupling=bool(self.forces_between) or self.drag is not None,
             inputs=self.inputs,
         )
 
@@ -277,7 +280,7 @@ class ContactLagrangian(nn.Module):
         forces = self.friction(v, c, h, order, u)
         for term in self.forces_between:
             forces = with_force(forces, term, v, c, h)
-        return forces
+        return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
 
 
 @dataclass(frozen=True)

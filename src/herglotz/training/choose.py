@@ -36,6 +36,12 @@ def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
     return "a joint that stands still says nothing about its forces in one step" if seen.settings.sticking else None
 
 
+def _terms(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
+    if seen.found is None or seen.found.sigma is None:
+        return None
+    return f"whole trajectories were fitted with named terms, to {seen.found.sigma:.2g}"
+
+
 def _structured(seen: Look, config: FitConfig) -> str | None:
     return seen.structure if config.objective == "auto" != seen.settings.objective else None
 
@@ -69,6 +75,7 @@ RULES = (
     Rule("Are s or p fitted too?", "residual", _supervised),
     Rule("Did the user name the objective?", "as named", _named),
     Rule("Can friction hold a joint?", "trajectory", _sticking),
+    Rule("Do named terms follow whole trajectories?", "trajectory", _terms),
     Rule("Does a dictionary of features explain the steps?", "as found", _structured),
     Rule("Does the baseline's equation of motion explain the steps?", "residual", _explained),
     Rule("Does a flexible model miss single steps?", "trajectory", _noisy),
@@ -82,14 +89,18 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     c, base, probe = seen.settings, seen.base, seen.probe
     objective, why = choose_objective(seen, user_settings)
     one_step, covered = objective in ("residual", "raw"), seen.baseline_motion is not None
-    network, why_network = _network(objective, covered)
+    named = seen.found is not None and seen.found.sigma is not None
+    network, why_network = _network(objective, covered, named)
     restarts = c.restarts or (RESTARTS if covered else 1)
     continues = one_step and probe is not None and restarts == 1
     sigma = None if one_step or probe is None or not probe.enough else probe.rms / NOISE_OF_R
+    sigma = seen.found.sigma if named and seen.found is not None else sigma
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
-        level=c.level, objective=objective, network=network, order=c.order, features=c.features, hold=seen.data.hold,
-        forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal},
+        level=c.level, objective=objective, network=network, order=c.order, features=c.features, drag=c.drag,
+        substeps=c.substeps, hold=seen.data.hold,
+        forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
+                "alike": c.alike},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
         reasons={
@@ -98,12 +109,14 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "network": why_network,
             "order": _structure_reason(seen, c.order == user_settings.order),
             "features": _structure_reason(seen, c.features == user_settings.features),
+            "drag": _structure_reason(seen, c.drag == user_settings.drag),
+            "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
             "hold": seen.hold,
             "forces": seen.friction if seen.structure is None else seen.structure,
             "start": "least squares on finite differences" if not base.start else "one linear problem",
             "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
-            "sigma": _sigma_reason(seen, one_step, sigma),
+            "sigma": "what the search for terms left" if named else _sigma_reason(seen, one_step, sigma),
             "restarts": _restart_reason(user_settings, covered),
             "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
         },
@@ -131,7 +144,9 @@ def drawing() -> str:
     return "\n".join(lines)
 
 
-def _network(objective: str, covered: bool) -> tuple[str, str]:
+def _network(objective: str, covered: bool, named: bool) -> tuple[str, str]:
+    if named:
+        return "none", "named terms are the whole model"
     if objective == "raw":
         return "plain", "a network alone, to show the collapse of the raw residual"
     if objective != "residual":

@@ -104,6 +104,9 @@ class FitConfig:
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
     terms
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
+    drag
+        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
+        (forced level). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
@@ -142,6 +145,7 @@ class FitConfig:
     diagonal: bool = False
     coupled: bool = False
     terms: tuple[str, ...] = ()
+    drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
 
@@ -160,8 +164,11 @@ class FitConfig:
         _choice("activation", self.activation, ACTIVATIONS)
         if self.sticking and self.objective not in ("auto", "trajectory"):
             raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
-        if (self.coulomb or self.sticking or self.input_map) and self.level not in ("forced", "auto"):
-            raise InputError(f"coulomb, sticking and input_map are forces; set level='forced', not '{self.level}'")
+        forces = self.coulomb or self.sticking or self.input_map or self.drag
+        if forces and self.level not in ("forced", "auto"):
+            raise InputError(
+                f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'"
+            )
         if self.input_map and not self.use_inputs:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
         if not 0 < self.train_fraction <= 1:
@@ -233,7 +240,7 @@ class FitConfig:
     def has_forces(self) -> bool:
         """Whether the user asked for forces, which the forced level alone has."""
         named = any(TERMS[name].has_force() for name in self.terms if name in TERMS)
-        return self.coulomb or self.coupled or self.sticking or named
+        return bool(self.coulomb or self.coupled or self.sticking or self.drag or named)
 
     def changed(self, settings: dict[str, Any]) -> FitConfig:
         """These settings with some of them replaced; a single text or number counts as a list of one where one is due.

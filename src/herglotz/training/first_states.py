@@ -15,10 +15,13 @@ from herglotz.training.problems.shooting import ShootingProblem
 START = 8  # samples that a robust start state is estimated from
 
 
-def first_states(problem: ShootingProblem, theta: Tensor) -> Tensor:
-    """Return segment states from the first two samples, p by FL⁻; from a robust cubic beside outliers."""
-    i, data = problem.grid.start_sample, problem.data
-    q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None else _begin(data, i)
+def first_states(problem: ShootingProblem, theta: Tensor, smooth: Trajectories | None = None) -> Tensor:
+    """Return segment states from the first two samples, p by FL⁻; from a robust cubic beside outliers.
+
+    `smooth` are the same samples, smoothed.
+    """
+    i, data = problem.grid.start_sample, smooth or problem.data
+    q0, q1 = (data.q[i], data.q[i + 1]) if problem.freedom is None or smooth else _begin(data, i)
     with torch.no_grad():
         s = torch.zeros_like(data.t[i]) if problem.s is None else problem.s[i]
         u = None if problem.u is None else problem.u[:, 0]

@@ -27,8 +27,18 @@ from herglotz.models.jet import pairs
 from herglotz.training.parameter_vector import ParameterVector
 
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
-          "friction.viscous", "coupling.viscous")  # fmt: skip
+          "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
+          "drag.coefficient")  # fmt: skip
 ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class NamedForces:
+    """Forces that join the linear problem beside viscous friction."""
+
+    drag: tuple[str, ...] = ()  # see `herglotz.models.drag`
+    dry: tuple[float, ...] = ()  # typical speeds, (n,): dry friction at its starting widths; empty: none
+    u: Tensor | None = None  # (T, m) inputs, held over both steps of a triple
 
 
 @dataclass(frozen=True)
@@ -40,29 +50,36 @@ class LinearFit:
     names: tuple[str, ...]  # (F,) parameter that each column belongs to; "mass" for the constant masses
 
     @classmethod
-    def of(cls, angles: Sequence[bool], features: Sequence[str], t: Triples) -> LinearFit:
-        """The columns of a model of order 2 with these features, coupled friction and no other damping."""
-        n = len(angles)
+    def of(
+        cls, angles: Sequence[bool], features: Sequence[str], t: Triples, forces: NamedForces | None = None,
+    ) -> LinearFit:  # fmt: skip
+        """The columns of a model of order 2 with these features, coupled friction and no other damping but `forces`."""
+        n, forces = len(angles), forces or NamedForces()
         zero = (0.0,) * n
         model = ContactLagrangian(
             ModelConfig(angles=tuple(angles), level="forced", coupled=True, features=tuple(features), potential_width=0,
-                        stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=(1.0,) * n, rate=0.0)
+                        stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=forces.dry or (1.0,) * n, rate=0.0,
+                        drag=forces.drag, coulomb=bool(forces.dry),
+                        inputs=0 if forces.u is None else forces.u.shape[1])
         ).to(t.q0)  # fmt: skip
         parameters = ParameterVector(model)
         which = [name for name in LINEAR if name in parameters.names]
         columns = torch.cat([parameters.index(name) for name in which])
 
-        def both(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor) -> tuple[Tensor, Tensor]:
+        def both(
+            theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor, *u: Tensor
+        ) -> tuple[Tensor, Tensor]:
             zero = torch.zeros_like(h0)
             before, after = (
-                parameters.partials(theta, q0, q1, zero, h0, 2),
-                parameters.partials(theta, q1, q2, zero, h1, 2),
+                parameters.partials(theta, q0, q1, zero, h0, 2, *u),
+                parameters.partials(theta, q1, q2, zero, h1, 2, *u),
             )
             p = momentum_plus(before)
             return momentum_residual(after, p), momentum_jacobian(after, p)
 
-        derivatives = vmap(jacrev(both), (None, *(0,) * 5))
-        R, J = derivatives(parameters.get(), t.q0, t.q1, t.q2, t.h0, t.h1)
+        inputs = () if forces.u is None else (forces.u,)
+        derivatives = vmap(jacrev(both), (None, *(0,) * (5 + len(inputs))))
+        R, J = derivatives(parameters.get(), t.q0, t.q1, t.q2, t.h0, t.h1, *inputs)
         i, j = pairs(n, t.q0.device)
         eye = torch.eye(n, dtype=t.q0.dtype, device=t.q0.device)
         unit = eye[:, i, None] * eye[:, j].T[None]  # (n, pairs, n), then symmetric

@@ -21,11 +21,20 @@ from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.smoothing_fit import SMOOTHED
 from herglotz.training.stages import Stages
-from herglotz.training.structure import kept_structure, start_of_features, structure_is_free
+from herglotz.training.structure import (
+    Structure,
+    kept_structure,
+    search,
+    start_of_features,
+    structure_is_free,
+    structured,
+    terms_are_free,
+)
 from herglotz.training.task import NOISY, Task, drag_starts_the_fit
 from herglotz.training.trajectory_fit import check_size
 
 PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
+FINE = 0.1  # rad
 EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
 
 
@@ -59,13 +68,16 @@ class Look:
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
-    structure: str | None  # what was found about several coordinates, in words; None: it was not asked
+    structure: str | None  # what was found about the terms, in words; None: it was not asked
+    found: Structure | None  # named terms that whole trajectories were fitted with
     baseline_motion: tuple[Triples, float] | None  # where the baseline explains exact data: its motions, their error
     probe: Probe | None  # None: the objective is known without it
 
 
-def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None) -> Look:
-    """Measure what the choice of a plan, or a given plan, needs.
+def look(
+    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None, *, named: bool = True
+) -> Look:
+    """Measure what the choice of a plan, or a given plan, needs; `named`: search for a model of named terms too.
 
     Raises
     ------
@@ -84,22 +96,36 @@ def look(data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Pla
     kept, drag = without(train, dropped), drag_starts_the_fit(settings)
     outliers = settings.robust == "on" or bool(dropped.any())
     outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
+    settings = settings if plan is None else plan.applied(settings)
     settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
-    structure = None
+    structure, found = None, None
     if plan is not None:
-        settings, base = plan.applied(settings), plan.started(base)
+        base = plan.started(base)
     elif structure_is_free(kept, user_settings):
-        settings, base, structure = kept_structure(kept, base, settings, stages)
+        plain, first = settings, base
+        of = kept_structure("structure", lambda: structured(kept, first, plain), base, settings, stages)
+        settings, base, structure = of.config, of.base, of.reason
     elif settings.features:
         base = start_of_features(kept, base, settings)
+    motion = None
+    if plan is None or plan.network == "covered":
+        motion = _baseline_motion(Task(kept, base, settings, stages))
+    if plan is None and named and not settings.features and terms_are_free(kept, user_settings):
+        if motion is None or _fine(base):
+            plain, first = replace(settings, sticking=user_settings.sticking), base
+            found = kept_structure(
+                "terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages
+            )
+            structure = found.reason
+        if found is not None and found.sigma is not None:
+            settings, base, motion = found.config, found.base, None
     task = Task(kept, base, settings, stages)
-    motion = _baseline_motion(task) if (plan is None or plan.network == "covered") else None
     wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
-        friction=why_friction, noise=roughness(kept), settings=settings, base=base, structure=structure,
+        friction=why_friction, noise=roughness(kept), settings=settings, base=base, structure=structure, found=found,
         baseline_motion=motion, probe=probe,
     )  # fmt: skip
 
@@ -116,6 +142,11 @@ def _with_friction(
         return replace(settings, sticking=False), "asked of driven data with nothing said of level, friction, objective"
     sticking, why = friction_holds(kept)
     return replace(settings, sticking=sticking), why
+
+
+def _fine(base: Baseline) -> bool:
+    """Whether a recorded step turns the phase so little that a rule of order 4 is exact to rounding."""
+    return base.max_step * max(v / x for v, x in zip(base.speed, base.scale, strict=True)) < FINE
 
 
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:

@@ -65,8 +65,9 @@ def fit_by_one_step(task: Task, seen: Look, plan: Plan) -> Fitted:
 
 
 def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG001
-    """Fit parameters and states to whole trajectories, from a short one-step fit."""
-    model, sigma = _one_step_start(task, plan)
+    """Fit parameters and states to whole trajectories, from a short one-step fit or from values that were found."""
+    found_before = plan.network == "none" and plan.sigma is not None
+    model, sigma = (task.build("none"), plan.sigma or 0.0) if found_before else _one_step_start(task, plan)
     if task.config.sticking:
         model = with_sticking(model)
     found = fit_trajectories(task, model, sigma)

@@ -23,10 +23,12 @@ class Plan:
 
     level: str  # of the ladder of models
     objective: str  # residual, trajectory, smoothing or raw
-    network: str  # correction, covered (one wide layer), potential or plain
+    network: str  # correction, covered (one wide layer), potential, plain or none
     order: int  # of the rule, 2 or 4
     features: tuple[str, ...]  # what L may hold beside its terms
     hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
+    drag: tuple[str, ...]  # friction forces beside the viscous one
+    substeps: int  # model steps in a recorded one
     forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
     start: dict[str, tuple[float, ...]]  # starting values of parameters by name
     outliers: bool  # the first one-step fit takes Student's t
@@ -40,7 +42,7 @@ class Plan:
         """The settings with what this plan decides."""
         return replace(
             settings, level=self.level, objective=self.objective, order=self.order, features=self.features,
-            departures=self.departures, **self.forces,
+            departures=self.departures, drag=self.drag, substeps=self.substeps, **self.forces,
         )  # fmt: skip
 
     def started(self, base: Baseline) -> Baseline:

@@ -24,6 +24,7 @@ from herglotz.stepping.method import OneStepMethod
 from herglotz.theory import ContinuousEquation, FractionalStepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
+from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.predict import Prediction, predict
 from herglotz.training.summary import as_html, one_line, summary
@@ -124,6 +125,11 @@ class Run:
         if len(lost):
             raise InputError(f"no energy at sample {tuple(lost[0].tolist())}: a step beside it fails; leave it out")
         return H
+
+    def equation(self) -> Equation:
+        """The learned equation of motion; with standard deviations where the model is made of named terms alone."""
+        stored = self.metrics.get("equation")
+        return Equation.from_dict(stored) if stored else equation_of(self)
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
         """State, with shapes (n,), (n,), (), and time at the last training sample of a trajectory.

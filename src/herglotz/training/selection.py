@@ -102,6 +102,9 @@ class Selection:
             lines.append(
                 f"{c.level:<14}{c.error:>13.3g}{spread:>24}{c.parameters:>12}{c.step_us:>9.0f}{seconds:>8.1f}{mark}"
             )
+        verdict = self.run.metrics.get("verdict", "")
+        if verdict.startswith("does not fit"):
+            lines.append(f"Warning: the chosen level {verdict}")
         return "\n".join(lines)
 
     def to_json(self) -> str:

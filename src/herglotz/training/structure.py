@@ -10,7 +10,8 @@ the data do not need, and tells noise from what the rule lacks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -18,13 +19,14 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import roughness
+from herglotz.data.roughness import precision, roughness
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
+from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
@@ -43,6 +45,8 @@ THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the 
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
+AT_THE_NOISE = 1.5  # times the precision, and without noise
+EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
@@ -53,16 +57,30 @@ class Structure(NamedTuple):
     config: FitConfig  # the settings with the features, the order and the objective that the data call for
     base: Baseline  # with starting values
     reason: str  # in words and numbers
+    sigma: float | None = None  # misfit of whole trajectories, where these were fitted
+    doubt: bool = False  # another model may fit better: held-out free runs decide
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
     """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
     c = user_settings
-    named = c.features or c.known or c.terms or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking
-    plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm"
     driven = data.u is not None and c.use_inputs
     several = 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)
-    return c.level == "auto" and not named and plain and not driven and several
+    return _nothing_named(c) and not driven and several
+
+
+def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
+    """Whether the terms of these data are left to `search`: one to three coordinates, nothing said."""
+    c = user_settings
+    return data.dof <= MOST and _nothing_named(c) and c.objective == "auto" and c.substeps == 1 and not c.input_map
+
+
+def _nothing_named(c: FitConfig) -> bool:
+    named = (
+        c.features or c.known or c.terms or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking or c.drag
+    )
+    plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm" and not c.coupled
+    return c.level == "auto" and not named and plain
 
 
 def dictionary(data: Trajectories) -> tuple[str, ...]:
@@ -74,18 +92,35 @@ def dictionary(data: Trajectories) -> tuple[str, ...]:
     return tuple(name for name in lengths(data.angles) if away or not name.startswith("r^"))
 
 
-def kept_structure(data: Trajectories, base: Baseline, config: FitConfig, stages: Stages) -> Structure:
-    """What `structured` finds, or what the checkpoint remembers of it."""
-    numbers = ("stiffness", "tilt", "rate", "start")
+def kept_structure(
+    name: str, find: Callable[[], Structure], base: Baseline, config: FitConfig, stages: Stages
+) -> Structure:
+    """What `find` finds, or what the checkpoint remembers of it under this name."""
+    numbers = ("stiffness", "tilt", "rate", "start", "model_step")
 
     def search() -> dict[str, Any]:
-        found = structured(data, base, config)
+        found = find()
         start = {name: getattr(found.base, name) for name in numbers}
-        return {"config": found.config.to_dict(), "base": start, "reason": found.reason}
+        rest = {"reason": found.reason, "sigma": found.sigma, "doubt": found.doubt}
+        return {"config": found.config.to_dict(), "base": start, **rest}
 
-    kept = stages.keep("structure", search)
+    kept = stages.keep(name, search)
     found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
-    return Structure(found, replace(base, **kept["base"]), kept["reason"])
+    return Structure(found, replace(base, **kept["base"]), kept["reason"], kept["sigma"], kept["doubt"])
+
+
+def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
+    """The named terms that whole trajectories ask for (`dictionary_search`); unchanged where they follow no data."""
+    found = DictionarySearch(data, base, config, outliers=outliers).run()
+    if found is None:
+        return Structure(config, base, "no dictionary of terms: its model cannot follow 20 steps")
+    noise = precision(data)
+    limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.spread)
+    named = ", ".join(found.terms.names) or "nothing"
+    words = f"beside mass, stiffness and friction of the first degree {named}: misses {found.rms:.2g}"
+    words += f" (precision {limit:.2g})" + ("" if found.whole else "; whole trajectories are not followed")
+    doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
+    return Structure(found.config, found.base, words, found.rms, doubt)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

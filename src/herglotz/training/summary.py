@@ -51,6 +51,9 @@ def summary(run: Judged) -> str:
              for name, value in table]  # fmt: skip
     if run.metrics.get("extrapolation_status") not in (None, "ok"):
         lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", COLUMNS))
+    equation = run.metrics.get("equation")
+    if equation:
+        lines += ["Learned equation:", *(f"  {line}" for line in equation["text"].splitlines())]
     return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
 
 

@@ -53,10 +53,10 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
     """A model with the network that the objective needs: the correction, the potential's, or a plain one alone.
 
     Where the baseline's motions have "covered" the whole range, the correction is one layer of `WIDER` times as many
-    units.
+    units. "none": named terms alone.
     """
     alone, n = network == "plain", len(base.angles)
-    width = config.correction_width if network != "potential" and config.order == 2 else 0
+    width = config.correction_width if network not in ("potential", "none") and config.order == 2 else 0
     features = ("1", *config.features) if drag_starts_the_fit(config) else () if alone else config.features
     model = ContactLagrangian(
         ModelConfig(
@@ -68,7 +68,7 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
             tilt=(0.0,) * n if config.alike else base.tilt,
             rate=base.rate,
             potential_width=config.potential_width if network == "potential" and config.order == 2 else 0,
-            damping_width=config.damping_width,
+            damping_width=config.damping_width if network != "none" else 0,
             correction_width=width * (WIDER if network == "covered" else 1),
             correction_depth=1 if network == "covered" else 2,
             baseline=not alone,
@@ -85,6 +85,7 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
             alike=config.alike and not alone,
             diagonal=config.diagonal and not alone,
             coupled=config.coupled,
+            drag=config.drag,
             order=config.order,
             terms=() if alone else config.terms,
         )

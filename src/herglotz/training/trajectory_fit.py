@@ -122,9 +122,18 @@ class SegmentStages:
         self.lengths = segment_lengths(task.data)
 
     def fit(
-        self, length: int, sigma: float, freedom: float | None, before: TrajectoryFit | None, used: Tensor | None = None
+        self,
+        length: int,
+        sigma: float,
+        freedom: float | None,
+        before: TrajectoryFit | None,
+        used: Tensor | None = None,
+        begin: Trajectories | None = None,
     ) -> TrajectoryFit | None:
-        """Segments of one length, from the states of the stage before; None where no path is found."""
+        """Segments of one length, from the states of the stage before or read off `begin`; None where no path is found.
+
+        `begin` is the data or, less noisy, the same smoothed.
+        """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
         problem = ShootingProblem(
@@ -133,9 +142,10 @@ class SegmentStages:
         )  # fmt: skip
         if before is None:
             start = problem.parameters.get()
-            states = first_states(problem, start)
+            states = first_states(problem, start, begin)
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
+            problem.guess_from(before.problem, before.path)
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
         return self.optimise(problem, start, states, name)
 
@@ -174,6 +184,13 @@ class SegmentStages:
             return first
         rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
         return trial if rest is None else rest
+
+    def whole(self, first: TrajectoryFit) -> TrajectoryFit | None:
+        """Whole trajectories at once, from parameters that are known well; None where that misses far more."""
+        used = None if bool(first.problem.used.all()) else first.problem.used
+        found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, used)
+        most = LOST * max(first.noise, FLOOR * self.task.size)
+        return None if found is None or found.noise > most else found
 
     def grow(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit:
         """From the shortest segments to whole trajectories, or as long as the model follows the data."""
@@ -220,7 +237,11 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
     if first is None:
         return None
     departures = stages.task.config.departures
-    last = stages.grow(stages.robust_or_not(first), sigma)
+    first = stages.robust_or_not(first)
+    if model.potential.network is None:  # no prior to choose
+        last = stages.whole(first) or stages.grow(first, sigma)
+        return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
+    last = stages.grow(first, sigma)
     previous, noise = last, last.noise
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
@@ -230,7 +251,7 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
             model, task.data, old.grid, sigma=noise, prior=prior_of(model, task.base, departure), freedom=old.freedom,
             used=old.used,
         )  # fmt: skip
-        problem.path = previous.path
+        problem.path = previous.path  # the same segments
         states = problem.states_at(previous.path, old.grid.start_sample)
         found = stages.optimise(problem, previous.theta, states, name)
         previous = found or previous

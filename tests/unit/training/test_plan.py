@@ -43,11 +43,11 @@ def test_the_drawing_in_the_docs_is_the_code():
 @pytest.mark.parametrize(
     ("noise", "settings", "number", "objective"),
     [
-        (0.0, {}, 4, "residual"),
-        (0.01, {}, 5, "trajectory"),
+        (0.0, {}, 5, "residual"),
+        (0.01, {}, 3, "trajectory"),
         (0.0, {"sticking": True}, 2, "trajectory"),
         (0.01, {"objective": "smoothing"}, 1, "smoothing"),
-        (0.0, {"mass_width": 3}, 6, "trajectory"),
+        (0.0, {"mass_width": 3}, 7, "trajectory"),
         (0.0, {"supervision": "qs"}, 0, "residual"),
     ],
 )

@@ -39,6 +39,15 @@ class SegmentGrid:
         """Model steps of the longest segment."""
         return self.h.shape[1]
 
+    def times(self, data: Trajectories) -> Tensor:
+        """Time of every node, (S, K + 1), also of those that pad a segment."""
+        first = data.t[self.start_sample][:, None]
+        return torch.cat([first, first + self.h.cumsum(1)], 1)
+
+    def start_trajectory(self, data: Trajectories) -> Tensor:
+        """Trajectory of every segment, (S,)."""
+        return data.trajectory[self.start_sample]
+
 
 def substeps(h: float, max_step: float) -> int:
     """In how many equal model steps a recorded step is crossed (a hair of tolerance for rounded time stamps)."""

@@ -90,7 +90,11 @@ class Prior:
 
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():
-            return self.parameters.model.potential.baseline(coordinates(self.grid, 1)).gradient
+            potential = self.parameters.model.potential
+            own = potential.baseline(coordinates(self.grid, 1)).gradient
+            if potential.features is None or bool(own.any()):
+                return own
+            return potential.features(self.grid, 1).gradient  # the potential is made of features alone
 
     def _departures(self, theta: Tensor) -> list[Tensor]:
         """Network outputs on the grid, each relative to its natural size."""

@@ -23,7 +23,7 @@ from herglotz.stepping import Stepper
 from herglotz.training.distributed import everywhere
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
-from herglotz.training.solvers.lifted_newton import Path, parameter_derivatives, solve_path
+from herglotz.training.solvers.lifted_newton import Path, linear_recurrence, parameter_derivatives, solve_path
 
 
 class ShootingProblem(StatesProblem):
@@ -63,6 +63,7 @@ class ShootingProblem(StatesProblem):
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
+        self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
 
     def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
         """Join states (S, n), (S, n), (S,) into the unknowns' layout (S, d)."""
@@ -88,7 +89,7 @@ class ShootingProblem(StatesProblem):
             path = None
             if self.path is not None:
                 path = solve_path(self.parameters, theta, start, self.grid.h, self.path.x, tol, u=self.u)
-            if path is None:
+            if path is None and (self.path is None or self.patient):
                 path = self._step_through(theta, start, tol)
         self._solved = x.clone(), path
         return path
@@ -151,6 +152,26 @@ class ShootingProblem(StatesProblem):
             first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
             rows[self.grid.start_sample] = first
         return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
+
+    def guess_from(self, other: ShootingProblem, path: Path) -> None:
+        """Start the next solve from a path over other segments or with other model steps, linear between its nodes.
+
+        Without one the next solve steps through the trajectories, one small step after the other.
+        """
+        old, new = other.grid.times(self.data), self.grid.times(self.data)
+        values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])
+        trajectories = [grid.start_trajectory(self.data) for grid in (other.grid, self.grid)]
+        for b in range(len(self.data)):
+            rows, own = (trajectories[0] == b).nonzero()[:, 0], (trajectories[1] == b).nonzero()[:, 0]
+            inside = torch.arange(old.shape[1], device=old.device) <= other.grid.end[rows, None]
+            node = (rows[:, None] * old.shape[1] + torch.arange(old.shape[1], device=old.device))[inside]
+            t, order = old[rows][inside].sort(stable=True)
+            known = values[node[order]]
+            at = torch.searchsorted(t, new[own].contiguous(), right=True).clamp(1, len(t) - 1)
+            gap = t[at] - t[at - 1]
+            share = torch.where(gap > 0, (new[own] - t[at - 1]) / torch.where(gap > 0, gap, 1.0), 1.0)[..., None]
+            x[own] = known[at - 1] + share.clamp(0, 1) * (known[at] - known[at - 1])
+        self.path = Path(x, path.A)
 
     def misfit(self, path: Path) -> Tensor:
         """q_model − q_data at every sample, (N', n), in units of q."""
@@ -232,8 +253,5 @@ class ShootingProblem(StatesProblem):
         if not held:
             B = parameter_derivatives(self.parameters, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
-        Z = [torch.cat([torch.zeros_like(B[:, 0]), eye], -1)]
-        pad = theta.new_zeros(S, d, d)
-        for k in range(K):
-            Z.append(path.A[:, k, :d, :d] @ Z[-1] + torch.cat([B[:, k], pad], -1))
-        return torch.stack(Z, 1)
+        first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
+        return linear_recurrence(path.A[..., :d, :d], torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)

@@ -8,6 +8,7 @@ stepping costs K small ones (Albersmeyer & Diehl 2010, the lifted Newton method)
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -52,14 +53,38 @@ def solve_path(
         size = float(defect.abs().amax(dim=(0, 1)).div(x.abs().amax(dim=(0, 1)) + 1e-300).max())
         if size <= tol or (size <= 1e3 * tol and size >= previous / 2):
             return Path(torch.cat([start[:, None], y], 1) if size == 0 else x, A)
-        e = [torch.zeros_like(start)]
-        for k in range(h.shape[1]):
-            e.append((A[:, k] @ e[-1][..., None])[..., 0] + defect[:, k])
-        x = x + torch.stack(e, 1)
+        x = x + linear_recurrence(A, defect[..., None], torch.zeros_like(start)[..., None])[..., 0]
         previous = size
         if not bool(torch.isfinite(x).all()):
             return None
     return None
+
+
+def linear_recurrence(
+    A: Tensor,  # (S, K, d, d)
+    B: Tensor,  # (S, K, d, r)
+    first: Tensor,  # (S, d, r)
+) -> Tensor:
+    """Z_0 = first, Z_{k+1} = A_k Z_k + B_k, (S, K+1, d, r), by about 2 √K products of batches instead of K small ones.
+
+    In √K blocks at once: Z from 0, and the product of the A so far; then from block to block.
+    """
+    S, K, d = A.shape[:3]
+    length = max(1, math.isqrt(K))
+    blocks = -(-K // length)
+    more = blocks * length - K
+    eye = torch.eye(d, dtype=A.dtype, device=A.device)
+    A = torch.cat([A, eye.expand(S, more, d, d)], 1).unflatten(1, (blocks, length))
+    B = torch.cat([B, B.new_zeros(S, more, *B.shape[2:])], 1).unflatten(1, (blocks, length))
+    own, product = [torch.zeros_like(B[:, :, 0])], [eye.expand(S, blocks, d, d)]
+    for k in range(length):
+        own.append(A[:, :, k] @ own[-1] + B[:, :, k])
+        product.append(A[:, :, k] @ product[-1])
+    starts = [first]
+    for b in range(blocks):
+        starts.append(product[-1][:, b] @ starts[-1] + own[-1][:, b])
+    inside = torch.stack(product[:-1], 2) @ torch.stack(starts[:-1], 1)[:, :, None] + torch.stack(own[:-1], 2)
+    return torch.cat([inside.flatten(1, 2), starts[-1][:, None]], 1)[:, : K + 1]
 
 
 def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:

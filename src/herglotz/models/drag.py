@@ -1,0 +1,121 @@
+"""Named friction forces of one joint: |v| v, v³, q² v, and so on, with a learned coefficient each.
+
+The text of one is a product: a power of a length's position if any, |v|, and a power of the joint's own speed:
+
+    |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        load 2
+
+`load 2` is a constant force on coordinate 2: on an angle no potential has it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor, nn
+
+from herglotz.errors import InputError
+from herglotz.mechanics import Forces
+
+HIGHEST = 9  # power of a speed or a position
+_TEXT = re.compile(
+    r"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|v(?P<w>\d+)\| )?v(?P<v>\d+)(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
+)
+
+
+@dataclass(frozen=True)
+class DragFeature:
+    """q_at^a |v_on|^b v_on^c, which brakes the coordinate `on`."""
+
+    on: int
+    at: int
+    a: int
+    b: int  # 0 or 1
+    c: int  # 1 or more; 0: a constant force
+
+
+def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
+    """Read the text of a friction force.
+
+    Raises
+    ------
+    InputError
+        If it is none, or names a coordinate that the model has not.
+    """
+    match, n = _TEXT.fullmatch(" ".join(text.split())), len(angles)
+    if match is None:
+        raise InputError(f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1' or 'load 1'")
+    on = int(match["v"] or match["load"]) - 1
+    at, a = int(match["q"] or on + 1) - 1, int(match["a"] or 1) if match["q"] else 0
+    c = 0 if match["load"] else int(match["c"] or 1)
+    if not (0 <= on < n and 0 <= at < n):
+        raise InputError(f"drag '{text}': the coordinates are numbered 1 … {n}")
+    if match["w"] and int(match["w"]) - 1 != on:
+        raise InputError(f"drag '{text}': |v| and v are the speed of one joint; write '|v{on + 1}| v{on + 1}'")
+    if a and angles[at]:
+        raise InputError(f"drag '{text}': a power of an angle is not periodic; leave q{at + 1} out")
+    if match["v"] and not (0 <= a <= HIGHEST and 1 <= c <= HIGHEST):
+        raise InputError(f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}")
+    return DragFeature(on, at, a, 1 if match["w"] else 0, c)
+
+
+class Drag(nn.Module):
+    """f_i = −Σ_g θ_g q̄_j^a |v_i|^b v_i^c of each joint i, with F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
+
+    The coefficients θ are plain parameters that start at 0; van der Pol's oscillator has viscous friction of negative
+    sign and one of q² v.
+    """
+
+    def __init__(self, features: Sequence[DragFeature], dof: int):
+        super().__init__()
+        self.features = tuple(features)
+        self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
+        eye = torch.eye(dof, dtype=torch.float64)
+        for name, rows in (("on", [f.on for f in features]), ("at", [f.at for f in features])):
+            self.register_buffer(name, eye[rows], persistent=False)
+        self.on: Tensor
+        self.at: Tensor
+
+    def terms(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return φ_g and its slopes by q̄_j and v_i, each (..., G)."""
+        x, y = q @ self.at.T, v @ self.on.T
+        columns = []
+        for g, f in enumerate(self.features):
+            at, speed = x[..., g], y[..., g]
+            own = speed.abs() if f.b else torch.ones_like(speed)
+            position, slope = _power(at, f.a), _power(at, f.a - 1) * f.a
+            bend = own * _power(speed, f.c - 1) * (f.b + f.c)
+            grip = own * _power(speed, f.c)
+            columns.append((position * grip, slope * grip, position * bend))
+        value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
+        return value, by_q, by_v
+
+    def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
+        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them."""
+        value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v))
+        f = -value @ self.on
+        before, after = (c * h / 2)[..., None], (h / 2)[..., None]
+        minus, plus = own.minus + before * f, own.plus + after * f
+        if own.minus_2 is None:
+            return replace(own, minus=minus, plus=plus)
+        assert own.minus_1 is not None
+        assert own.plus_1 is not None
+        assert own.plus_2 is not None
+        along = torch.diag_embed(-(by_v @ self.on)) / h[..., None, None]  # ∂f/∂v · ∂v/∂q1
+        across = -(self.on.T @ (by_q[..., None] * self.at)) / 2  # ∂f/∂q̄ · ∂q̄/∂q1
+        one, other = before[..., None], after[..., None]
+        return replace(
+            own, minus=minus, plus=plus, minus_1=own.minus_1 + one * (across - along),
+            minus_2=own.minus_2 + one * (across + along), plus_1=own.plus_1 + other * (across - along),
+            plus_2=own.plus_2 + other * (across + along),
+        )  # fmt: skip
+
+
+def _power(x: Tensor, k: int) -> Tensor:
+    """x^k by multiplication: the forward derivative of `pow` takes the logarithm of negative numbers."""
+    out = torch.ones_like(x)
+    for _ in range(k):
+        out = out * x
+    return out

@@ -1,0 +1,312 @@
+"""The named terms that a recording needs: one linear problem, then whole trajectories with terms added and left out.
+
+The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
+trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
+fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
+leave. Model steps are halved while that changes the motion by as much as the data miss it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import precision
+from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smooth_triples, smoothed
+from herglotz.models.jet import pairs
+from herglotz.training.baseline import Baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.named_terms import (
+    DRAG,
+    DRY,
+    MOVING,
+    STILL,
+    NamedTerms,
+    candidates,
+    own_terms,
+    places,
+    settings_of,
+    started,
+    values_of,
+    with_inverse_free,
+)
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import prune
+from herglotz.training.stages import Stages
+from herglotz.training.task import EXACT, Task, build_model, with_sticking
+from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
+
+ROWS = 4000  # triples in the linear problem
+ADDED = 6  # terms that may join one after the other
+FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
+LOWER = 0.99  # share of the misfit that is left where halved steps are kept
+FINEST = 16  # model steps in a recorded one
+STEPS = 40_000  # model steps of all trajectories together
+ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
+SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
+
+
+@dataclass(frozen=True)
+class Found:
+    """A model of named terms with its fit."""
+
+    terms: NamedTerms
+    config: FitConfig
+    values: dict
+    base: Baseline
+    fit: TrajectoryFit
+    whole: bool  # every trajectory is one segment
+    spread: float  # of q, RMS
+
+    @property
+    def rms(self) -> float:
+        """Misfit of the data, in units of q."""
+        return self.fit.noise
+
+
+class DictionarySearch:
+    """See the head of this module.
+
+    Parameters
+    ----------
+    data
+        What is trained on, without single spikes.
+    base, config
+        The first look at it, and the settings of the fit.
+    outliers
+        Whether Student's t is the loss.
+    """
+
+    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False):
+        self.data, self.base, self.config = data, base, config
+        self.freedom = FREEDOM if outliers else None
+        self.all = candidates(data)
+        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
+        self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
+        self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
+        self.precision = precision(data)
+        self.order = 4 if self.precision < SMOOTH * self.spread else 2
+
+    def run(self) -> Found | None:
+        """The model that the data ask for; None where not even the shortest segments can be followed."""
+        local = local_polynomials(self.data)
+        linear = None if local is None else self._linear(local)
+        if linear is None or local is None:
+            return None
+        terms, values = linear
+        found = self._grown(terms, values, 1, smoothed(self.data, local))
+        if found is None:
+            return None
+        found = self._finer(self._held(found))
+        for _ in range(ADDED):
+            name = self._missing(found)
+            if name is None:
+                break
+            more = self._refit(found, self.all.only((*found.terms.names, name)))
+            if more is None or not more.rms < found.rms:
+                break
+            found = self._finer(self._held(self._longer(more)))
+        return self._pruned(found)
+
+    def _held(self, found: Found) -> Found:
+        """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
+        if not found.terms.dry or found.config.sticking or self.config.sticking is False:
+            return found
+        other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
+        return found if other is None or not other.rms < found.rms else self._longer(other)
+
+    def _linear(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
+        """Terms and values of the linear problem, pruned."""
+        t, u = smooth_triples(self.data, local)
+        rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
+        if len(t) > ROWS:
+            t, u = t.spread_out(ROWS), None if u is None else u[rows]
+        forces = NamedForces(self.all.drag, self.base.speed, u)
+        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
+        columns = self._columns(fit)
+        x = fit.solve(columns)
+        if float(x[0]) == 0:
+            return None
+        x = x / x[0]
+        r = fit.errors(x)
+        if not bool(torch.isfinite(r).all()):
+            return None
+        X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
+        size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
+        overlap = max(1.0, local.width / 2)
+        A = X.T @ X / size / overlap
+        place = self._linear_places(fit, columns)
+        free = torch.tensor([i for own in place.values() for i in own])
+        kept, _ = prune(A, x[columns][1:], free, max(3, int(r.numel() / overlap)))
+        stay = set(kept.tolist())
+        terms = self.all.only([name for name, own in place.items() if stay & set(own)])
+        left = columns.clone()
+        at = columns.nonzero()[1:, 0]
+        for name, own in place.items():
+            if name not in terms.names:
+                left[at[own]] = False
+        start = fit.start(fit.solve(left))
+        if start is None:
+            return None
+        values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
+        for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
+            values |= zip(names, values.pop(parameter, ()), strict=True)
+        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
+        return terms, values
+
+    @property
+    def _still(self) -> list[str]:
+        return [x for x in self.all.features if "v" not in x and x not in self.own]
+
+    @property
+    def _moving(self) -> list[str]:
+        return [x for x in self.all.features if "v" in x]
+
+    def _columns(self, fit: LinearFit) -> Tensor:
+        """All columns for joints; no mass or friction between lengths."""
+        if any(self.data.angles):
+            return torch.ones(len(fit.names), dtype=torch.bool)
+        i, j = pairs(self.data.dof, torch.device("cpu"))
+        diagonal = iter((i == j).tolist())
+        return torch.tensor([next(diagonal) if x == "mass" else x != "coupling.viscous" for x in fit.names])
+
+    def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
+        """Columns of each term among those that are used, the first mass not counted."""
+        names = [x for x, used in zip(fit.names, columns.tolist(), strict=True) if used][1:]
+        at: dict[str, list[int]] = {}
+        for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
+            own = [i for i, x in enumerate(names) if x == parameter]
+            at |= {term: [i] for term, i in zip(terms, own, strict=True)}
+        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
+        at[DRY] = [i for i, x in enumerate(names) if x == DRY]
+        return at
+
+    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
+        config = settings_of(terms, self.data, self.config, self.order, substeps)
+        config = replace(config, sticking=bool(sticking) and terms.dry)
+        base = started(self.base, self.data, values, config)
+        task = Task(self.data, base, config, Stages(False, None, "", resume=False))
+        model = build_model(base, config, "none")
+        return SegmentStages(task, with_sticking(model) if config.sticking else model)
+
+    def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
+        task = stages.task
+        values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
+        whole = fit.problem.grid.segments == len(self.data)
+        base = started(task.base, self.data, values, task.config)
+        return Found(terms, task.config, values, base, fit, whole, self.spread)
+
+    def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
+        """From the shortest segments to the longest that the model follows."""
+        stages = self._stages(terms, values, substeps)
+        sigma = max(min(self.precision, self.spread), self.floor)
+        first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
+        return None if first is None else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
+
+    def _longer(self, found: Found) -> Found:
+        """The same terms over longer segments, where the model follows the data now."""
+        if found.whole:
+            return found
+        stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
+        done = found.fit.problem.grid.longest / found.config.substeps
+        stages.lengths = [0, *(length for length in stages.lengths if length > 1.01 * done)]
+        return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
+
+    def _problem(self, found: Found, terms: NamedTerms, substeps: int) -> tuple[SegmentStages, ShootingProblem]:
+        """The problem with other terms over the same segments."""
+        stages = self._stages(terms, found.values, substeps, found.config.sticking)
+        old, base = found.fit.problem, stages.task.base
+        length = round(old.grid.longest / found.config.substeps)
+        grid = segment_grid(self.data, length, base.model_step)
+        model = stages.model
+        problem = ShootingProblem(
+            model, self.data, grid, sigma=max(found.rms, self.floor), prior=prior_of(model, base, None),
+            freedom=self.freedom,
+        )  # fmt: skip
+        problem.guess_from(old, found.fit.path)
+        problem.patient = False
+        return stages, problem
+
+    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None) -> Found | None:
+        """The fit with other terms or steps, from this one."""
+        stages, problem = self._problem(found, terms, substeps or found.config.substeps)
+        states = found.fit.problem.states_at(found.fit.path, problem.grid.start_sample)
+        fit = stages.optimise(problem, problem.parameters.get(), states, "terms")
+        return None if fit is None else self._found(terms, stages, fit)
+
+    def _missing(self, found: Found) -> str | None:
+        """The term whose absence costs most, where that is more than it may; None where none does."""
+        names = [name for name in self.all.names if name not in found.terms.names]
+        if not names:
+            return None
+        _, problem = self._problem(found, self.all, found.config.substeps)
+        theta = problem.parameters.get()
+        at = places(problem.parameters, self.all)
+        x = problem.pack(theta, found.fit.problem.states_at(found.fit.path, problem.grid.start_sample))
+        cost, A, b = problem.normal_equations(x)
+        if not math.isfinite(float(cost)):
+            return None
+        others = torch.tensor([i for name in names for i in at[name]])
+        absent = torch.zeros(len(x), dtype=torch.bool)
+        absent[others] = True
+        if DRY in names:  # what shapes a force of 0 has no effect yet
+            for shape in ("friction.breakaway", "friction.log"):
+                absent[problem.parameters.index(shape)] = True
+        left, slope = with_inverse_free(A, (~absent).nonzero()[:, 0], others, b)
+        gain = torch.where(left > 1e-9, slope.square() / left.clamp_min(1e-300), 0.0)
+        best = int(gain.argmax())
+        if float(gain[best]) <= math.log(self.data.q.numel()):
+            return None
+        return next(name for name in names if int(others[best]) in at[name])
+
+    def _pruned(self, found: Found) -> Found:
+        """Without the terms that the fit does not lose by."""
+        problem = found.fit.problem
+        at = places(problem.parameters, found.terms)
+        if not at:
+            return found
+        x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])
+        _, A, _ = problem.normal_equations(x)
+        A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
+        free = torch.tensor([i for own in at.values() for i in own])
+        kept, _ = prune(A, x, free, self.data.q.numel())
+        stay = set(kept.tolist())
+        terms = found.terms.only([name for name, own in at.items() if stay & set(own)])
+        if terms == found.terms:
+            return found
+        less = self._refit(found, terms)
+        allowed = (1 + len(at) * math.log(self.data.q.numel()) / self.data.q.numel()) ** 0.5
+        return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+
+    def _finer(self, found: Found) -> Found:
+        """With as many model steps in a recorded one as the misfit asks for."""
+        while True:
+            m = found.config.substeps
+            if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
+                return found
+            if self._change(found, 2 * m) <= max(FINER * found.rms, self.floor):
+                return found
+            other = self._refit(found, found.terms, 2 * m)
+            if other is None or not other.rms < LOWER * found.rms:
+                return found  # other values of the parameters make up for the longer steps
+            found = self._longer(other)
+
+    def _change(self, found: Found, substeps: int) -> float:
+        """RMS change of the fitted motion by so many model steps in a recorded one."""
+        _, problem = self._problem(found, found.terms, substeps)
+        fit = found.fit
+        states = fit.problem.states_at(fit.path, problem.grid.start_sample)
+        path = problem.solve(problem.pack(fit.theta, states))
+        if path is None:
+            return math.inf
+        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
+        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
+        return float(change.square().mean().sqrt())

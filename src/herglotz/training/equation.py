@@ -1,0 +1,314 @@
+"""The learned equation of motion in words: the named terms of a model with their numbers, units and deviations.
+
+With masses that do not depend on position there is one line a coordinate, m ẍ = forces, in units in which the first
+mass is 1. Other models are printed as L = K − V with the forces beside it. A network is no formula: the equation says
+how large its force is.
+"""
+
+from __future__ import annotations
+
+import math
+import textwrap
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.models.drag import parse_drag
+from herglotz.models.feature_grammar import Product
+from herglotz.models.features import expand, parse
+from herglotz.models.jet import coordinates
+
+
+class Run(Protocol):
+    """What an equation is read off: `herglotz.training.Run`."""
+
+    @property
+    def model(self) -> ContactLagrangian:
+        """The trained model."""
+        ...
+
+    @property
+    def data(self) -> Trajectories:
+        """With the names and units of the coordinates."""
+        ...
+
+
+WIDTH = 78  # two blanks stand before each line on screen
+RELATIVE = 1e-12  # smaller deviations are rounding
+_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
+
+
+@dataclass(frozen=True)
+class Term:
+    """value · what, on the right-hand side of the equation of one coordinate."""
+
+    left: str  # x″, or L
+    what: str  # x³; empty: a constant
+    value: float
+    deviation: float | None  # standard deviation; None: it was not computed
+    unit: str
+
+    @property
+    def shown(self) -> bool:
+        """Whether the data tell the value from 0: it is beyond two standard deviations, or these are not known."""
+        return self.deviation is None or abs(self.value) > 2 * self.deviation
+
+    def __str__(self) -> str:
+        sign = "−" if self.value < 0 else "+"
+        return f"{sign} {_number(abs(self.value), self.deviation)} {self.what}".rstrip()
+
+
+@dataclass(frozen=True)
+class Equation:
+    """The learned equation; `str` gives lines of at most 80 columns, without terms that the data do not tell from 0."""
+
+    terms: tuple[Term, ...]
+    lefts: tuple[str, ...]  # what stands on the left of each line, with its mass
+    units: str  # "x in m, t in s"
+    network: str | None  # what a network adds, in words
+
+    def __str__(self) -> str:
+        lines = []
+        for left in self.lefts:
+            own = [str(term) for term in self.terms if term.left == left and term.shown]
+            right = " ".join(own) or "0"
+            right = right.removeprefix("+ ").replace("− ", "−", 1) if right.startswith(("+", "−")) else right
+            lines += textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
+        if self.network:
+            lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
+        return "\n".join([*lines, *textwrap.wrap(f"with {self.units}", WIDTH)])
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON: the terms, and the same as text."""
+        terms = [asdict(term) for term in self.terms]
+        rest = {"lefts": list(self.lefts), "units": self.units, "network": self.network}
+        return {"text": str(self), "terms": terms, **rest}
+
+    @classmethod
+    def from_dict(cls, values: dict[str, Any]) -> Equation:
+        """Inverse of `as_dict`."""
+        terms = tuple(Term(**term) for term in values["terms"])
+        return cls(terms, tuple(values["lefts"]), values["units"], values["network"])
+
+
+def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
+    """The equation of a run's model, in the data's units; the first mass is 1.
+
+    Parameters
+    ----------
+    run
+        A finished fit.
+    covariance
+        (P, P) of the parameters in the model's order (`herglotz.training.laplace`), for standard deviations.
+    """
+    spread, first, at = covariance, {}, 0
+    for name, parameter in run.model.named_parameters():
+        first[name] = at
+        at += parameter.numel()
+    terms = []
+    for left, what, unit, parts in _parts(run):
+        value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
+        deviation = None
+        if spread is not None:
+            w = spread.new_zeros(len(spread))
+            for name, i, by in parts:
+                w[first[name] + i] += by
+            deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
+        if value != 0.0:
+            terms.append(Term(left, what, value, deviation, unit))
+    data = run.data
+    units = [f"{name} in {unit}" for name, unit in zip(data.names, data.units, strict=True) if unit != "1"]
+    units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
+    return Equation(tuple(terms), tuple(_lefts(run)), ", ".join(units) or "plain numbers", network_of(run))
+
+
+Part = tuple[str, int, float]  # parameter, entry, factor
+
+
+def _lefts(run: Run) -> list[str]:
+    if not _newtonian(run.model):
+        return ["L", *(f"force on {name}" for name in run.data.names)]
+    kinetic, names = run.model.kinetic, run.data.names
+    mass = kinetic.mass().detach().diagonal().tolist()  # type: ignore[operator]
+    return [f"{name}″" if i == 0 else f"{mass[i]:.4g} {name}″" for i, name in enumerate(names)]
+
+
+def _newtonian(model: ContactLagrangian) -> bool:
+    """Whether every coordinate has an equation of its own: one mass each."""
+    made_of, config = model.capabilities, model.config
+    return made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
+
+
+def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
+    """Left side, text, unit and parameters of each term."""
+    data, config = run.data, run.model.config
+    lefts, newton = _lefts(run), _newtonian(run.model)
+    for i, (name, unit) in enumerate(zip(data.names, data.units, strict=True)):
+        left = lefts[i] if newton else lefts[i + 1]
+        yield from _friction(run, left, i, name, unit, newton)
+    named = dict(run.model.named_parameters())
+    n = config.dof
+    for i, (name, angle) in enumerate(zip(data.names, data.angles, strict=True)):
+        if "potential.stiffness" in named:
+            at = [("potential.stiffness", i, 1.0), ("potential.tilt", i, 1.0)]
+        elif config.order == 4 and not config.alike:  # −k, b of an angle; k/2, b of a length
+            coefficient = "potential.features.sum.coefficient"
+            at = [(coefficient, 2 * i, -1.0 if angle else 2.0), (coefficient, 2 * i + 1, 1.0)]
+        else:
+            continue
+        for (parameter, entry, by), power in zip(at, (2, 1), strict=True):
+            yield _baseline(run, lefts, newton, i, name, angle, power, (parameter, entry, by))
+    texts = expand(config.features, config.angles)
+    offset = 2 * n if config.order == 4 and not config.alike else 0
+    still = [text for text in texts if not parse(text, config.angles)[0].velocities]
+    moving = [text for text in texts if text not in still]
+    for g, text in enumerate(still):
+        yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
+    for g, text in enumerate(moving):
+        yield "L", _named(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
+
+
+def _friction(
+    run: Run, left: str, i: int, name: str, unit: str, newton: bool
+) -> Iterator[tuple[str, str, str, list[Part]]]:
+    config, named, time = run.model.config, dict(run.model.named_parameters()), run.data.time_unit
+    parts = [("damping.rate", 0, -1.0)] if "damping.rate" in named and (newton and i == 0) else []
+    parts += [("friction.viscous", i, -1.0)] if "friction.viscous" in named else []
+    if parts:
+        yield left, f"{name}′", _unit(unit, 0, time, 1), parts
+    for g, text in enumerate(config.drag):
+        f = parse_drag(text, config.angles)
+        if f.on == i:
+            of = [_raised(run.data.names[f.at], f.a)] if f.a else []
+            of += [f"|{name}′|"] if f.b else []
+            of += [_raised(f"{name}′", f.c)] if f.c else []
+            powers = 1 - f.a - f.b - f.c
+            yield left, " ".join(of), _unit(unit, powers, time, 2 - f.b - f.c), [("drag.coefficient", g, -1.0)]
+    if config.coulomb:
+        yield left, f"sgn({name}′)", _unit(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
+        friction = run.model.friction
+        assert friction is not None  # dry friction is part of it
+        width = (friction.sharpest + friction.log_stribeck.exp()).detach()
+        shape = f"exp(−({name}′/{float(width[i]):.3g})²) sgn({name}′)"
+        yield left, shape, _unit(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
+    if "friction.input_map" in named:
+        for j in range(config.inputs):
+            at = i * config.inputs + j
+            what = "u" if config.inputs == 1 else f"u{j + 1}"
+            yield left, f"({what} − {_zero(run, j)})", "", [("friction.input_map", at, 1.0)]
+
+
+def _zero(run: Run, j: int) -> str:
+    friction = run.model.friction
+    zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
+    return f"{zero:.3g}"
+
+
+def _baseline(
+    run: Run, lefts: list[str], newton: bool, i: int, name: str, angle: bool, power: int, part: Part
+) -> tuple[str, str, str, list[Part]]:
+    """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
+    unit, time = run.data.units[i], run.data.time_unit
+    parameter, entry, by = part
+    if newton:
+        what = (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else "")
+        size = _unit(unit, 1 if angle else 2 - power, time, 2)
+        return lefts[i], what, size, [(parameter, entry, -by)]
+    what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else _raised(name, power)
+    factor = (by if power == 2 else -by) if angle else (-by / 2 if power == 2 else -by)
+    return "L", what, "", [(parameter, entry, factor)]
+
+
+def _feature(
+    run: Run, lefts: list[str], newton: bool, text: str, at: tuple[str, int]
+) -> Iterator[tuple[str, str, str, list[Part]]]:
+    """A feature of the potential: its force on each coordinate, or its part of L."""
+    names, units, time = run.data.names, run.data.units, run.data.time_unit
+    if not newton:
+        yield "L", _named(text, names), "", [(*at, -1.0)]
+        return
+    for i in range(len(names)):
+        for product in parse(text, run.model.config.angles):
+            if product.function == "radius" or product.form[i]:
+                what, by, power = _slope(product, i, names)
+                yield lefts[i], what, _unit(units[i], power, time, 2), [(*at, -by)]
+
+
+def _slope(p: Product, i: int, names) -> tuple[str, float, int]:
+    """∂/∂q_i of a product without velocities: its text, its factor, and the power of length in the unit of a force."""
+    if p.function == "radius":
+        return f"{_raised('r', p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
+    form, w = _form(p.form, names), p.form[i]
+    if p.function == "power":
+        inner = form if sum(1 for x in p.form if x) == 1 else f"({form})"
+        return (_raised(inner, p.power - 1) if p.power > 1 else ""), p.factor * p.power * w, 2 - p.power
+    return (f"sin({form})", -p.factor * w, 1) if p.function == "cos" else (f"cos({form})", p.factor * w, 1)
+
+
+def _form(form: tuple[float, ...], names) -> str:
+    parts = [(w, name) for w, name in zip(form, names, strict=True) if w]
+    text = " ".join(f"{'−' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for w, name in parts)
+    return text.removeprefix("+ ")
+
+
+def _named(text: str, names) -> str:
+    """A feature's text with the names of the coordinates."""
+    for i, name in reversed(list(enumerate(names, 1))):
+        text = text.replace(f"1q{i}", f"q{i}").replace(f"q{i}", name).replace(f"v{i}", f"{name}′")
+    return text.replace("-", "−").replace("*", " ")
+
+
+def _raised(base: str, power: int) -> str:
+    return base if power == 1 else "" if power == 0 else base + str(power).translate(_RAISED)
+
+
+def _unit(unit: str, power: int, time: str, per: int) -> str:
+    """Power of the coordinate's unit over a power of the unit of time."""
+    top = "" if unit == "1" else _raised(unit, power)
+    bottom = "" if time == "1" or not per else f"{time}{str(per).translate(_RAISED) if per > 1 else ''}"
+    return (f"{top or '1'}/{bottom}" if bottom else top) or "1"
+
+
+def _number(value: float, deviation: float | None) -> str:
+    """A value with its standard deviation in units of its last digit: 25.0(3)."""
+    if deviation is None or not math.isfinite(deviation) or deviation <= RELATIVE * value:
+        return f"{value:.4g}"
+    digits = -math.floor(math.log10(deviation))
+    last = round(deviation * 10.0**digits)
+    digits, last = (digits + 1, round(deviation * 10.0 ** (digits + 1))) if last == 1 else (digits, last)
+    if digits > 12 or digits < -6:
+        return f"{value:.6g} ± {deviation:.1g}"
+    return (
+        f"{value:.{digits}f}({last})" if digits > 0 else f"{round(value, digits):.0f}({round(deviation, digits):.0f})"
+    )
+
+
+def network_of(run: Run) -> str | None:
+    """What networks add, in words; None without."""
+    model, config = run.model, run.model.config
+    parts = []
+    if not config.baseline:
+        return "nothing: a network is the whole of L_d"
+    if model.potential.network is not None:
+        rows = run.data.q.to(next(model.parameters()))
+        with torch.no_grad():
+            own = model.potential.departure(coordinates(rows, 1))
+            whole = model.potential(rows, 1)
+        assert own is not None
+        parts.append(f"a network in the potential, {_share(own.gradient, whole.gradient)} of the conservative force")
+    if model.correction is not None:
+        parts.append("a network that corrects the rule at this step")
+    if config.mass_width:
+        parts.append("a network in the mass")
+    if config.level in ("affine", "full"):
+        parts.append(f"damping of the level '{config.level}', which depends on the state")
+    return ", ".join(parts) or None
+
+
+def _share(part: Tensor, whole: Tensor) -> str:
+    return f"{100 * float((part.square().mean() / whole.square().mean()).sqrt()):.2g} %"

@@ -1,0 +1,157 @@
+"""The terms that a model may be made of by name, and their values by name while terms come and go."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models.features import lengths, revolute
+from herglotz.training.baseline import JITTER, Baseline
+from herglotz.training.config import FitConfig
+from herglotz.training.parameter_vector import ParameterVector
+
+HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
+WAVES = 3  # highest harmonic of one angle
+STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
+DRY = "friction.coulomb"
+
+
+@dataclass(frozen=True)
+class NamedTerms:
+    """Terms of L and of the forces beside masses, stiffness, tilt and viscous friction."""
+
+    features: tuple[str, ...] = ()
+    drag: tuple[str, ...] = ()
+    dry: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All of them, each once."""
+        return (*self.features, *self.drag, *((DRY,) if self.dry else ()))
+
+    def only(self, names: Sequence[str]) -> NamedTerms:
+        """Those of them that are among `names`."""
+        return NamedTerms(
+            tuple(x for x in self.features if x in names), tuple(x for x in self.drag if x in names),
+            self.dry and DRY in names,
+        )  # fmt: skip
+
+
+def candidates(data: Trajectories) -> NamedTerms:
+    """The terms that these coordinates are tried with."""
+    angles, n = data.angles, data.dof
+    if n == 1:
+        waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
+        powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
+        features = [*own_terms(angles[0]), *(waves if angles[0] else powers)]
+    else:
+        features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r")]
+        if any(angles):
+            features += [f"q{i + 1}^{k}" for k in (3, 4) for i, angle in enumerate(angles) if not angle]
+    drag = []
+    for i, angle in enumerate(angles, 1):
+        drag += [f"|v{i}| v{i}", f"load {i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
+    return NamedTerms(tuple(features), tuple(drag), True)
+
+
+def own_terms(angle: bool) -> dict[str, tuple[str, float]]:
+    """The baseline's terms of one coordinate as features: the parameter of each, and its factor."""
+    if angle:
+        return {"cos(q1)": ("potential.stiffness", -1.0), "sin(q1)": ("potential.tilt", 1.0)}
+    return {"q1^2": ("potential.stiffness", 0.5), "q1": ("potential.tilt", 1.0)}
+
+
+def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
+    """The settings of a model that is made of these terms."""
+    driven = data.u is not None and config.use_inputs
+    forced = bool(terms.drag) or terms.dry or driven or data.dof > 1
+    lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
+    return replace(
+        config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
+        diagonal=lengths and data.dof > 1, coupled=not lengths and data.dof > 1, order=order, substeps=substeps,
+        objective="trajectory", alike=data.dof == 1 and (still or order == 2),  # the potential holds features alone
+    )  # fmt: skip
+
+
+def started(
+    base: Baseline, data: Trajectories, values: Mapping[str, float | tuple[float, ...]], of: FitConfig
+) -> Baseline:
+    """The baseline with these values as starts, for a model of these settings."""
+    rest: dict[str, tuple[float, ...]] = {
+        name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")
+    }
+    rate = float(rest.pop("damping.rate", (0.0,))[0])
+    moving = [name for name in of.features if "v" in name]
+    still = [name for name in of.features if "v" not in name]
+    for parameter, names in ((STILL, still), (MOVING, moving), (DRAG, of.drag)):
+        if names:
+            rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
+    if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
+        rate += float(rest.pop("friction.viscous", (0.0,))[0])
+    known = _parameters(of, bool(moving))
+    rest = {name: x for name, x in ((known(name), x) for name, x in rest.items()) if name and x}
+    zero = (0.0,) * data.dof
+    stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
+    assert isinstance(stiffness, tuple)
+    assert isinstance(tilt, tuple)
+    step = base.max_step if of.substeps == 1 else JITTER * data.typical_step / of.substeps
+    return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
+
+
+def _parameters(of: FitConfig, moving: bool):
+    """The name that a parameter has in a model of these settings; "" where it has none."""
+
+    def name_in(name: str) -> str:
+        if name.startswith("kinetic.") and name != MOVING:
+            name = name.replace("kinetic.base.", "kinetic.")
+            if of.diagonal and name == "kinetic.off_diagonal":
+                return ""
+            return name.replace("kinetic.", "kinetic.base.") if moving else name
+        if name.startswith("friction."):
+            dry = name.removeprefix("friction.") in ("coulomb", "breakaway", "log_smooth", "log_stribeck")
+            gone = of.level != "forced" or (dry and not of.coulomb) or (of.sticking and name == "friction.log_smooth")
+            return "" if gone else name
+        return "" if name == "coupling.viscous" and not of.coupled else name
+
+    return name_in
+
+
+def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles: Sequence[bool]):
+    """Values by the name of a term or, as a tuple, of a parameter."""
+    named = {name: tuple(x.reshape(-1).tolist()) for name, x in parameters.unflatten(theta).items()}
+    values: dict[str, float | tuple[float, ...]] = {}
+    still, n = named.pop(STILL, ()), len(angles)
+    if of.order == 4 and not of.alike:  # −k, b of each angle; k/2, b of the others
+        own, still = still[: 2 * n], still[2 * n :]
+        turn = [-1.0 if angle else 2.0 for angle in angles]
+        values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
+        values["potential.tilt"] = own[1::2]
+    values |= zip([x for x in of.features if "v" not in x], still, strict=True)
+    values |= zip([x for x in of.features if "v" in x], named.pop(MOVING, ()), strict=True)
+    values |= zip(of.drag, named.pop(DRAG, ()), strict=True)
+    return values | named
+
+
+def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
+    """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
+    config = parameters.model.config
+    still = parameters.index(STILL)[2 * config.dof if config.order == 4 and not config.alike else 0 :].tolist()
+    at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
+    at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
+    at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)
+    if terms.dry:
+        at[DRY] = parameters.index(DRY).tolist()
+    return at
+
+
+def with_inverse_free(A: Tensor, free: Tensor, others: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    """Diagonal of the Schur complement and gradient of `others` where the `free` unknowns follow them."""
+    scale = A.diagonal().clamp_min(1e-300).sqrt()
+    S, y = A / scale[:, None] / scale, b / scale
+    C = torch.linalg.pinv(S[free][:, free], hermitian=True) @ S[free][:, others]
+    left = S[others, others] - (S[free][:, others] * C).sum(0)
+    return left, y[others] - C.T @ y[free]

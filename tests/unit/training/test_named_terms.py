@@ -1,0 +1,89 @@
+"""The terms that recordings of one coordinate need, found with nothing told, and the equation that is printed."""
+
+import json
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.data.smoothing import local_polynomials, smooth_triples
+from herglotz.errors import InputError
+from herglotz.models.drag import parse_drag
+from herglotz.scenes import scene
+from herglotz.training import fit
+from herglotz.training.equation import Equation
+from herglotz.training.solvers.lifted_newton import linear_recurrence
+
+
+@pytest.fixture(scope="module")
+def duffing():
+    data = simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=0.003, seed=0)
+    return fit(data, progress=False)
+
+
+def test_duffing_is_found_from_one_noisy_recording(duffing):
+    # fails if the dictionary, its linear start, the terms that join or leave, or the plan that follows them are broken
+    plan = duffing.metrics["plan"]
+    assert set(plan["features"]) == {"q1^2", "q1^4"}
+    assert plan["drag"] == ()
+    assert plan["network"] == "none"
+    assert duffing.metrics["train_rms"] < 1.2 * 0.003
+    assert duffing.metrics["extrapolation_rms"] < 1.5 * 0.003
+
+
+def test_the_equation_is_printed_with_deviations(duffing):
+    # fails if a sign, a factor of a derivative, a unit or a covariance is wrong: 4 deviations are 6e-5 of chance
+    terms = {term.what: term for term in duffing.equation().terms}
+    for what, value, unit in (("x′", -0.15, "1/s"), ("x", -1.0, "1/s²"), ("x³", -25.0, "m⁻²/s²")):
+        assert abs(terms[what].value - value) < 4 * terms[what].deviation
+        assert terms[what].deviation < 0.1 * abs(value)
+        assert terms[what].unit == unit
+    text = str(duffing.equation())
+    assert text.startswith("x″ = −0.1")
+    assert max(map(len, text.splitlines())) <= 78
+    stored = json.loads(json.dumps(duffing.metrics["equation"]))
+    assert str(Equation.from_dict(stored)) == text
+
+
+@pytest.mark.slow  # 8 s
+def test_van_der_pol_is_found_with_its_negative_damping():
+    # fails if forces of position and velocity are no candidates, or dry friction is taken for them
+    run = fit(simulate(scene("van_der_pol"), trajectories=1, steps=400, h=0.1, noise=0.01, seed=0), progress=False)
+    assert run.metrics["plan"]["drag"] == ("q1^2 v1",)
+    assert run.metrics["extrapolation_rms"] < 1.5 * 0.01
+
+
+@pytest.mark.parametrize(("noise", "worst"), [(0.0, 2e-3), (0.001, 0.1)])
+def test_local_polynomials_read_accelerations(noise, worst):
+    # fails if the width ignores noise or motion, or a window is not centred; measured 1e-3 and 0.04 of their size
+    data = simulate(scene("duffing"), trajectories=2, steps=200, h=0.05, noise=noise, seed=1)
+    local = local_polynomials(data)
+    assert local is not None
+    t, _ = smooth_triples(data, local)
+    a, v = (t.q2 - 2 * t.q1 + t.q0) / t.h0[:, None] ** 2, (t.q2 - t.q0) / (2 * t.h0[:, None])
+    error = a + 0.15 * v + t.q1 + 25 * t.q1**3
+    assert float(error.square().mean().sqrt()) < worst * float(a.square().mean().sqrt())
+
+
+@pytest.mark.parametrize("K", [1, 2, 7, 50])
+def test_a_recurrence_in_blocks_is_the_recurrence(K):
+    # fails if a block starts from the wrong state, or padding reaches the result
+    make = torch.Generator().manual_seed(0)
+    A, B, z = (torch.randn(*s, generator=make, dtype=torch.float64) for s in ((3, K, 2, 2), (3, K, 2, 4), (3, 2, 4)))
+    A, found = A / 2, linear_recurrence(A / 2, B, z)
+    assert found.shape == (3, K + 1, 2, 4)
+    for k in range(K):
+        assert torch.allclose(found[:, k], z, rtol=1e-12, atol=1e-12)
+        z = A[:, k] @ z + B[:, k]
+    assert torch.allclose(found[:, K], z, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [("q1 q1", "write"), ("|v2| v1", "speed of one joint"), ("v3", "numbered 1 … 2"), ("q1^2 v2", "not periodic"),
+     ("v1^10", "from 1 to 9")],
+)  # fmt: skip
+def test_wrong_drag_is_an_input_error(text, says):
+    # fails if a text is read as another force
+    with pytest.raises(InputError, match=says):
+        parse_drag(text, (True, False))
