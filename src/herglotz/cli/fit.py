@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 # Copies, so that help does not import PyTorch; a test compares them.
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
+HOLDS = ("zero", "first", "smooth")
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")
@@ -62,9 +64,12 @@ def _model_flags(parser: argparse._ArgumentGroup) -> None:
         help="of the rule; 4: from the features alone, without networks (default %(default)s)",
     )  # fmt: skip
     parser.add_argument(
-        "--sticking", action="store_true",
-        help="dry friction that can hold a joint still: axes without a spring (forced; stepped by PyTorch alone)",
+        "--sticking", action=argparse.BooleanOptionalAction, default=None,
+        help="dry friction that can hold a joint still (forced); default: where driven data show it",
     )  # fmt: skip
+    parser.add_argument(
+        "--term", action="append", default=[], metavar="NAME", help="a term of herglotz.models.TERMS; may be repeated"
+    )
     parser.add_argument("--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     parser.add_argument("--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     parser.add_argument("--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
@@ -136,6 +141,11 @@ def _expert_flags(parser: argparse._ArgumentGroup) -> None:
         "--input-map", type=finite, nargs="+", default=(), metavar="G",
         help="the map from inputs to forces, row by row, where it is known (default: learned); the first mass is 1",
     )  # fmt: skip
+    parser.add_argument(
+        "--hold", choices=HOLDS,
+        help="what the inputs do between samples: nothing, straight lines, or cubics (default: what the file says, or "
+        "what explains the data best)",
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -151,11 +161,13 @@ def run(arguments: argparse.Namespace) -> int:
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device,
         robust=arguments.robust, supervision=arguments.supervision, restarts=arguments.restarts, batch=arguments.batch,
         use_inputs=not arguments.ignore_inputs, input_map=tuple(arguments.input_map),
-        features=tuple(arguments.feature), known=tuple(arguments.known), alike=arguments.alike,
-        diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
-        substeps=arguments.substeps, iterations=arguments.iterations, departures=tuple(arguments.departures),
+        features=tuple(arguments.feature), known=tuple(arguments.known), terms=tuple(arguments.term),
+        alike=arguments.alike, diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking,
+        order=arguments.order, substeps=arguments.substeps, iterations=arguments.iterations,
+        departures=tuple(arguments.departures),
     )  # fmt: skip
-    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments)).thinned(arguments.every)
+    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
+    data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     made = _make(out)
     try:
         save_run(fit(data, config, out=out, resume=arguments.resume, progress=progress(arguments.quiet)), out)

@@ -19,6 +19,7 @@ import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.cli.parser import build_parser
 from herglotz.data import load
+from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
 from herglotz.plots.style import FORMATS
 from herglotz.scenes import scene_names
@@ -67,7 +68,8 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit, flags = herglotz.cli.fit, herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION, FitConfig().departures) == (fit.ROBUST, fit.SUPERVISION, fit.DEPARTURES)
+    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
+    assert FitConfig().departures == fit.DEPARTURES
     assert build_parser().parse_args(["fit", "a", "--out", "b"]).iterations == FitConfig().iterations
     assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
@@ -118,9 +120,9 @@ def test_fit_says_what_it_found(tmp_path, capsys):
 def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped, or resume fits again
     folder = tmp_path / "run"
     arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
-    arguments += ["--objective", "trajectory", "--level", "affine"]
+    arguments += ["--objective", "trajectory", "--level", "conservative"]  # the cheapest that is no default
     code, found = run_json(capsys, *arguments)
-    assert (found["level"], found["objective"]) == ("affine", "trajectory")
+    assert (found["level"], found["objective"]) == ("conservative", "trajectory")
     assert code == (3 if found["verdict"].startswith("does not fit") else 0)  # rounding decides, in float32
     run = load_run(folder)
     assert next(run.model.parameters()).dtype == torch.float32
