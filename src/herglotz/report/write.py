@@ -107,8 +107,8 @@ def _posterior(run: Run) -> Laplace | str:
 
 
 def _equation(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
-    equation = run.metrics.get("equation")
-    blocks: list[Block] = [Code(equation if isinstance(equation, str) else str(equation))] if equation else []
+    equation = getattr(run, "equation", None)
+    blocks: list[Block] = [] if equation is None else [Code(str(equation()))]
     blocks.append("The first coordinate's mass is 1: positions alone do not fix the unit of force.")
     if isinstance(posterior, str):
         return (*blocks, posterior, Picture(plot_learned(run), "Potential and force of the model."))
