@@ -75,6 +75,8 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(numbers)
     else:
         _report(numbers, folder / "bands.png")
+        if str(result.metrics.get("verdict", "")).startswith("does not fit"):
+            print(f"Warning: the run {result.metrics['verdict']}; the numbers above say nothing of the system")
     return 0
 
 
@@ -104,8 +106,6 @@ def _report(numbers: dict[str, Any], figure: Path) -> None:
     worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
     rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
     print_table(rows)
-    if str(result.metrics.get("verdict", "")).startswith("does not fit"):
-        print(f"Warning: the run {result.metrics['verdict']}; the numbers above say nothing of the system")
     if numbers["traded"]:
         print("What these data cannot tell apart (record other motions, or give one of them):")
         for trade in numbers["traded"]:
