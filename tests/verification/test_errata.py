@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import contact_defect, flow_derivative
+from herglotz.plots import parachute_motion
 from herglotz.scenes import PrintedParachute, scene
 from herglotz.scenes.printed_parachute import MAP_START
 from herglotz.theory import contact_vector_field
@@ -134,9 +135,9 @@ def landing_reference():
 def test_the_landing_to_fifteen_digits():
     # fails if the closed form takes the other root, or the flow another velocity
     time, speed = landing_reference()
-    x = parachute.start()
+    x = parachute_motion.start()
     v0 = float(scene("parachute").velocity(*x))
-    for t, v in (parachute.landing(100.0, v0), parachute.landing_by_root(x, time)):
+    for t, v in (parachute_motion.landing(100.0, v0), parachute_motion.landing_by_root(x, time)):
         assert abs(t / time - 1) < 1e-15
         assert abs(v / speed - 1) < 1e-15
 
