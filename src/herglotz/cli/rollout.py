@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.cli.flags import add_trust_flag
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--inputs", type=Path, metavar="FILE",
         help="recorded motion whose inputs u drive the model: its first K samples, at their own steps unless --h",
     )  # fmt: skip
+    add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as JSON")
     parser.set_defaults(run=run)
 
@@ -89,7 +91,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import Trajectories, save
 
-    source = read_source(arguments.source, arguments.trajectory)
+    source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
     u, h = _inputs(arguments, source, start.q.dtype)
     began = time.perf_counter()
@@ -129,7 +131,7 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def read_source(path: Path, trajectory: int) -> Source:
+def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
     """Read a run or an exported model, to be stepped.
 
     Raises
@@ -154,7 +156,7 @@ def read_source(path: Path, trajectory: int) -> Source:
 
     from herglotz.export import load_exported
 
-    stepper = load_exported(path)
+    stepper = load_exported(path, trust_code=trust_code)
     m, n = stepper.metadata, stepper.dof
     stored = m.get("start")
     start = stored and State(*(torch.tensor(stored[name], dtype=stepper.dtype) for name in "qps"))

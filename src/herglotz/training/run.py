@@ -1,27 +1,19 @@
-"""A finished fit, in memory and on disk."""
+"""A finished fit, in memory."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
-from io import BytesIO
-from pathlib import Path
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories, read_npz, write_npz
-from herglotz.data.files import write_atomically
+from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
-from herglotz.errors import InputError
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.predict import Prediction, predict
-
-FORMAT = 1
 
 
 @dataclass(frozen=True)
@@ -78,69 +70,6 @@ class Run:
     def predict(self, data: Trajectories, **settings: Any) -> Prediction:
         """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
         return predict(self, data, **settings)
-
-
-def save_run(run: Run, folder: str | Path) -> None:
-    """Write model.pt, config.json, metrics.json and fit.npz into a folder; each file whole or not at all."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_npz(folder / "fit.npz", run.data)
-    model = {
-        "format": FORMAT,
-        "model": run.model.config.to_dict(),
-        "parameters": {k: v.detach().cpu() for k, v in run.model.state_dict().items()},
-        "states": {k: v.detach().cpu() for k, v in run.states._asdict().items()},
-        "train_lengths": list(run.train_lengths),
-        "h": run.h,
-        "box": run.box,
-        "history": run.history,
-        "data_digest": run.data.digest(),
-    }
-    buffer = BytesIO()
-    torch.save(model, buffer)
-    write_atomically(folder / "model.pt", buffer.getvalue())
-    for name, values in (("config.json", run.config.to_dict()), ("metrics.json", run.metrics)):
-        write_atomically(folder / name, (json.dumps(values, indent=2, allow_nan=False) + "\n").encode())
-
-
-def load_run(folder: str | Path) -> Run:
-    """Read what `save_run` wrote.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged or of another format.
-    """
-    folder = Path(folder)
-    if not (folder / "model.pt").is_file():
-        raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
-    try:
-        stored = torch.load(folder / "model.pt", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise InputError(f"{folder / 'model.pt'}: cannot be read ({type(error).__name__}); fit again") from None
-    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        raise InputError(f"{folder / 'model.pt'}: not a herglotz model of format {FORMAT}; fit again")
-    config = FitConfig.from_dict({**_json(folder / "config.json"), "device": "cpu"})
-    model = ContactLagrangian(ModelConfig.from_dict(stored["model"])).to(config.torch_dtype)
-    model.load_state_dict(stored["parameters"])
-    return Run(
-        model,
-        config,
-        _json(folder / "metrics.json"),
-        read_npz(folder / "fit.npz"),
-        tuple(stored["train_lengths"]),
-        State(**stored["states"]),
-        stored["h"],
-        stored["box"],
-        stored["history"],
-    )
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); fit again") from None
 
 
 def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:

@@ -95,7 +95,9 @@ def verify(
     behind = replace(known, L_d=model) if known.forced else known
     force = _forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
+    missing: tuple[str, ...] = ()
     if known.forced and force is None:
+        missing = ("contact", "momentum")
         checks[-1] = replace(checks[-1], note=f"{checks[-1].note}. {FORCED}")
     elif force is None:
         checks.append(contact(w, strict))
@@ -122,7 +124,7 @@ def verify(
         more, numbers = data_checks(known.run)
         checks += more
         details["data"] = numbers
-    return Report(known.name, tuple(checks), details)
+    return Report(known.name, tuple(checks), details, missing)
 
 
 def _forces(known: Subject, w: SampledRollout) -> Forces | None:

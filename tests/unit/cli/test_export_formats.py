@@ -8,6 +8,7 @@ import torch
 
 from herglotz.cli import main
 from herglotz.data import load
+from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
 
@@ -62,10 +63,9 @@ def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys
     # user is not told
     monkeypatch.chdir(tmp_path)
     few = ["verify", str(tiny_onnx), "--samples", "4", "--steps", "2"]
-    shutil.copytree(tiny_run, tmp_path / "runs" / "one")
-    stored = torch.load(tmp_path / "runs/one/model.pt", weights_only=True)
-    stored["parameters"] = {key: 2 * value for key, value in stored["parameters"].items()}
-    torch.save(stored, tmp_path / "runs/one/model.pt")
+    other = load_run(tiny_run)
+    other.model.load_state_dict({key: 2 * value for key, value in other.model.state_dict().items()})
+    save_run(other, tmp_path / "runs" / "one")
     assert main(few) == 0
     assert "not compared with its model" in capsys.readouterr().out
     shutil.copytree(tiny_run, tmp_path / "runs" / "two")
