@@ -15,6 +15,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import herglotz
+from herglotz.cli.interrupts import orderly
 from herglotz.cli.parser import build_parser
 from herglotz.errors import InputError
 
@@ -38,8 +39,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     # was measured). PyTorch reads the variable when it is imported; a value that the user has set stays.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
-        arguments = build_parser().parse_args(argv)
-        return int(arguments.run(arguments) or OK)
+        with orderly():
+            arguments = build_parser().parse_args(argv)
+            return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
         return stop.code if isinstance(stop.code, int) else OK
     except KeyboardInterrupt as interrupt:

@@ -118,6 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_run_folder(out, arguments.resume)
 
     from herglotz.data import load
+    from herglotz.data.lock import locked
     from herglotz.training import FitConfig, fit, load_run, save_run
 
     config = FitConfig(
@@ -132,7 +133,8 @@ def run(arguments: argparse.Namespace) -> int:
     data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
     made = _make(out)
     try:
-        save_run(fit(data, config, out=out, resume=arguments.resume), out)
+        with locked(out):
+            save_run(fit(data, config, out=out, resume=arguments.resume), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():
             raise KeyboardInterrupt("; the same command with --resume goes on") from None

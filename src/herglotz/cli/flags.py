@@ -34,6 +34,11 @@ def add_machine_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
 
 
+def add_force_flag(parser: argparse.ArgumentParser) -> None:
+    """Add --force."""
+    parser.add_argument("--force", action="store_true", help="overwrite the file that --out names")
+
+
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
     """Add --trust-code."""
     parser.add_argument(

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
-from herglotz.cli.flags import add_trust_flag
+from herglotz.cli.flags import add_force_flag, add_trust_flag
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--inputs", type=Path, metavar="FILE",
         help="recorded motion whose inputs u drive the model: its first K samples, at their own steps unless --h",
     )  # fmt: skip
+    add_force_flag(parser)
     add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as JSON")
     parser.set_defaults(run=run)
@@ -81,7 +82,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the model, step it, write the motion."""
-    check_output_file(arguments.out, (".csv", ".npz"))
+    check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     if arguments.steps < 2:
         raise InputError(f"--steps must be at least 2, got {arguments.steps}")
     if (arguments.q0 is None) != (arguments.p0 is None):

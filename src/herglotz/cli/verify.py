@@ -85,6 +85,8 @@ def _opened(path: Path, arguments: argparse.Namespace) -> Any:
     from herglotz.export.c_stepper import read_header
     from herglotz.training import load_run
 
+    if path.suffix.lower() in (".csv", ".npz", ".txt"):
+        raise InputError(f"{path}: is data, not a model; fit it first: herglotz fit {path} --out RUN")
     if path.suffix.lower() != ".h":
         found = load_exported(path, trust_code=arguments.trust_code)
         arguments.against = arguments.against or _exported_from(found.metadata, path)

@@ -21,6 +21,7 @@ from herglotz.export.metadata import weights_digest
 from herglotz.export.trusted import check_trusted
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
+from herglotz.stepping.state import check_started
 
 
 class CompiledStepper:
@@ -62,7 +63,7 @@ class CompiledStepper:
         h: Tensor | float = 1.0,
         u: Tensor | None = None,
     ) -> State:
-        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. NaN where it is not finite."""
+        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. Errors as `Stepper.init`."""
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0)
         h = spread_h(self._checked_h(h), s0).contiguous()
@@ -72,7 +73,7 @@ class CompiledStepper:
         status = torch.zeros(s0.shape, dtype=torch.uint8)
         starts = [x.contiguous() for x in (q0, q1, s0)]
         self._call("herglotz_inits", s0.numel(), *starts, h, 1, u, self.inputs, p, s, status)
-        return State(q1, p, s)
+        return check_started(State(q1, p, s))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step.

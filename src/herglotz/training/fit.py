@@ -5,9 +5,11 @@ from __future__ import annotations
 import hashlib
 import json
 import time
+from contextlib import nullcontext
 from pathlib import Path
 
 from herglotz.data import Trajectories
+from herglotz.data.lock import locked
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.evaluate import evaluate
@@ -57,9 +59,21 @@ def fit(
     Raises
     ------
     InputError
-        If the data cannot be used or the settings are wrong.
+        If the data cannot be used, the settings are wrong, or another process is fitting into `out`.
     """
-    started, config = time.perf_counter(), config or FitConfig()
+    with nullcontext() if out is None else locked(out):
+        return _fit(data, config or FitConfig(), plan, out, progress, resume)
+
+
+def _fit(
+    data: Trajectories,
+    config: FitConfig,
+    plan: Plan | None,
+    out: str | Path | None,
+    progress: bool | None,
+    resume: bool,
+) -> Run:
+    started = time.perf_counter()
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
     seen = look(data, config, stages, plan)
