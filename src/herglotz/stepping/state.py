@@ -161,8 +161,8 @@ def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     """
     h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
     if not bool(((h > 0) & (h < torch.inf)).all()):
-        wrong = h[~((h > 0) & (h < torch.inf))].flatten()[0]
-        raise InputError(f"h must be > 0 and finite, got {float(wrong):g}")
+        wrong = float(h[~((h > 0) & (h < torch.inf))].flatten()[0])
+        raise InputError(f"h must be {'finite' if wrong > 0 else '> 0'}, got {wrong:g}")
     return h
 
 
