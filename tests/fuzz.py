@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from herglotz.data import load, save, simulate
@@ -123,7 +124,8 @@ def kinds(folder: Path, only: str = "") -> list[Kind]:
     found.append(Kind("feature", folder / "feature.txt", text, hashed=False))
     model = ContactLagrangian(ModelConfig(level="linear", potential_width=2, damping_width=2))
     writers = {"pt2": export_pt2, "onnx": export_onnx, "h": export_c}
-    readers = {"pt2": lambda x: load_pt2(x, trust_code=True), "h": lambda x: load_c(x, trust_code=True), "onnx": load_onnx}
+    trusted = {"pt2": load_pt2, "h": load_c}
+    readers = {name: partial(load, trust_code=True) for name, load in trusted.items()} | {"onnx": load_onnx}
     for name, write in writers.items():
         if only in name:
             found.append(Kind(name, write(model, folder / f"model.{name}", h=0.1), readers[name]))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from herglotz.cli.common import KICKS, check_output_file, positive, print_json
 from herglotz.cli.flags import add_force_flag
@@ -60,24 +59,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     result = load_run(arguments.source)
 
-    from herglotz.cli.states import last_fitted
-    from herglotz.export import export_aoti, export_c, export_onnx, export_pt2, load_exported
+    from herglotz.export import export_run, load_exported
     from herglotz.export.c_header import read_metadata
 
-    write = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}[arguments.format]
-    q, p, s = last_fitted(result, 0)
-    metadata = {
-        "names": list(result.data.names),
-        "time_unit": result.data.time_unit,
-        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s)},
-        "metrics": result.metrics,
-        "h_range": list(arguments.h_range or result.h_range),
-    }
-    described: dict[str, Any] = {"h": result.h, "box": result.box, "units": result.data.units, "metadata": metadata}
+    export_run(result, arguments.out, arguments.format, h_range=arguments.h_range)
     tuned = result.setting
-    if tuned and arguments.format == "c":
-        described |= {"dtype": tuned["dtype"], "tolerance": tuned["tol"]}
-    write(result.model, arguments.out, **described)
     if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
     else:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import argparse
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from herglotz.cli.common import count, finite, print_json, print_table
-from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, parse_angles
+from herglotz.cli.common import count, finite, print_json
+from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, columns_of, parse_angles
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -130,7 +130,7 @@ def run(arguments: argparse.Namespace) -> int:
         diagonal=arguments.diagonal, coupled=arguments.coupled, sticking=arguments.sticking, order=arguments.order,
         substeps=arguments.substeps,
     )  # fmt: skip
-    data = load(arguments.data, angles=parse_angles(arguments.angles)).thinned(arguments.every)
+    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments)).thinned(arguments.every)
     made = _make(out)
     try:
         with locked(out):
@@ -156,43 +156,14 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     """Print what was reached, for people, and what to do next."""
     from herglotz.training import Plan
 
-    m, data = result.metrics, result.data
-    unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
-    kept, total = sum(result.train_lengths), data.samples
-    rows = [
-        ("data", data.summary()),
-        ("trained on", f"{kept} of {total} samples by the {m.get('objective')} objective, {m.get('level')} level"),
-        ("features", features_in_words(result.config.features)),
-        ("extrapolation RMS", f"{_show(m.get('extrapolation_rms'), unit)}  free run over the unseen samples"),
-        ("training RMS", _show(m.get("train_rms"), unit)),
-        ("one-step RMS", _show(m.get("one_step_rms"), unit)),
-        ("damping rate", _show(m.get("rate"), f"per {'unit of time' if data.time_unit == '1' else data.time_unit}")),
-        ("time", _show(m.get("seconds"), "s")),
-    ]
     print("Plan (what was decided, and why):")
-    print(Plan.from_dict(m["plan"]).table())
+    print(Plan.from_dict(result.metrics["plan"]).table())
     print("Result:")
-    print_table([row for row in rows if not row[1].startswith("None")])
-    if m.get("extrapolation_status") not in (None, "ok"):
-        print(f"Note: {m['extrapolation_status']}")
+    print(result.summary())
     if drawn:
         print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
-    print(f"Verdict: {m['verdict']}")
     print(f"Next: herglotz verify {out}")
-    if not result.config.sticking:  # files refuse such models
-        print(f"      herglotz export {out} --out {out.name}.pt2")
-
-
-def features_in_words(names: tuple[str, ...], most: int = 5) -> str:
-    """What the model is made of beside its terms, told or found; "None" without."""
-    if not names:
-        return "None"
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
-
-
-def _show(value: Any, unit: str) -> str:
-    return "None" if value is None else f"{value:.3g} {unit}".rstrip()
+    print(f"      herglotz export {out} --out {out.name}.pt2")
 
 
 def _draw(result: Run, out: Path) -> list[Path]:

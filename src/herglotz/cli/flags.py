@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 from herglotz.cli.common import check_output_folder, count, finite
 from herglotz.errors import InputError
@@ -22,8 +23,25 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--angles", metavar="NAMES",
-        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad)",
+        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
     )  # fmt: skip
+    add_column_flags(parser)
+
+
+def add_column_flags(parser: argparse.ArgumentParser) -> None:
+    """Add --time, --coordinates, --inputs, --drop and --group: the roles of a csv file's columns."""
+    columns = parser.add_argument_group("columns of a csv file (default: by their names, printed as a table)")
+    columns.add_argument("--time", metavar="NAME", help="column of the time")
+    columns.add_argument("--coordinates", type=names, metavar="NAMES", help="exactly these, with commas")
+    columns.add_argument("--inputs", type=names, metavar="NAMES", help="forces, torques, ...: exactly these, or none")
+    columns.add_argument("--drop", type=names, metavar="NAMES", help="columns to leave aside")
+    columns.add_argument("--group", metavar="NAME", help="column that numbers the trajectories")
+
+
+def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
+    """Return what the flags say of the columns, for `load`."""
+    given = {name: getattr(arguments, name) for name in ("time", "coordinates", "inputs", "drop", "group")}
+    return {name: value for name, value in given.items() if value is not None}
 
 
 def add_machine_flags(parser: argparse.ArgumentParser) -> None:
@@ -56,6 +74,9 @@ def check_run_folder(out: Path, resume: bool) -> None:
 
 def parse_angles(text: str | None) -> list[str] | None:
     """Return [] for `none`, [a, b] for `a,b`, and None, which keeps the angles of the file, without a flag."""
-    if text is None:
-        return None
+    return None if text is None else names(text)
+
+
+def names(text: str) -> list[str]:
+    """Return [] for `none`, and [a, b] for `a,b` (argparse type)."""
     return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]

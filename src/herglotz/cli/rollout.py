@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
 from herglotz.cli.flags import add_force_flag, add_trust_flag
@@ -47,6 +48,7 @@ class Source:
     angles: tuple[bool, ...]
     time_unit: str
     box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
+    h_range: tuple[float, float] | None  # steps of the fit
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -72,8 +74,12 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--inputs", type=Path, metavar="FILE",
-        help="recorded motion whose inputs u drive the model: its first K samples, at their own steps unless --h",
+        help="recorded motion whose inputs u drive the model, each at its own time: K samples from the start's time on "
+        "(with --q0: from the first), at their own steps unless --h",
     )  # fmt: skip
+    parser.add_argument(
+        "--t0", type=finite, metavar="T", help="time of the start (default: of the fitted state; 0 with --q0)"
+    )
     add_force_flag(parser)
     add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as JSON")
@@ -94,18 +100,20 @@ def run(arguments: argparse.Namespace) -> int:
 
     source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
-    u, h = _inputs(arguments, source, start.q.dtype)
+    u, times = _driven(arguments, source, t0)
+    h = times.diff().to(start.q.dtype) if arguments.inputs else (arguments.h or source.h)
     began = time.perf_counter()
     with torch.no_grad():
-        found = source.stepper.rollout(*start, h=h, steps=arguments.steps, inputs=u)
+        found = source.stepper.rollout(
+            *start, h=h, steps=arguments.steps, inputs=None if u is None else u.to(start.q.dtype)
+        )
     seconds = time.perf_counter() - began
-    h_all = h.double() if isinstance(h, torch.Tensor) else torch.full((arguments.steps,), h, dtype=torch.float64)
-    h = float(h_all.mean())
+    h = float(times.diff().mean())
     _check(found, h)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
     left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
     motion = Trajectories.of(
-        t0 + torch.cat([h_all.new_zeros(1), h_all.cumsum(0)]), found.q.double(), names=source.names,
+        times, found.q.double(), names=source.names,
         units=source.units, angles=source.angles, s=found.s.double(), p=found.p.double(), time_unit=source.time_unit,
         source=str(arguments.source),
     )  # fmt: skip
@@ -114,6 +122,7 @@ def run(arguments: argparse.Namespace) -> int:
     summary = {
         "file": str(arguments.out),
         "steps": arguments.steps,
+        "t0": float(times[0]),
         "h": h,
         "seconds": seconds,
         "largest_residual": float(found.residual.max()),
@@ -127,9 +136,18 @@ def run(arguments: argparse.Namespace) -> int:
         per_step = 1e6 * seconds / arguments.steps
         print(f"{arguments.out}: {arguments.steps} steps of {h:g} {source.time_unit}, {per_step:.0f} µs each; {end}")
     if left is not None:
-        text = f"from step {left} on, the motion leaves the range of states (q, p, s) that the model was fitted to"
-        print(f"herglotz: note: {text}", file=sys.stderr)
+        _note(f"from step {left} on, the motion leaves the range of states (q, p, s) that the model was fitted to")
+    low, high = source.h_range or (0.0, math.inf)
+    steps = times.diff()
+    if float(steps.min()) < low * (1 - 1e-6) or float(steps.max()) > high * (1 + 1e-6):
+        _note(
+            f"steps of {h:g} {source.time_unit} are outside of {low:g} to {high:g}, those that the model was fitted to"
+        )
     return 0
+
+
+def _note(text: str) -> None:
+    print(f"herglotz: note: {text}", file=sys.stderr)
 
 
 def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
@@ -146,14 +164,13 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     from herglotz.stepping import State
 
     if path.is_dir() or path.suffix.lower() not in SUFFIXES:
-        from herglotz.cli.states import last_fitted
         from herglotz.training import load_run
 
         run_, data = (found := load_run(path)), found.data
-        start = last_fitted(run_, trajectory)
-        t0 = float(data.t[data.offsets[trajectory] + max(run_.train_lengths[trajectory], 1) - 1])
+        start, t0 = run_.last_fitted(trajectory)
         box = Box(run_.box, data.angles, start.q.dtype)
-        return Source(run_.stepper, start, t0, run_.h, data.names, data.units, data.angles, data.time_unit, box)
+        labels = (data.names, data.units, data.angles, data.time_unit)
+        return Source(run_.stepper, start, t0, run_.h, *labels, box, run_.h_range)
 
     from herglotz.export import load_exported
 
@@ -165,7 +182,9 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
     box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype)
-    return Source(stepper, start, 0.0, stepper.h, names, units, angles, m.get("time_unit", "s"), box)
+    span, stepper.metadata["h_range"] = m.get("h_range"), None  # a note beside the motion, as for a run: no refusal
+    t0 = (stored or {}).get("t", 0.0)
+    return Source(stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span)
 
 
 def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
@@ -179,40 +198,32 @@ def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]
         if like is None:
             raise InputError(f"{arguments.source}: records no state to start from; give --q0 and --p0")
         s = like.s if arguments.s0 is None else torch.full_like(like.s, arguments.s0)
-        return State(like.q, like.p, s), source.t0
+        return State(like.q, like.p, s), source.t0 if arguments.t0 is None else arguments.t0
     for name in ("q0", "p0"):
         given = getattr(arguments, name)
         if len(given) != n:
             raise InputError(f"--{name} needs {n} number(s), one a coordinate ({', '.join(source.names)}), got {given}")
     dtype = getattr(source.stepper, "dtype", None) or (torch.float64 if like is None else like.q.dtype)
     values = (arguments.q0, arguments.p0, arguments.s0 or 0.0)
-    return State(*(torch.tensor(x, dtype=dtype) for x in values)), 0.0
+    return State(*(torch.tensor(x, dtype=dtype) for x in values)), arguments.t0 or 0.0
 
 
-def _inputs(arguments: argparse.Namespace, source: Source, dtype: torch.dtype) -> tuple[torch.Tensor | None, Any]:
-    """Return the inputs (K, m) and h: one number, or the recorded steps, (K,)."""
+def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[torch.Tensor | None, torch.Tensor]:
+    """Return the inputs (K, m), where there are any, and the times (K + 1,)."""
     import torch
 
-    from herglotz.data import load
+    from herglotz.data.driving import driven, even_times, recorded
 
-    h = source.h if arguments.h is None else arguments.h
-    if arguments.u is None and arguments.inputs is None:
-        return None, h
-    if arguments.u is not None and arguments.inputs is not None:
+    steps, path = arguments.steps, arguments.inputs
+    if path is None:
+        u = None if arguments.u is None else torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1)
+        return u, even_times(t0, arguments.h or source.h, steps)
+    if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    steps = arguments.steps
-    recorded_at: Path | None = arguments.inputs
-    if recorded_at is None:
-        u = torch.tensor(arguments.u, dtype=dtype).expand(steps, -1)
-    else:
-        recorded = load(recorded_at)[0]
-        if recorded.u is None:
-            raise InputError(f"--inputs {arguments.inputs}: holds no inputs; name their columns u, u_* or torque")
-        if recorded.samples <= steps:
-            raise InputError(f"--inputs {arguments.inputs}: {steps} steps need more than {recorded.samples} samples")
-        u = recorded.u[:steps].to(dtype)
-        h = recorded.t.diff()[:steps].to(dtype) if arguments.h is None else h
-    return u, h
+    found = recorded(path, arguments.trajectory, source.time_unit)
+    if arguments.q0 is not None and arguments.t0 is None:
+        t0 = float(found.t[0])
+    return driven(found, t0, steps, arguments.h)
 
 
 def _check(found: Rollout, h: float) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from herglotz.cli.common import count, print_json
 from herglotz.cli.fit import LEVELS
-from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, parse_angles
+from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, columns_of, parse_angles
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import FitConfig, save_run, select
 
-    data = load(arguments.data, angles=parse_angles(arguments.angles))
+    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
     config = FitConfig(
         train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device
     )

@@ -1,5 +1,6 @@
 """Trajectories: read, written, split, simulated."""
 
+from herglotz.data.anything import as_trajectories
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.ibm_double_pendulum import read_ibm_double_pendulum
@@ -15,6 +16,7 @@ __all__ = [
     "Steps",
     "Trajectories",
     "Triples",
+    "as_trajectories",
     "load",
     "read_csv",
     "read_ibm_double_pendulum",

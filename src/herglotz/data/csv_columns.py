@@ -1,4 +1,4 @@
-"""The role of each csv column: time, trajectory, coordinate, action, momentum, input, or left aside."""
+"""The role of each column of a table: time, trajectory, coordinate, action, momentum, input, or left aside."""
 
 from __future__ import annotations
 
@@ -10,9 +10,47 @@ from herglotz.data.rows import quote
 from herglotz.errors import InputError
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)\s*(?:\[([^\[\]]*)\])?")
-TIME, TRAJECTORY = ("t", "time"), ("trajectory", "trial")
-ACTION, MOMENTUM, INPUT = re.compile("s"), re.compile("p|p_.*"), re.compile("u|u_.*|torque")
-VELOCITY = re.compile(r"v|velocity|.*_dot")  # left aside: a logged velocity is usually filtered
+ROLES = {
+    "time": re.compile(r"t|time|timestamp|datetime"),
+    "trajectory": re.compile(r"trajectory|trial"),
+    "action": re.compile(r"s"),
+    "momentum": re.compile(r"p|p_.*"),
+    "input": re.compile(r"u\d*|u_.*|F|(f|forces?|torques?|tau|motor)(\d+|_.*)|forces?|torques?|tau|motor"),
+    "velocity": re.compile(r"v|velocity|.*_dot"),  # left aside: a logged velocity is usually filtered
+}
+FORCES = re.compile(r"[kmM]?N([ *·.]?m)?")  # units in which no coordinate is measured
+Names = str | Sequence[str]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user says of the columns, each by name; None where the header decides."""
+
+    time: str | None = None
+    coordinates: Names | None = None  # exactly these
+    inputs: Names | None = None  # exactly these; () for none
+    drop: Names = ()  # left aside
+    group: str | None = None  # numbers the trajectories
+
+    def role(self, name: str) -> str | None:
+        """The role that the user gives to this column; None where the user says nothing."""
+        given = (("time", self.time), ("trajectory", self.group), ("dropped", self.drop), ("q", self.coordinates))
+        for role, wanted in (*given, ("input", self.inputs)):
+            if name in _several(wanted or ()):
+                return role
+        return None
+
+    def __bool__(self) -> bool:
+        return bool(self.names) or self.inputs is not None or self.coordinates is not None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All columns that the user names."""
+        every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
+        return tuple(name for wanted in every if wanted for name in _several(wanted))
+
+
+HEADER_DECIDES = Wanted()
 
 
 @dataclass(frozen=True)
@@ -30,15 +68,23 @@ class Columns:
 
     @property
     def numeric(self) -> tuple[int, ...]:
-        """Columns whose cells are parsed as numbers."""
+        """Columns whose cells are parsed as numbers, time first."""
         return (self.time, *self.q, *(() if self.s is None else (self.s,)), *self.p, *self.u)
+
+    def roles(self) -> tuple[tuple[str, str, str], ...]:
+        """Name, role and unit of every column, in the order of the header."""
+        named = {self.time: "time", self.trajectory: "trajectory", self.s: "action s"}
+        named |= (
+            dict.fromkeys(self.q, "coordinate") | dict.fromkeys(self.p, "momentum") | dict.fromkeys(self.u, "input")
+        )
+        rows = enumerate(zip(self.names, self.units, strict=True))
+        return tuple((name, named.get(i, "left aside"), unit) for i, (name, unit) in rows)
 
 
 def assign(
     cells: Sequence[str],  # the header's cells, `name` or `name[unit]`
     where: str,  # begins every message: file and row
-    time: str | None = None,  # name of the time column, if neither t nor time
-    coordinates: Sequence[str] | None = None,  # names of the coordinates, if not "all others"
+    wanted: Wanted = HEADER_DECIDES,
 ) -> Columns:
     """Give every column of a header its role.
 
@@ -48,28 +94,45 @@ def assign(
         If a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named column is absent.
     """
     names, units = _parse(cells, where)
-    # "Time" means time, but a single "V" may be a volume.
-    key = {name: name.casefold() if len(name) > 1 else name for name in names}
-    for asked in (() if time is None else (time,)) + tuple(coordinates or ()):
+    for asked in wanted.names:
         if asked not in names:
             raise InputError(f"{where}: there is no column {quote(asked)}; the columns are {', '.join(names)}")
-    clock = [time] if time is not None else [x for x in names if key[x] in TIME and x not in (coordinates or ())]
-    if len(clock) != 1:
-        found = f"two time columns, {' and '.join(clock)}" if clock else "no time column"
-        raise InputError(f"{where}: {found}; name exactly one column t (or time), or pass time=")
-    roles: dict[str, list[int]] = {"trajectory": [], "s": [], "p": [], "u": [], "q": []}
-    for i, name in enumerate(names):
-        role = "q" if coordinates is not None and name in coordinates else _role(key[name])
-        if name != clock[0] and role in roles and not (role == "q" and coordinates and name not in coordinates):
-            roles[role].append(i)
-    q = tuple(roles["q"]) if coordinates is None else tuple(names.index(x) for x in coordinates)
+    roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
+    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
+        roles[wanted.role(name) or _by_itself(name, unit, wanted)].append(i)
+    clock = _clock(where, names, roles["time"])
+    q = tuple(roles["q"] if wanted.coordinates is None else (names.index(x) for x in _several(wanted.coordinates)))
     if not q:
         raise InputError(f"{where}: no coordinate column, only {', '.join(names)}; add a column such as q[rad]")
     if len(roles["trajectory"]) > 1:
-        raise InputError(f"{where}: both a column trajectory and a column trial; keep one")
-    p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["p"]})
-    one = {x: roles[x][0] if roles[x] else None for x in ("trajectory", "s")}
-    return Columns(names, units, names.index(clock[0]), q, one["trajectory"], one["s"], p, tuple(roles["u"]))
+        both = " and a column ".join(names[i] for i in roles["trajectory"])
+        raise InputError(f"{where}: both a column {both}; keep one")
+    p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
+    one = {x: roles[x][0] if roles[x] else None for x in ("trajectory", "action")}
+    return Columns(names, units, clock, q, one["trajectory"], one["action"], p, tuple(roles["input"]))
+
+
+def _several(names: Names) -> Sequence[str]:
+    return (names,) if isinstance(names, str) else names
+
+
+def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
+    """The role of a column that the user does not name, by its name and unit; `dropped` where others have that role."""
+    key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
+    role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "q")
+    role = "input" if role == "q" and FORCES.fullmatch(unit) else role
+    taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
+    return "dropped" if taken.get(role) is not None else role
+
+
+def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
+    if len(found) == 1:
+        return found[0]
+    columns = f"the columns are {', '.join(names)}"
+    if found:
+        what = f"two time columns, {' and '.join(names[i] for i in found)}"
+        raise InputError(f"{where}: {what}; choose one with --time NAME (time= in Python)")
+    raise InputError(f"{where}: no time column; {columns}: choose one with --time NAME (time= in Python), or call it t")
 
 
 def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
@@ -83,20 +146,9 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
             raise InputError(f"{where}: the column {quote(name)} comes twice; rename or delete one")
         names.append(name)
         units.append((match[2] or "").strip())
-    if all(_is_number(name) for name in names):
+    if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")
     return tuple(names), tuple(units)
-
-
-def _role(key: str) -> str:
-    if key in TIME:
-        return "time"
-    if key in TRAJECTORY:
-        return "trajectory"
-    for role, pattern in (("s", ACTION), ("p", MOMENTUM), ("u", INPUT), ("velocity", VELOCITY)):
-        if pattern.fullmatch(key):
-            return role
-    return "q"
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
@@ -111,7 +163,8 @@ def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:
     raise InputError(f"{where}: momentum columns {', '.join(p)} are not {', '.join(wanted)}; rename or delete them")
 
 
-def _is_number(text: str) -> bool:
+def is_number(text: str) -> bool:
+    """Whether Python reads this text as a number."""
     try:
         float(text)
     except ValueError:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 
-from herglotz.data.csv_columns import Columns, assign
+from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import group_rows, number, quote
+from herglotz.data.rows import number, quote
+from herglotz.data.table import from_table, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
@@ -17,21 +19,26 @@ from herglotz.errors import InputError
 def read_csv(
     path: PathLike,
     *,
-    time: str | None = None,  # name of the time column; left out: t or time
-    coordinates: str | Sequence[str] | None = None,  # left out: every column without another role
-    angles: str | Sequence[str] | None = None,  # coordinates that are angles; left out: those in rad; () for none
+    time: str | None = None,  # name of the time column; left out: t, time, timestamp or datetime
+    coordinates: Names | None = None,  # left out: every column without another role
+    inputs: Names | None = None,  # left out: those called u, force, torque, ...; () for none
+    drop: Names = (),  # columns to leave aside
+    group: str | None = None,  # column that numbers the trajectories; left out: trajectory or trial
+    angles: Names | None = None,  # coordinates that are angles; left out: those in rad; () for none
 ) -> Trajectories:
     """Read trajectories from a csv file (UTF-8, commas, a decimal point).
 
-    The header's cells are `name` or `name[unit]`. `t` or `time` is the time; `trajectory` or `trial`, if there, groups
-    the rows; `s` is the action, `p`/`p_*` momenta, `u`/`u_*`/`torque` inputs; velocities (`v`, `velocity`, `*_dot`) are
-    left aside; every other column is a coordinate. Lines that start with # and blank lines are skipped.
-    A coordinate in rad is taken for an angle.
+    The header's cells are `name` or `name[unit]`. `t`, `time`, `timestamp` or `datetime` is the time; `trajectory` or
+    `trial`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`, `force`, `F`, `torque`,
+    `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs; velocities (`v`, `velocity`,
+    `*_dot`) are left aside; every other column is a coordinate. Times may be dates in ISO 8601: they become seconds
+    since the first row. Lines that start with # and blank lines are skipped. A coordinate in rad is taken for an angle.
 
     Returns
     -------
     Trajectories
-        In float64, as measured (angles are not unwrapped; `load` does that).
+        In float64, as measured (`load` unwraps angles and converts degrees and milliseconds); `columns` holds the role
+        of every column.
 
     Raises
     ------
@@ -45,9 +52,9 @@ def read_csv(
     at, header = rows[0]
     if "," not in header and (";" in header or "\t" in header):
         raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
-    wanted = (coordinates,) if isinstance(coordinates, str) else coordinates
-    columns = assign(_cells(header), f"{Path(path)}, row {at}", time, wanted)
-    return _build(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]), angles)
+    columns = assign(_cells(header), f"{Path(path)}, row {at}", Wanted(time, coordinates, inputs, drop, group))
+    found = from_table(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]))
+    return found if angles is None else found.with_angles(angles)
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
@@ -88,12 +95,17 @@ def _parse_rows(
 ) -> tuple[list[int], list[str], list[list[float]]]:
     """Return line number, trajectory label and numbers of every row."""
     width, labels, values = len(columns.names), [], []
+    first = None  # date of the first row, where times are dates
     for at, line in rows:
         cells = _cells(line)
         if len(cells) != width:
             raise InputError(
                 f"{path}, row {at}: {len(cells)} cells where the header has {width}; correct or delete the row"
             )
+        date = moment(cells[columns.time]) if first is not None or not values else None
+        if date is not None and not is_number(cells[columns.time]):
+            first = first or date
+            cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
         values.append([number(cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
         labels.append("" if columns.trajectory is None else cells[columns.trajectory])
     if any(labels) and not all(labels):
@@ -102,33 +114,10 @@ def _parse_rows(
     return [at for at, _ in rows], labels, values
 
 
-def _build(
-    path: Path,
-    columns: Columns,
-    at: list[int],
-    labels: list[str],
-    values: list[list[float]],
-    angles: str | Sequence[str] | None,
-) -> Trajectories:
-    groups = group_rows(path, at, labels, [row[0] for row in values], ("trajectory", columns.names[columns.time]))
-    table = np.array([values[row] for group in groups for row in group], dtype=np.float64)
-    widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
-    t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
-    units = tuple(columns.units[i] or "1" for i in columns.q)
-    found = Trajectories.of(
-        t[:, 0],
-        q,
-        tuple(len(group) for group in groups),
-        names=tuple(columns.names[i] for i in columns.q),
-        units=units,
-        angles=tuple(unit == "rad" for unit in units),
-        s=s[:, 0] if s.size else None,
-        p=p if p.size else None,
-        u=u if u.size else None,
-        time_unit=columns.units[columns.time] or "s",
-        source=path.name,
-    )
-    return found if angles is None else found.with_angles(angles)
+def _since(first: datetime, date: datetime, where: str) -> float:
+    if (first.tzinfo is None) != (date.tzinfo is None):
+        raise InputError(f"{where}: {date} and the first date {first} differ in having a time zone; write it in all")
+    return (date - first).total_seconds()
 
 
 def _check_header(path: Path, header: list[str], trajectories: Trajectories) -> None:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import sys
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.trajectories import Trajectories
+from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError
 
 
@@ -41,24 +45,28 @@ WRITES = ".csv and .npz"
 def load(
     path: PathLike,
     *,
-    angles: str | Sequence[str] | None = None,  # coordinates that are angles; left out: what the file says; () for none
+    angles: Names | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     unwrap: bool = True,  # make angles continuous
+    show: bool = True,  # print the table of columns on stderr, where a table was read
+    **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
 ) -> Trajectories:
-    """Read trajectories from any of `FORMATS`.
+    """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
 
     Returns
     -------
     Trajectories
-        Angles unwrapped: no jump longer than π between samples.
+        Angles in rad, unwrapped: no jump longer than π between samples. Times in ms, µs, ns or min become s.
 
     Raises
     ------
     InputError
         If the format is not known (the message lists those that are), or from the reader of that format.
     """
-    found = _read(Path(path))
+    found = in_radians_and_seconds(_read(Path(path), Wanted(**columns)))
     if angles is not None:
         found = found.with_angles(angles)
+    if show and found.columns:
+        print(found.table(), file=sys.stderr)
     return found.unwrapped() if unwrap else found
 
 
@@ -80,12 +88,16 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
             raise InputError(f"{path}: cannot write {other or 'a file without extension'}; written are {WRITES}")
 
 
-def _read(path: Path) -> Trajectories:
+def _read(path: Path, wanted: Wanted) -> Trajectories:
     suffix = path.suffix.lower()
     line = read_bytes(path)[:200].decode("utf-8", "replace").lstrip().split("\n")[0] if suffix != ".npz" else ""
     candidates = [one for one in FORMATS if one.suffix == suffix]
     for one in candidates:
         if one.first_line(line):
-            return one.read(path)
+            if not wanted:
+                return one.read(path)
+            if one.read is not read_csv:
+                raise InputError(f"{path}: columns are chosen in a csv table; this is {one.name}")
+            return read_csv(path, **vars(wanted))
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
     raise InputError(f"{path}: cannot read {what}; known formats: {'; '.join(one.name for one in FORMATS)}")

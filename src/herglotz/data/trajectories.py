@@ -19,9 +19,10 @@ from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
 
 GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
+IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Trajectories:
     """B trajectories of n coordinates, stored one after the other.
 
@@ -45,6 +46,7 @@ class Trajectories:
     u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
     time_unit: str = "s"
     source: str = ""  # file or scene of origin, for messages
+    columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
@@ -65,6 +67,7 @@ class Trajectories:
         u: Tensor | np.ndarray | None = None,
         time_unit: str = "s",
         source: str = "",
+        columns: tuple[tuple[str, str, str], ...] = (),
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
 
@@ -88,7 +91,11 @@ class Trajectories:
             u=None if u is None else _column(_tensor("u", u)),
             time_unit=time_unit,
             source=source,
+            columns=columns,
         )
+
+    def __repr__(self) -> str:
+        return f"Trajectories({self.summary()})"
 
     def __len__(self) -> int:
         """Return B, the number of trajectories."""
@@ -140,8 +147,15 @@ class Trajectories:
         return float(self.steps().h.median())
 
     @property
+    def irregular(self) -> bool:
+        """Whether the steps differ by more than clocks do, also where no sample is missing."""
+        h = self.steps().h
+        h = h[h <= GAP * h.median()]
+        return float(h.std(correction=0)) > IRREGULAR * float(h.median())
+
+    @property
     def gaps(self) -> int:
-        """Number of steps longer than 1.5 typical steps: samples are missing there."""
+        """Number of steps longer than 1.5 typical steps: samples are missing there, unless the steps are irregular."""
         return int((self.steps().h > GAP * self.typical_step).sum())
 
     def split_time(self, fraction: float) -> tuple[Trajectories, Trajectories]:
@@ -243,10 +257,29 @@ class Trajectories:
         known = "".join(f", {name}" for name in ("s", "p", "u") if getattr(self, name) is not None)
         plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
         gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
+        step = f"step {self.typical_step:.4g}{unit}{gaps}"
+        if self.irregular:
+            h = self.steps().h
+            step = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
         return (
             f"{self.source or 'trajectories'}: {len(self)} trajector{plural}, {self.samples} samples of "
-            f"{coordinates}{known}; step {self.typical_step:.4g}{unit}{gaps}"
+            f"{coordinates}{known}; {step}"
         )
+
+    def table(self) -> str:
+        """Return what every column of the table that was read was taken for, a line each, for people."""
+        now = dict(zip(self.names, zip(self.units, self.angles, strict=True), strict=True))
+        rows = [("column", "is taken for", "unit")]
+        for name, role, unit in self.columns:
+            if role == "coordinate" and name in now:
+                role = "angle" if now[name][1] else role
+                unit = unit if unit in ("", now[name][0]) else f"{unit}, converted to {now[name][0]}"
+            elif role == "time" and unit not in ("", self.time_unit):
+                unit = f"{unit}, converted to {self.time_unit}"
+            rows.append((name, role, unit or "-"))
+        widths = [max(len(row[k]) for row in rows) for k in range(2)]
+        lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
+        return "\n".join([f"{self.source or 'table'}:", *lines])
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}

@@ -12,6 +12,7 @@ from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
 from herglotz.export.metadata import weights_digest
 from herglotz.export.module import StepModule
+from herglotz.export.run_file import export_run
 
 __all__ = [
     "CompiledStepper",
@@ -25,6 +26,7 @@ __all__ = [
     "export_c",
     "export_onnx",
     "export_pt2",
+    "export_run",
     "load_c",
     "load_exported",
     "load_onnx",

@@ -73,6 +73,7 @@ TOP = """\
 #define hz_INPUTS {inputs}
 #define hz_SINGLE {single} /* float, not double */
 #define hz_EXPLICIT {explicit} /* the step equation is linear in q1: no iteration */
+#define hz_STICKING {sticking} /* dry friction can hold a coordinate still */
 #define hz_BOXED {boxed} /* a box of the fitted data is recorded */
 #define hz_DERIVATIVES {derivatives} /* hz_step_jacobian is there */
 #define hz_WIDE {wide} /* batches go by registers of samples */
@@ -176,7 +177,7 @@ def c_source(
     types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
     parts = [
-        _top(entries, step.explicit, derivatives),
+        _top(entries, step, derivatives),
         types,
         _constants(model, entries),
         number_tests,
@@ -258,7 +259,7 @@ def _identifier(stem: str) -> str:
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
 
 
-def _top(entries: Mapping[str, Any], explicit: bool, derivatives: bool) -> str:
+def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     """The comment, the guard, and what the preprocessor decides by."""
     inputs = entries["inputs"]
     return TOP.format(
@@ -272,7 +273,8 @@ def _top(entries: Mapping[str, Any], explicit: bool, derivatives: bool) -> str:
         m=inputs,
         inputs=int(inputs > 0),
         single=int(entries["dtype"] == "float32"),
-        explicit=int(explicit),
+        explicit=int(step.explicit),
+        sticking=int(step.sticks),
         boxed=int(entries["box"] is not None),
         derivatives=int(derivatives),
         wide=int(entries["dof"] <= MAX_WIDE),

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from herglotz.errors import InputError
 from herglotz.export.trace import Graph, example_batch, traced
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
+from herglotz.stepping.stick_slip import StickSlip
 
+HELD = 2  # tensors that set-valued friction adds to an iteration: K and w/K
 LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
 # u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
@@ -64,16 +65,23 @@ class Terms:
 
 
 class StepEquation(nn.Module):
-    """One iteration: a Newton step from a trial Δ, and what the step gains there."""
+    """One iteration: a Newton step from a trial Δ, and what the step gains there.
 
-    def __init__(self, model: ContactLagrangian):
+    With `sticking` Δ is the z of `herglotz.stepping.stick_slip`, and the arguments end with K and w/K.
+    """
+
+    def __init__(self, model: ContactLagrangian, sticking: bool = False):
         super().__init__()
-        self.model = model
+        self.model, self.held = model, HELD * sticking
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """−J⁻¹F (B, n), |J⁻¹cp0| and |F| (B,), p1 (B, n), L, c (B,), then J (B, n, n)."""
-        terms = Terms(self.model, q, p, s, h, more)
-        point = terms(delta, True)
+        split = len(more) - self.held
+        form = terms = Terms(self.model, q, p, s, h, more[:split])
+        if self.held:
+            assert isinstance(terms.equation, PartialsEquation)
+            form = StickSlip(terms.equation, *more[split:])
+        point = form(delta, True)
         assert point.J is not None
         move, size = eliminate(point.J, torch.stack([point.F, terms.equation.push(point)], -1)).unbind(-1)
         gained = terms.gained(delta, point)
@@ -128,11 +136,6 @@ class Equations:
     @classmethod
     def of(cls, model: ContactLagrangian | Equations) -> Equations:
         """Those of a copy of the model, which no export can change or train."""
-        if isinstance(model, ContactLagrangian) and model.capabilities.sticking:
-            raise InputError(
-                "this model's dry friction is set-valued, which files do not step; step it with PyTorch, or fit "
-                "without sticking"
-            )
         return model if isinstance(model, Equations) else cls(copy.deepcopy(model).eval().requires_grad_(False))
 
     @cached_property

@@ -12,9 +12,10 @@ from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.errors import InputError
 from herglotz.export.equation import Equations, dense
-from herglotz.export.newton import CONVERGED, ITERATIONS, Values, unfinished
+from herglotz.export.newton import CARRIED, CONVERGED, ITERATIONS, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
 from herglotz.export.trace import Graph
+from herglotz.mechanics.legendre import beyond
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.linearise import eliminate
 
@@ -23,9 +24,11 @@ def solved(
     graphs: StepGraphs, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor], constants: Sequence[Values]
 ) -> Values:
     """Newton's last carry: begin, then iterate to the end; `constants` are those of `begin` and of `iterate`."""
-    state, here, (trail,), _ = graphs.layout.split(carry)
-    first = tuple(dense(x) for x in graphs.begin.call(h, trail, *constants[0]))
-    fixed: Any = (*state, h, *here, *u, *constants[1])
+    state, here, trail, _ = graphs.layout.split(carry)
+    given = (*state, h, *u) if graphs.layout.sticks else (h, *trail)
+    begun = tuple(dense(x) for x in graphs.begin.call(*given, *constants[0]))
+    first, held = begun[:CARRIED], begun[CARRIED:]
+    fixed: Any = (*state, h, *here, *u, *held, *constants[1])
     ends = len(first), len(first) + STATE + 1
 
     def turn(*x: Tensor) -> Values:
@@ -33,7 +36,9 @@ def solved(
 
     # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
     carried: Any = first
-    return while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
+    found = while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
+    # What is carried as Δ is z where friction can hold a coordinate.
+    return (*found[:2], beyond(found[2], held[1]), *found[3:]) if held else found
 
 
 class RolloutModule(nn.Module):

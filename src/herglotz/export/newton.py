@@ -1,7 +1,8 @@
 """One iteration of Newton on the step equation as tensor operations; a file's own loop repeats the iteration.
 
-The unknown is Δ = q1 − q0, because the difference q1 − q0 would round a small step away. The rules of acceptance are
-those of `herglotz.stepping.newton`.
+The unknown is Δ = q1 − q0, because the difference q1 − q0 would round a small step away; where dry friction can hold a
+coordinate it is the z of `herglotz.stepping.stick_slip`. The rules of acceptance are those of
+`herglotz.stepping.newton`.
 """
 
 from __future__ import annotations
@@ -53,11 +54,11 @@ class NewtonIteration(nn.Module):
 
     def __init__(self, model: ContactLagrangian):
         super().__init__()
-        self.equation = StepEquation(model)
+        self.equation = StepEquation(model, model.capabilities.sticking)
         self.speed = max(model.config.speed)  # the networks' rounding is relative to h times this speed, even at rest
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *rest: Tensor) -> Values:
-        """The next carry; `rest` is the carry, then V, V′ at q and u as far as the model has them."""
+        """The next carry; `rest` is the carry, then V, V′ at q, u, K and w/K as far as the model has them."""
         (count, done, x, delta, merit, fraction, scale, *values), more = rest[:CARRIED], rest[CARRIED:]
         eps = torch.finfo(q.dtype).eps
         first = count == 0

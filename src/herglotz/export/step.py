@@ -2,13 +2,14 @@
 
     start    (q, p, s) → carry
     begin    (h, carry) → Newton's first carry           only where a step iterates
+             (q, p, s, h, u) → the same, K and w/K       where dry friction can hold a coordinate
     iterate  (q, p, s, h, Newton's carry, …) → Newton's carry
     finish   (h, u, carry[, Newton's last carry]) → carry, then c[, residual, status]
     report   (h, q, p, s, q1, p1, s1, c[, residual, status]) → the file's outputs
 
-The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where a step
-iterates; then, in float32, what rounding took from q and s (Kahan's sum; without it a digit is lost every ten steps).
-Vectors are (B, n), numbers a sample (B,).
+The carry is q, p, s; then V and V′ at q where the model's terms are known; then the last velocities where a guess
+continues them; then, in float32, what rounding took from q and s (Kahan's sum; without it a digit is lost every ten
+steps). Vectors are (B, n), numbers a sample (B,).
 """
 
 from __future__ import annotations
@@ -19,12 +20,14 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.export.box import Box, Report
-from herglotz.export.equation import dense, example, inverse, length
+from herglotz.export.equation import Terms, dense, example, inverse, length
 from herglotz.export.newton import CARRIED, CONVERGED, NewtonIteration, Values, first_carry, status_of
 from herglotz.export.trace import traced
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
+from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.stick_slip import at_rest
 
 # The guess of Δ/h continues the parabola through the last velocities. Measured at h = 0.1 (16×2 networks, linear,
 # affine and full): 3.0 evaluations a step with three to five velocities, 2.0 to 3.0 with six; where steps differ
@@ -40,12 +43,14 @@ class Layout:
         made_of = model.capabilities
         self.field = 2 * made_of.by_terms  # V and V′
         self.iterates = not made_of.explicit
+        self.sticks = made_of.sticking  # the iteration has a start of its own
+        self.trail = self.iterates and not self.sticks
         self.compensated = next(model.parameters()).dtype == torch.float32
-        self.size = STATE + self.field + self.iterates + 2 * self.compensated
+        self.size = STATE + self.field + self.trail + 2 * self.compensated
 
     def split(self, carry: Sequence[Tensor]) -> tuple[Values, Values, Values, Values]:
         """(q, p, s), (V, V′), (velocities,) and (lost of q, lost of s), each empty where the model has none."""
-        ends = (STATE, STATE + self.field, STATE + self.field + self.iterates, self.size)
+        ends = (STATE, STATE + self.field, STATE + self.field + self.trail, self.size)
         return tuple(tuple(carry[a:b]) for a, b in zip((0, *ends), ends, strict=False))  # pyright: ignore
 
 
@@ -59,7 +64,7 @@ class Start(nn.Module):
     def forward(self, q: Tensor, p: Tensor, s: Tensor) -> Values:
         """From a state; the velocities are NaN until there is a step."""
         here = FieldOf(self.model.potential)(q) if self.layout.field else ()
-        trail = (torch.full_like(q, torch.nan).repeat(1, len(CONTINUE)),) if self.layout.iterates else ()
+        trail = (torch.full_like(q, torch.nan).repeat(1, len(CONTINUE)),) if self.layout.trail else ()
         lost = (torch.zeros_like(q), torch.zeros_like(s)) if self.layout.compensated else ()
         return tuple(dense(x) for x in (q, p, s, *here, *trail, *lost))
 
@@ -73,6 +78,21 @@ class Begin(nn.Module):
         eye = torch.eye(n, dtype=trail.dtype, device=trail.device)
         guess = h[:, None] * (trail @ torch.cat([weight * eye for weight in CONTINUE]))
         return first_carry(torch.where(torch.isfinite(guess), guess, 0.0))
+
+
+class BeginSticking(nn.Module):
+    """Newton's first carry in z, K and w/K: `herglotz.stepping.stick_slip`."""
+
+    def __init__(self, model: ContactLagrangian):
+        super().__init__()
+        self.model = model
+
+    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
+        """From the state, h (B,) and the inputs."""
+        equation = Terms(self.model, q, p, s, h, u).equation
+        assert isinstance(equation, PartialsEquation)
+        start, *held = at_rest(equation)
+        return *first_carry(start), *(dense(x) for x in held)
 
 
 class Finish(nn.Module):
@@ -112,7 +132,8 @@ class Finish(nn.Module):
             V, slope = there = FieldOf(self.model.potential)(q1)
             p1, L = p1 - (h / 2)[:, None] * slope, L - h / 2 * V
         s1, *lost_s = _added(s, L, lost[1:])
-        new = (q1, p1, s1, *there, _followed(trail[0], x / h[:, None]), *lost_q, *lost_s)
+        followed = (_followed(trail[0], x / h[:, None]),) if trail else ()
+        new = (q1, p1, s1, *there, *followed, *lost_q, *lost_s)
         return tuple(dense(y) for y in (*new, c, residual, status))
 
 
@@ -156,9 +177,14 @@ class StepGraphs(nn.Module):
         here = carry[STATE : STATE + layout.field]
         found: list[Tensor] = []
         if layout.iterates:
-            self.begin = traced(Begin(), (h, carry[STATE + layout.field]))
             found = [y.clone() for y in first_carry(0.1 * p)]
-            self.iterate = traced(NewtonIteration(model), (q, p, s, h, *found, *here, *u))
+            held: list[Tensor] = []
+            if layout.sticks:
+                self.begin = traced(BeginSticking(model), (q, p, s, h, *u))
+                held = [y + 0.1 * (i + 1) for i, y in enumerate((q, p))]
+            else:
+                self.begin = traced(Begin(), (h, carry[STATE + layout.field]))
+            self.iterate = traced(NewtonIteration(model), (q, p, s, h, *found, *here, *u, *held))
         self.finish = traced(Finish(model), (h, *u, *carry, *found))
         rows = [y + 1 for y in (q, p, s, s + 1)]
         solved = (s + 3, (s > 0).to(torch.uint8)) if layout.iterates else ()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -10,6 +12,7 @@ from torch import Tensor, nn
 
 from herglotz.export.equation import Equations, FieldAt, example, field_like
 from herglotz.export.trace import Graph, traced
+from herglotz.mechanics.legendre import beyond
 from herglotz.models import ContactLagrangian
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
@@ -18,10 +21,11 @@ from herglotz.models.terms import Potential
 from herglotz.stepping.equation import PartialsEquation, Point, model_equation
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field
+from herglotz.stepping.stick_slip import StickSlip, at_rest
 
 Start = tuple[Tensor, Tensor, Tensor, Tensor]  # q0, p0, s0, h
 Ends = tuple[Field, Field]  # the potential at q0 and q1
-Parts = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]  # what `StepParts` gives
+Parts = tuple[Tensor, ...]  # what `StepParts` gives
 
 
 def step_parts(model: ContactLagrangian, explicit: bool) -> Graph:
@@ -97,13 +101,18 @@ class StepParts(nn.Module):
         slope1: Tensor,  # (B, n)
         *u: Tensor,  # (B, m)
     ) -> tuple[Tensor, ...]:
-        """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1."""
+        """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1.
+
+        Where dry friction can hold a coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K follows.
+        """
         ends = Field(V0, slope0), Field(V1, slope1)
         form = self._explicit if self.explicit else self._by_jets
         if not self.explicit and model_equation(self.model) is not None:
             form = self._by_terms
-        guess, F, J, dp, L, E = form((q, p, s, h), ends, delta, x, u)
-        return guess.clone(), F.clone(), J.clone(), dp.clone(), L.clone(), E.expand(s.shape).clone()
+        if self.model.capabilities.sticking:
+            form = self._by_sticking
+        guess, F, J, dp, L, E, *bound = form((q, p, s, h), ends, delta, x, u)
+        return *(y.clone() for y in (guess, F, J, dp, L)), E.expand(s.shape).clone(), *bound
 
     def _explicit(self, start: Start, ends: Ends, delta: Tensor, _: Tensor, u: tuple[Tensor, ...]) -> Parts:
         h = start[3]
@@ -134,14 +143,9 @@ class StepParts(nn.Module):
         return form.leap(), point.F, point.J, dp, end.L, E
 
     def _by_jets(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        model, potential = self.model, self.model.potential
-        L_d: Any = model.at(*u) if u else model
-        model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
-        try:
-            form = PartialsEquation(L_d, *start, 1, True)
+        with self._given(ends):
+            form = self._in_increments(start, u)
             point = form(delta, True)
-        finally:
-            model.potential = potential
         end = form.end(delta, point)
         dp = (end.p1 + point.F) - start[1]  # as F is not quite 0
         assert point.J is not None
@@ -153,6 +157,32 @@ class StepParts(nn.Module):
             end.L + (end.p1 * (x - delta)).sum(-1),
             point.rest.D3,
         )
+
+    def _by_sticking(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
+        with self._given(ends):
+            equation = self._in_increments(start, u)
+            guess, stiffness, bound = at_rest(equation)
+            form = StickSlip(equation, stiffness, bound)
+            point = form(delta, True)
+        end, moved = form.end(delta, point), beyond(x, bound) - beyond(delta, bound)
+        left = point.F - torch.where(form.slides(delta), 0.0, stiffness * (x - delta))  # −J (Δ(x) − Δ)
+        assert point.J is not None
+        L = end.L + (end.p1 * moved).sum(-1)
+        return guess, point.F, point.J, (end.p1 + left) - start[1], L, point.rest.D3, bound.clone()
+
+    def _in_increments(self, start: Start, u: tuple[Tensor, ...]) -> PartialsEquation:
+        L_d: Any = self.model.at(*u) if u else self.model
+        return PartialsEquation(L_d, *start, 1, True)
+
+    @contextmanager
+    def _given(self, ends: Ends) -> Iterator[None]:
+        """The model with its potential known at q0 and q1."""
+        potential = self.model.potential
+        self.model.potential = GivenPotential(potential, ends)  # pyright: ignore[reportAttributeAccessIssue]
+        try:
+            yield
+        finally:
+            self.model.potential = potential
 
     def _leap(self, q: Tensor, p: Tensor, h: Tensor, here: Field) -> Tensor:
         """The step with the mass at q = 0 and no network of (q̄, v): a guess."""

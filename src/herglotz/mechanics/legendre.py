@@ -86,7 +86,13 @@ def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
     """
     F = unheld_residual(P, p0)
     held = None if P.force is None else P.force.held
-    return F if held is None else F - F.clamp(-held, held)
+    return F if held is None else torch.where(held > 0, beyond(F, held), F)
+
+
+def beyond(x: Tensor, bound: Tensor) -> Tensor:
+    """What x has beyond ±bound, x − clamp(x, −bound, bound): exactly 0 between them, with derivative 0."""
+    below = torch.where(x > bound, bound, x)
+    return x - torch.where(-bound > below, -bound, below)
 
 
 def momentum_jacobian(P: Partials, p0: Tensor) -> Tensor:

@@ -99,7 +99,7 @@ class Friction(nn.Module):
         if self.dry and self.sticking:
             grip, grip_slope = self.grip(v)
             whole = (c * h)[..., None]
-            minus, held = minus - whole * grip * v.sign(), torch.where(v == 0, whole * grip, 0.0)
+            minus, held = minus - whole * grip * v.sign(), torch.where(v.abs() > 0, 0.0, whole * grip)
             grip_slope = grip_slope * v.sign()
         if order == 1:
             return Forces(minus, plus, held=held)

@@ -14,7 +14,7 @@ from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solv
 from herglotz.mechanics.newton_one import newton_one, newton_step, norm
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import Status
-from herglotz.stepping.stick_slip import stick_slip
+from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
 
 ROUNDING = 1e3  # machine epsilons of the size: below that a move is rounding
 
@@ -80,10 +80,11 @@ def find_root(
     equation: StepEquation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
 ) -> Found:
     """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
-    sticky = stick_slip(equation)
-    if sticky is not None:
-        rules, z = Rules(tol, max_iterations), sticky.start()
-        found = newton(sticky, z, rules, _Sizes(sticky, q0, increments).tensors)
+    if sticks(equation):
+        assert isinstance(equation, PartialsEquation)
+        start, *held = at_rest(equation)
+        sticky = StickSlip(equation, *held)
+        found = newton(sticky, start, Rules(tol, max_iterations), _Sizes(sticky, q0, increments).tensors)
         x = sticky.unknown(found.x)
         return found._replace(x=x, point=equation(x, order == 2), mixed=False)
     x = guess - q0 if increments else guess

@@ -17,15 +17,49 @@ V. Acary & B. Brogliato, Numerical Methods for Nonsmooth Dynamical Systems (2008
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.legendre import unheld_jacobian, unheld_residual
+from herglotz.mechanics.legendre import beyond, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Point
 from herglotz.models import capabilities
 from herglotz.stepping.partials_equation import End, PartialsEquation
 
 SWEEPS = 8  # of Gauss–Seidel: they find which coordinates stick, Newton's iteration finds by how much the others move
+
+
+class Rest(NamedTuple):
+    """What the equation at Δ = 0 says of a step, (..., n) each."""
+
+    start: Tensor  # z of the equation that is linear in Δ
+    stiffness: Tensor  # K
+    bound: Tensor  # w/K, the |z| up to which a coordinate sticks
+
+
+def at_rest(equation: PartialsEquation) -> Rest:
+    """The start of the iteration, exact for n = 1 and by Gauss–Seidel for more, with the constants of z.
+
+    Parameters
+    ----------
+    equation
+        In the unknown q1 or, in increments, Δ = q1 − q0; its friction is set-valued.
+    """
+    zero = torch.zeros_like(equation.q0)
+    P = equation(zero if equation.increments else equation.q0, True).rest
+    F, J = unheld_residual(P, equation.p0), unheld_jacobian(P, equation.p0)
+    stiffness = J.diagonal(0, -2, -1).abs()
+    bound = P.force.held / stiffness
+    z = alone = F / stiffness
+    couples = J / stiffness[..., None]
+    n = z.shape[-1]
+    for _ in range(SWEEPS if n > 1 else 0):
+        for i in range(n):
+            delta = beyond(z, bound)
+            others = (couples[..., i, :] * delta).sum(-1) - couples[..., i, i] * delta[..., i]
+            z = torch.cat([z[..., :i], (alone[..., i] + others)[..., None], z[..., i + 1 :]], -1)
+    return Rest(z, stiffness, bound)
 
 
 class StickSlip:
@@ -35,50 +69,32 @@ class StickSlip:
     ----------
     equation
         In the unknown q1 or, in increments, Δ = q1 − q0.
-    rest
-        The equation's point at Δ = 0, of order 2: its forces say what friction can hold.
+    stiffness, bound
+        K and w/K, as `at_rest` gives them.
     """
 
-    def __init__(self, equation: PartialsEquation, rest: Point):
-        self.equation = equation
-        P = rest.rest
-        self.F, self.J = unheld_residual(P, equation.p0), unheld_jacobian(P, equation.p0)
-        self.stiffness = self.J.diagonal(0, -2, -1).abs()  # K
-        self.threshold = P.force.held / self.stiffness  # w/K
-
-    def start(self) -> Tensor:
-        """The z of the equation that is linear in Δ, F + J Δ at rest: exact for n = 1, by Gauss–Seidel for more."""
-        z = alone = self.F / self.stiffness
-        couples = self.J / self.stiffness[..., None]
-        n = z.shape[-1]
-        for _ in range(SWEEPS if n > 1 else 0):
-            for i in range(n):
-                delta = self.increment(z)
-                others = (couples[..., i, :] * delta).sum(-1) - couples[..., i, i] * delta[..., i]
-                z = torch.cat([z[..., :i], (alone[..., i] + others)[..., None], z[..., i + 1 :]], -1)
-        return z
-
-    def increment(self, z: Tensor) -> Tensor:
-        """Δ(z), exactly 0 where a coordinate sticks."""
-        return z - z.clamp(-self.threshold, self.threshold)
+    def __init__(self, equation: PartialsEquation, stiffness: Tensor, bound: Tensor):
+        self.equation, self.stiffness, self.bound = equation, stiffness, bound
 
     def unknown(self, z: Tensor) -> Tensor:
         """What the equation itself has for its unknown: Δ, or q1."""
-        delta = self.increment(z)
+        delta = beyond(z, self.bound)
         return delta if self.equation.increments else self.equation.q0 + delta
+
+    def slides(self, z: Tensor) -> Tensor:
+        """Where Δ is not 0 as the forces see it: q0 + Δ may round to q0."""
+        unknown = self.unknown(z)
+        return (unknown if self.equation.increments else unknown - self.equation.q0).abs() > 0
 
     def __call__(self, x: Tensor, second: bool) -> Point:
         """G at z = x, and ∂G/∂z if `second`."""
         order = 2 if second else self.equation.order
-        unknown = self.unknown(x)
-        point = self.equation(unknown, second)
-        # As the forces see it: q0 + Δ may round to q0.
-        P, sticks = point.rest, unknown == (0.0 if self.equation.increments else self.equation.q0)
-        G = unheld_residual(P, self.equation.p0) - torch.where(sticks, self.stiffness * x, 0.0)
+        P, slides = self.equation(self.unknown(x), second).rest, self.slides(x)
+        G = unheld_residual(P, self.equation.p0) - torch.where(slides, 0.0, self.stiffness * x)
         if order != 2:
             return Point(G, None, P)
-        J = torch.where(sticks[..., None, :], 0.0, unheld_jacobian(P, self.equation.p0))
-        return Point(G, J - torch.diag_embed(torch.where(sticks, self.stiffness, 0.0)), P)
+        J = torch.where(slides[..., None, :], unheld_jacobian(P, self.equation.p0), 0.0)
+        return Point(G, J - torch.diag_embed(torch.where(slides, 0.0, self.stiffness)), P)
 
     def push(self, point: Point) -> Tensor:
         """See `Equation`."""
@@ -93,12 +109,9 @@ class StickSlip:
         return self.equation.typical_increment()
 
 
-def stick_slip(equation: object) -> StickSlip | None:
-    """The equation in z where friction can hold a coordinate of this step; None where no friction is set-valued."""
+def sticks(equation: object) -> bool:
+    """Whether dry friction can hold a coordinate of this step."""
     if not isinstance(equation, PartialsEquation):
-        return None
+        return False
     made_of = capabilities(equation.L_d)
-    if made_of is None or not made_of.sticking:
-        return None
-    rest = torch.zeros_like(equation.q0) if equation.increments else equation.q0
-    return StickSlip(equation, equation(rest, True))
+    return made_of is not None and made_of.sticking

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
+from difflib import get_close_matches
 from typing import Any
 
 import torch
@@ -224,6 +225,23 @@ class FitConfig:
             )
         return config
 
+    def changed(self, settings: dict[str, Any]) -> FitConfig:
+        """These settings with some of them replaced; a single text or number counts as a list of one where one is due.
+
+        Raises
+        ------
+        InputError
+            If a setting does not exist; the message names the nearest.
+        """
+        known = [f.name for f in fields(self)]
+        for name in settings:
+            if name not in known:
+                near = get_close_matches(name, known, 1)
+                hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(known)}"
+                raise InputError(f"unknown setting {name!r} of a fit; {hint}")
+        lists = {name for name in known if isinstance(getattr(self, name), tuple)}
+        return replace(self, **{name: _tuple(x) if name in lists else x for name, x in settings.items()})
+
     @property
     def torch_dtype(self) -> torch.dtype:
         """The dtype as torch knows it."""
@@ -237,6 +255,10 @@ class FitConfig:
     def from_dict(cls, values: dict[str, Any]) -> FitConfig:
         """Inverse of `to_dict`; unknown keys are an error."""
         return from_plain(cls, values)
+
+
+def _tuple(x: Any) -> tuple:
+    return (x,) if isinstance(x, (str, int, float)) else tuple(x)
 
 
 def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:

@@ -7,9 +7,12 @@ import json
 import time
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Any
 
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
+from herglotz.data.anything import split_options
 from herglotz.data.lock import locked
+from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.evaluate import evaluate
@@ -21,14 +24,16 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 
 
+@one_thread()
 def fit(
-    data: Trajectories,
+    data: Any,
     config: FitConfig | None = None,
     *,
     plan: Plan | None = None,
     out: str | Path | None = None,
     progress: bool | None = None,
     resume: bool = False,
+    **settings: Any,
 ) -> Run:
     """Train a discrete contact Lagrangian on positions.
 
@@ -38,7 +43,8 @@ def fit(
     Parameters
     ----------
     data
-        Trajectories of positions, and of inputs u where there are any; of s and p as `config.supervision` says.
+        Trajectories of positions, and of inputs u where there are any; of s and p as `config.supervision` says. Or what
+        `herglotz.data.as_trajectories` reads: a path, a DataFrame, arrays.
     config
         Settings; default `FitConfig()`.
     plan
@@ -49,6 +55,9 @@ def fit(
         Show progress bars; None: on a terminal only.
     resume
         Go on from the checkpoint in `out`, if there is one.
+    **settings
+        Single settings of `FitConfig`, over those of `config` (`level="affine"`), and how data are to be read
+        (`h=0.01`, `time="t"`, `angles="theta"`, `group="run"`; see `herglotz.data.as_trajectories`).
 
     Returns
     -------
@@ -60,9 +69,18 @@ def fit(
     ------
     InputError
         If the data cannot be used, the settings are wrong, or another process is fitting into `out`.
+
+    Examples
+    --------
+    >>> run = hz.fit("motion.csv", level="affine")
+    >>> run = hz.fit(df, time="t", angles="theta", group="run")
+    >>> run = hz.fit([a, b], h=0.01)
     """
+    reading, changes = split_options(settings)
+    config = (config or FitConfig()).changed(changes)
+    data = as_trajectories(data, **reading)
     with nullcontext() if out is None else locked(out):
-        return _fit(data, config or FitConfig(), plan, out, progress, resume)
+        return _fit(data, config, plan, out, progress, resume)
 
 
 def _fit(

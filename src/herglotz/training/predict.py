@@ -12,6 +12,7 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
+from herglotz.threads import one_thread
 from herglotz.training.inputs import step_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
@@ -37,7 +38,7 @@ class Trained(Protocol):
     def stepper(self) -> Stepper: ...  # noqa: D102
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Prediction:
     """A recording beside the model's free run.
 
@@ -50,6 +51,10 @@ class Prediction:
     every: int  # stride by which the recording was thinned, so that its steps are not shorter than the model's
     most_substeps: int  # largest number of model steps in a recorded step
     outside: float  # share of model steps that are shorter or longer than those of the training data
+
+    def __repr__(self) -> str:
+        rms = "failed" if self.rms is None else f"{self.rms:.3g}"
+        return f"Prediction({', '.join(self.data.names)} of {self.data.source or 'data'}; RMS {rms})"
 
     @property
     def prediction(self) -> Tensor:
@@ -113,6 +118,7 @@ class Prediction:
         }
 
 
+@one_thread()
 def predict(
     run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
 ) -> Prediction:

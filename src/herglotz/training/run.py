@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
+from herglotz.data.anything import split_options
 from herglotz.data.trajectories import GAP
+from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
+from herglotz.training.motion import Motion, free_motion
 from herglotz.training.predict import Prediction, predict
+from herglotz.training.summary import as_html, one_line, summary
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Run:
     """A trained model with everything that is needed to judge it.
 
     `prediction` is the model's free run at every sample: on the training part from the fitted states, and from the last
-    training sample on without another look at the data.
+    training sample on without another look at the data. `rollout`, `predict`, `plot`, `export` and `verify` take and
+    return plain numbers, arrays and files; `stepper` is the differentiable stepper behind them.
     """
 
     model: ContactLagrangian
@@ -67,9 +74,87 @@ class Run:
         """The trained time stepper, with Newton's tolerance as tuned."""
         return Stepper(self.model, tol=self.setting.get("tol"))
 
-    def predict(self, data: Trajectories, **settings: Any) -> Prediction:
-        """Score the model on another recording; the settings are those of `herglotz.training.predict`."""
-        return predict(self, data, **settings)
+    def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
+        """State, with shapes (n,), (n,), (), and time at the last training sample of a trajectory.
+
+        Raises
+        ------
+        InputError
+            If there is no such trajectory.
+        """
+        if not 0 <= trajectory < len(self.data):
+            raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(self.data) - 1}")
+        row = self.data.offsets[trajectory] + max(self.train_lengths[trajectory], 1) - 1
+        return State(*(x[row].detach() for x in self.states)), float(self.data.t[row])
+
+    def rollout(self, steps: int, **start: Any) -> Motion:
+        """Step the model alone; numpy arrays come out, without gradients (`run.stepper.rollout` has gradients).
+
+        Parameters
+        ----------
+        steps
+            Number of steps K.
+        q0, p0, s0
+            Start, (..., n), (..., n), (...); left out, the last fitted state of `trajectory` (0). s0 is 0 by default.
+        t0
+            Time of the start; left out, that of the fitted state, or 0.
+        h
+            Step; left out, the model's own, or those of recorded inputs.
+        inputs
+            Held (m,), a step each (K, m), or a recording (path or trajectories) whose inputs act at their own times.
+        trajectory
+            Whose last fitted state to start from.
+
+        Returns
+        -------
+        Motion
+            t (K+1,), q and p (..., K+1, n), s (..., K+1), status (..., K).
+
+        Raises
+        ------
+        InputError
+            If shapes do not fit the model, or a recording does not cover the rollout.
+        """
+        return free_motion(self, steps, **start)
+
+    def predict(self, data: Any, **settings: Any) -> Prediction:
+        """Score the model on another recording: anything that `fit` takes.
+
+        The settings are those of `herglotz.data.as_trajectories` and of `herglotz.training.predict`.
+        """
+        reading, others = split_options(settings)
+        return predict(self, as_trajectories(data, **reading), **others)
+
+    def plot(self, name: str = "trajectory") -> Any:
+        """A matplotlib `Figure`; the names are those of the files that `herglotz plot` writes."""
+        return _front().plot(self, name)
+
+    def save(self, folder: str | Path) -> None:
+        """Write the run into a folder, as `herglotz fit` does; `herglotz.load_run` reads it."""
+        import_module("herglotz.training.run_folder").save_run(self, folder)  # which knows runs
+
+    def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
+        """Write one file that steps without this package: .pt2, .onnx or .h (`herglotz.export.export_run`)."""
+        return _front().export(self, path, kind, **settings)
+
+    def verify(self, **settings: Any) -> Any:
+        """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
+        return _front().verify(self, **settings)
+
+    def summary(self) -> str:
+        """What was reached, in a few lines."""
+        return summary(self)
+
+    def __repr__(self) -> str:
+        return one_line(self)
+
+    def _repr_html_(self) -> str:
+        return as_html(self)
+
+
+def _front() -> Any:
+    """The module that knows the rooms above this one; loaded when a run is asked for something of theirs."""
+    return import_module("herglotz.front")
 
 
 def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:

@@ -12,9 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
+from herglotz.data import Trajectories, as_trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
+from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
@@ -109,8 +110,9 @@ class Selection:
         return json.dumps({"chosen": self.chosen.level, "levels": rows}, indent=2, allow_nan=False) + "\n"
 
 
+@one_thread()
 def select(
-    data: Trajectories,
+    data: Any,
     levels: Sequence[str] | None = None,
     seeds: int = 3,
     config: FitConfig | None = None,
@@ -118,6 +120,7 @@ def select(
     out: str | Path | None = None,
     progress: bool | None = None,
     resume: bool = False,
+    **reading: Any,
 ) -> Selection:
     """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
 
@@ -128,7 +131,7 @@ def select(
     Parameters
     ----------
     data
-        Trajectories of positions.
+        Trajectories of positions, or anything else that `fit` takes.
     levels
         Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried and preferred in this
         order. None: those of `levels_for`.
@@ -140,6 +143,8 @@ def select(
         Folder for one checkpoint a fit, so that `resume` goes on after an interruption.
     progress, resume
         As for `fit`.
+    **reading
+        How other data than trajectories are to be read (`herglotz.data.as_trajectories`).
 
     Raises
     ------
@@ -147,6 +152,7 @@ def select(
         If a level is unknown or nothing is held out, or no level has a finite held-out error.
     """
     config = config or FitConfig()
+    data = as_trajectories(data, **reading)
     levels = levels_for(data, config) if levels is None else levels
     unknown = [level for level in levels if level not in LADDER]
     if unknown or not levels:

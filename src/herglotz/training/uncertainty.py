@@ -19,6 +19,7 @@ from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes, without
 from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
+from herglotz.threads import one_thread
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.problems.grid import segment_grid
@@ -104,6 +105,7 @@ class Laplace:
         self.information = A.double()  # prior included
         self.covariance = _inverse(self.information) * self.inflation**2
 
+    @one_thread()
     def bands(self) -> Bands:
         """The run's prediction at every sample with its standard deviation, held-out part included.
 
@@ -226,11 +228,13 @@ def _inverse(A: Tensor) -> Tensor:
     return (vectors / values.clamp_min(NULL * float(values[-1]))) @ vectors.T / size[:, None] / size
 
 
+@one_thread()
 def laplace(run: Run) -> Laplace:
     """The Gauss–Newton posterior of a run; see `Laplace`."""
     return Laplace(run)
 
 
+@one_thread()
 def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: int = 20) -> Bands:
     """The mean prediction of fits from several seeds to the same data, with their spread.
 

@@ -12,7 +12,6 @@ Levenberg–Marquardt converges. States of the run are states of the distilled m
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch

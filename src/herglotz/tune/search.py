@@ -15,6 +15,7 @@ from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
+from herglotz.threads import one_thread
 from herglotz.training import Run
 from herglotz.tune.config import TuneConfig, allowed_failures
 from herglotz.tune.cost import Cost, measure_costs, timed_stepping
@@ -37,6 +38,7 @@ class _Tried:
     kicks: KickStepper | None = None
 
 
+@one_thread()
 def tune(
     run: Run,
     *,

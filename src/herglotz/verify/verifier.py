@@ -9,6 +9,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces, partials
+from herglotz.threads import one_thread
 from herglotz.verify.action import derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.legendre import left_formalism, momentum_matching, regularity
@@ -32,6 +33,7 @@ FORCED = "A map with friction or inputs is no contact map: the other checks need
 IDENTITY = {torch.float64: 1e-10, torch.float32: 1e-3}
 
 
+@one_thread()
 def verify(
     target: Any,
     *,

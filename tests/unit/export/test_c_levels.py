@@ -31,6 +31,7 @@ CASES: dict[str, dict[str, Any]] = {
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},
     "coupled": {"level": "forced", "coupled": True},
+    "sticking": {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1, "potential_width": 2},
     "velocities": {"level": "linear", "features": ("cos(q1) v1 v2", "q2^2 v2^2")},
     "order 4": {"level": "linear", "order": 4, "potential_width": 0, "features": ("q2^4", "cos(q1) v1 v2")},
     "order 4, coupled motors": {
@@ -40,7 +41,10 @@ CASES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 # Derivatives that the default suite compiles, which takes 5 to 15 s each: every kind of term is in one of them.
-ALWAYS = ("affine, tanh", "full, correction", "motors", "velocities", "order 4, coupled motors")
+ALWAYS = ("affine, tanh", "full, correction", "motors", "sticking", "velocities", "order 4, coupled motors")
+
+
+SLOW_STICKING = pytest.param("sticking", marks=pytest.mark.slow)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -62,6 +66,8 @@ def damped(case):
             parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
         if model.friction is not None:
             model.friction.viscous.abs_()
+            if model.friction.sticking:  # so strong that joints stop
+                model.friction.coulomb.abs_().add_(0.2)
         if model.action is not None:  # so large that a missing term is seen
             model.action.rate.mul_(6)
         if isinstance(model.kinetic, PositionKinetic):
@@ -120,7 +126,7 @@ def test_every_level_agrees_with_the_eager_stepper(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["coupled", "velocities", "order 4", "order 4, coupled motors"])
+@pytest.mark.parametrize("case", ["coupled", "sticking", "velocities", "order 4", "order 4, coupled motors"])
 def test_a_thousand_steps_of_features_and_joints_agree(case):
     # fails if rounding of features, of coupled friction or of order 4 adds up (test_c_matrix.py has the other terms)
     model, states, options = problem(case, 1000)
@@ -162,14 +168,16 @@ def test_a_failed_step_has_no_derivative():
     assert bool(torch.isnan(found.by_state).all())
 
 
-@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4"])
+@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4", SLOW_STICKING])
 def test_float32_keeps_its_digits_over_many_steps(case):
     # fails if c is multiplied into p or sigma: 1 + E rounds, and 1000 steps add it up to 3e-5
     model, states, options = problem(case, 1000, torch.float32)
     compiled = compiled_of(case, torch.float32)
-    ours, single = compiled.rollout(*states, **options), compiled.rollout(*(x[0] for x in states), **options)
+    start, alone = one(0, states, options)
+    ours, single = compiled.rollout(*states, **options), compiled.rollout(*start, **alone)
     wide = State(*(x.double() for x in states))
-    exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=1000)
+    wider = {key: x.double() for key, x in options.items() if key == "inputs"}
+    exact = compile_c(model.double()).rollout(*wide, h=float(torch.tensor(H)), steps=1000, **wider)
     assert ours.ok.all()
     for name in ("q", "p", "s", "sigma"):
         assert relative(getattr(ours, name), getattr(exact, name)) <= 1e-5, name
@@ -177,6 +185,23 @@ def test_float32_keeps_its_digits_over_many_steps(case):
     for sigma, truth in ((ours.sigma, exact.sigma), (single.sigma, exact.sigma[0])):  # it falls: entry by entry
         rounded = 1000 * 6e-8 * float((truth[..., 1] / truth[..., 0] - 1).abs().max())  # c - 1, once a step
         assert (sigma / truth - 1).abs().max() <= 1e-6 + rounded
+
+
+def test_joints_stand_still_and_break_away_as_in_the_eager_stepper():
+    # fails if the file loses the bound of z, takes the momentum of a joint at rest from its neighbour, or starts wrong
+    model, states, options = problem("sticking", 200)
+    with torch.no_grad():
+        eager = Stepper(model, tol=4e-16).rollout(*states, **options)
+    ours = compiled_of("sticking").rollout(*states, **options)
+    still, moves = (run.q[:, 1:] == run.q[:, :-1] for run in (ours, eager)), eager.q.diff(dim=1) != 0
+    assert torch.equal(*still)
+    assert bool((moves[:, 1:] & ~moves[:, :-1]).any())  # a joint breaks away
+    assert bool((~moves[:, 1:] & moves[:, :-1]).any())  # a joint comes to rest
+    for q1 in (states.q, states.q + 0.01 * states.p):
+        u = options["inputs"][:, 0]
+        with torch.no_grad():
+            begin = Stepper(model).init(states.q, q1, states.s, H, u)
+        assert relative(compiled_of("sticking").init(states.q, q1, states.s, H, u).p, begin.p) <= 1e-13
 
 
 def test_no_inputs_is_not_a_missing_input():

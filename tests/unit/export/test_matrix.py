@@ -17,12 +17,12 @@ WRITE = {"pt2": export_pt2, "onnx": export_onnx, "aoti": export_aoti}
 SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
 EVERY = [*LEVELS, *TERMS]
 # Always tested; the others are slow tests.
-ALWAYS = {"pt2": ("affine",), "onnx": (*LEVELS, "order 4"), "aoti": ()}
+ALWAYS = {"pt2": ("affine",), "onnx": (*LEVELS, "order 4", "sticking"), "aoti": ()}
 MATRIX = [
     pytest.param(form, name, marks=[] if name in ALWAYS[form] else pytest.mark.slow)
     for form in WRITE
     for name in EVERY
-    if form != "aoti" or name in ("affine", "forced", "order 4")  # a compiler run of 20–60 s for each
+    if form != "aoti" or name in ("affine", "forced", "order 4", "sticking")  # a compiler run of 20–60 s for each
 ]
 
 
@@ -111,7 +111,7 @@ def test_inputs_reach_their_own_step(form, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-@pytest.mark.parametrize("name", [*LEVELS, "order 4"])
+@pytest.mark.parametrize("name", [*LEVELS, "order 4", "sticking"])
 @pytest.mark.parametrize("form", ["pt2", "onnx"])
 def test_a_thousand_steps_at_every_batch_size(form, name, dtype, tmp_path):
     # fails if a graph is specialised to a batch or mixes samples, a float64 constant turns a float32 graph into a mixed

@@ -10,6 +10,7 @@ from herglotz.stepping import State, Stepper
 CASES = {
     "linear": {"level": "linear", "correction_width": 3},
     "dry, inputs": {"level": "forced", "coulomb": True, "inputs": 1},
+    "sticking": {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1},
     "order 4": {"level": "linear", "order": 4, "potential_width": 0, "features": ("q2^4",)},
 }
 

@@ -171,8 +171,17 @@ def test_rollout_of_recorded_inputs(exact_run, tmp_path, capsys):
     assert float((motion.q - data.q).abs().max()) < 0.01
     assert main([*command, "--inputs", str(tmp_path / "u.csv"), "--u", "1"]) == 2
     assert "leave one out" in capsys.readouterr().err
+    # from the last fitted state the inputs are those of its time: the rollout is the run's own free run
+    first = exact_run.train_lengths[0] - 1
+    steps = exact_run.data.lengths[0] - 1 - first
+    command[3:] = [str(steps), "--out", str(tmp_path / "m.csv")]
+    assert main([*command, "--inputs", str(tmp_path / "u.csv")]) == 0
+    motion = load(tmp_path / "m.csv")
+    torch.testing.assert_close(motion.t, data.t[first:], rtol=0, atol=1e-12)
+    torch.testing.assert_close(motion.q, exact_run.prediction[first : first + steps + 1], rtol=0, atol=1e-9)
+    capsys.readouterr()
     assert main([*command, "--u", "0.1", "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["steps"] == 40
+    assert json.loads(capsys.readouterr().out)["steps"] == steps
 
 
 def test_figures_of_a_driven_run(exact_run, tmp_path, capsys):

@@ -1,5 +1,7 @@
 """A resumed fit is bit for bit the uninterrupted one, wherever it was interrupted."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -8,13 +10,14 @@ from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, stages
 
+SMALL = FitConfig(level="linear", objective="trajectory", iterations=6, potential_width=0)
 CASES = {
-    "one step": FitConfig(level="linear", objective="residual", iterations=20, correction_width=3),
-    "trajectories": FitConfig(level="linear", objective="trajectory", iterations=12, potential_width=2, departures=(0.1, 1.0)),
-    "trajectories, robust, s": FitConfig(level="full", objective="trajectory", iterations=6, potential_width=0, robust="on"),
-    "smoothing": FitConfig(level="linear", objective="smoothing", iterations=8, potential_width=0),
-    "adam, batches": FitConfig(level="linear", objective="residual", optimiser="adamw", iterations=3, batch=16, correction_width=2),
-}  # fmt: skip
+    "one step": replace(SMALL, objective="residual", iterations=20, correction_width=3),
+    "trajectories": replace(SMALL, iterations=12, potential_width=2, departures=(0.1, 1.0)),
+    "trajectories, robust, s": replace(SMALL, level="full", robust="on"),
+    "smoothing": replace(SMALL, objective="smoothing", iterations=8),
+    "adam": replace(SMALL, objective="residual", optimiser="adamw", iterations=3, batch=16, correction_width=2),
+}
 
 
 class Interrupted(BaseException):

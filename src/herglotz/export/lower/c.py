@@ -50,10 +50,11 @@ class StepInC:
         given = {name: self.program.given(name, size) for name, size in names.items()}
         graph = step_parts(equations.model, explicit)
         arrays = interpret(self.program, graph, list(given.values()))
-        guess, F, J, dp, ds, E = (list(x.ravel()) for x in arrays)
+        guess, F, J, dp, ds, E, *bound = (list(x.ravel()) for x in arrays)
+        self.sticks = bool(bound)
         self.earliest = self._earliest({name: given[name][0].statement for name in given})
         self.outputs = {
-            "begin": {"move": guess},
+            "begin": {"move": guess, **({"P->bound": bound[0]} if bound else {})},
             "evaluate_first": {"t->F": F},
             **({} if explicit else {"evaluate": {"t->F": F, "t->J": J}}),
             "gains": {"dp": dp, "*ds": ds[0], "*E": E[0]},
@@ -202,7 +203,9 @@ def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: 
     V, slope = (np.full(n, 0.0, object) for n in (1, step.n)) if graph is None else interpret(program, graph, [q])
     outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
     head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
-    texts = TYPES.format(push="  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else "", problem=step.members("P"),
+    push = "  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else ""
+    push += "  REAL bound[hz_N]; /* up to which dry friction holds the move */\n" if step.sticks else ""
+    texts = TYPES.format(push=push, problem=step.members("P"),
                          terms=step.members("t")) + whole(program, head, outputs) + step.source()  # fmt: skip
     slopes = _slopes_source(equations, step) if derivatives else ""
     tables = "".join(

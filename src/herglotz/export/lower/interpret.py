@@ -95,7 +95,7 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.pow.Tensor_Tensor: c.powers,
         aten.tanh_backward.default: lambda g, t: c.multiply(g, c.subtract(1.0, c.multiply(t, t))),
         aten.sigmoid_backward.default: lambda g, s: c.multiply(g, c.multiply(s, c.subtract(1.0, s))),
-        aten.gt.Tensor: c.greater, **dict.fromkeys(WHERE, c.choose),
+        aten.gt.Tensor: c.greater, aten.gt.Scalar: c.greater, **dict.fromkeys(WHERE, c.choose),
         aten.log_sigmoid.default: lambda x: c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0),
         aten.log_sigmoid_forward.default: lambda x: (
             c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0), None,
@@ -129,6 +129,8 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.broadcast_tensors.default: lambda xs: np.broadcast_arrays(*xs),
         aten.index.Tensor: lambda x, places: x[tuple(slice(None) if p is None else p for p in places)],
         aten.index_select.default: lambda x, dim, i: np.take(x, i, axis=dim),
+        aten.sign.default: lambda x: c.choose(c.greater(x, 0.0), 1.0, c.choose(c.greater(0.0, x), -1.0, 0.0)),
+        aten.diagonal.default: lambda x, offset, a, b: np.diagonal(x, offset, a, b),
         aten.diag_embed.default: _diagonal,
         aten.zeros_like.default: lambda x, **_: _full(x.shape, 0),
         aten.ones_like.default: lambda x, **_: _full(x.shape, 1),
@@ -230,14 +232,17 @@ class _Numbers:
         return out
 
     def choose(self, where: np.ndarray, x: Any, y: Any) -> np.ndarray:
-        where, x, y = np.broadcast_arrays(where, _atoms(x), _atoms(y))
-
-        def fold(condition: Any, a: Atom, b: Atom) -> Atom | None:
-            if isinstance(condition, Compared):
-                return a if a == b else None
-            return a if condition else b
-
-        return self.program.elementwise("{0} ? {1} : {2}", fold, where.astype(object), x, y)
+        where, x, y = np.broadcast_arrays(where.astype(object), _atoms(x), _atoms(y))
+        out = np.empty(x.shape, object)
+        for i in np.ndindex(x.shape):
+            condition, a, b = where[i], x[i], y[i]
+            if not isinstance(condition, Compared) or a == b:
+                out[i] = a if condition else b
+                continue
+            operands = (*condition, a, b)
+            places = (f"{{{k}}}" if isinstance(v, Ref) else f"SPREAD({{{k}}})" for k, v in enumerate(operands))
+            out[i] = self.program.scalar(f"FN_choose({', '.join(places)})", operands)
+        return out
 
     def product(self, x: np.ndarray, w: np.ndarray, bias: np.ndarray | None = None) -> np.ndarray:
         """Matrix products as torch broadcasts them."""

@@ -276,3 +276,11 @@ def write_different(w: Writer, node: Any) -> str:
     """A ≠ b."""
     a, b = node.args
     return w.emit("Not", w.emit("Equal", w.name(a), w.name(b, common_dtype(node))))
+
+
+def write_diagonal_of(w: Writer, node: Any) -> str:
+    """The diagonal of the matrices (B, n, n)."""
+    x: Any = node.args[0]
+    n = described(x).shape[-1]
+    rows = w.emit("Reshape", w.name(x), w.integers(-1, n * n))
+    return w.emit("Gather", rows, w.integers(*range(0, n * n, n + 1)), axis=1)

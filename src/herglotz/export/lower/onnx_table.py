@@ -17,6 +17,7 @@ aten = torch.ops.aten
 SIMPLE = {
     aten.abs.default: "Abs", aten.neg.default: "Neg", aten.sin.default: "Sin", aten.cos.default: "Cos",
     aten.exp.default: "Exp", aten.tanh.default: "Tanh", aten.sqrt.default: "Sqrt", aten.sigmoid.default: "Sigmoid",
+    aten.sign.default: "Sign",
     aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not",
     aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul", aten.bmm.default: "MatMul",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
@@ -173,4 +174,5 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.atanh.default: ops.write_atanh,
     aten.log_sigmoid.default: ops.write_log_sigmoid,
     aten.diag_embed.default: ops.write_diagonal,
+    aten.diagonal.default: ops.write_diagonal_of,
 }

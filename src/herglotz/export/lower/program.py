@@ -29,13 +29,13 @@ class Ref(NamedTuple):
 
 
 class Compared(NamedTuple):
-    """The condition a > b."""
+    """The condition a > b, which only `where` reads."""
 
     a: Any
     b: Any
 
 
-Atom = Any  # float | Ref | Compared
+Atom = Any  # float | Ref
 NAME = re.compile(r"@(\d+)")
 
 
@@ -147,8 +147,6 @@ class Program:
 
     def read(self, atom: Atom) -> str:
         """One number, as an operand."""
-        if isinstance(atom, Compared):
-            return f"{self.read(atom.a)} > {self.read(atom.b)}"
         if not isinstance(atom, Ref):
             return literal(atom)
         return f"@{atom.statement}[{atom.index}]" if self.statements[atom.statement].size else f"@{atom.statement}"
@@ -298,13 +296,7 @@ def literal(value: float) -> str:
 
 
 def _reads(atoms: Iterable[Atom]) -> set[int]:
-    reads: set[int] = set()
-    for x in atoms:
-        if isinstance(x, Compared):
-            reads |= _reads((x.a, x.b))
-        elif isinstance(x, Ref):
-            reads.add(x.statement)
-    return reads
+    return {x.statement for x in atoms if isinstance(x, Ref)}
 
 
 def _mentioned(text: str) -> set[int]:
@@ -330,6 +322,4 @@ def _step(a: Atom, b: Atom, distance: int) -> int | None:
     if isinstance(a, Ref) and isinstance(b, Ref) and a.statement == b.statement:
         gap = b.index - a.index
         return gap // distance if gap % distance == 0 else None
-    if isinstance(a, Compared) or isinstance(b, Compared):
-        return None
     return None if isinstance(a, Ref) or isinstance(b, Ref) else 0

@@ -67,6 +67,12 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   hz_prepare(&P);
   for (pass = 0; pass < 2; pass++) { /* first c, and the momentum p0 that the step starts with; then the step's end */
     hz_begin(&P, move);
+#if hz_STICKING
+    for (i = 0; i < hz_N; i++) {
+      t.move[i] = q1[i] - q0[i];
+      if (t.move[i] != hz_R(0.0)) t.move[i] += t.move[i] > hz_R(0.0) ? P.bound[i] : -P.bound[i];
+    }
+#endif
     hz_evaluate_first(&P, &t);
     hz_gains(&P, &t, t.move, &V1, dp, &ds, &E);
     for (i = 0; !pass && i < hz_N; i++) P.p0[i] = -t.F[i] / (hz_R(1.0) + E);

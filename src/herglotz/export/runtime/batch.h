@@ -148,7 +148,7 @@ static inline void hz_wide_solve_from_guess(hz_wide_track *track, hz_wide_terms 
     guess[0][i] = t->move[i];
     guess[1][i] = hz_R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
     for (w = 0; w < hz_LANES; w++)
-      if (track->known[w] >= 3 && track->miss[1][w] < track->miss[0][w]) t->move[i][w] = guess[1][i][w];
+      if (!hz_STICKING && track->known[w] >= 3 && track->miss[1][w] < track->miss[0][w]) t->move[i][w] = guess[1][i][w];
   }
   hz_wide_solve(&track->P, t, open, residual);
   for (i = 0; i < hz_N; i++) {
@@ -207,7 +207,7 @@ static inline void hz_wide_advance(hz_wide_state *state, hz_wide_track *track, c
   hz_wide_terms t;
   hz_wide_state next;
   hz_wide_potential_t V1;
-  hz_lanes x[hz_N], dp[hz_N], ds, E, sum = hz_spread(hz_R(0.0)), low_q[hz_N], low_p[hz_N], low_s, low_sigma;
+  hz_lanes x[hz_N], dp[hz_N], ds, E, sum = hz_spread(hz_R(0.0)), low_q[hz_N], low_p[hz_N], low_s, low_sigma, moved;
   int open[hz_LANES], i, w, redo = 0, left = 0, changed = 0;
   for (w = 0; w < hz_LANES; w++) left += open[w] = status[w] == hz_CONVERGED;
   if (!left) return;
@@ -246,7 +246,14 @@ static inline void hz_wide_advance(hz_wide_state *state, hz_wide_track *track, c
   hz_wide_solve_from_guess(track, &t, open, residual);
   for (i = 0; i < hz_N; i++) x[i] = track->move[0][i];
 #endif
-  for (i = 0; i < hz_N; i++) next.q[i] = hz_wide_add(P->q0[i], x[i], &low_q[i]);
+  for (i = 0; i < hz_N; i++) {
+    moved = x[i];
+#if hz_STICKING /* as hz_moved */
+    moved = hz_select((hz_masks)(moved > P->bound[i]), P->bound[i], moved);
+    moved = x[i] - hz_select((hz_masks)(-P->bound[i] > moved), -P->bound[i], moved);
+#endif
+    next.q[i] = hz_wide_add(P->q0[i], moved, &low_q[i]);
+  }
   hz_wide_potential(next.q, &V1);
   hz_wide_gains(P, &t, x, &V1, dp, &ds, &E);
   for (i = 0; i < hz_N; i++) {

@@ -59,6 +59,8 @@ static inline hz_real hz_softplus(hz_real x) {
   return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
+static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
+
 #ifdef __GNUC__
 /* Registers of numbers, as wide as the processor's, with GCC and clang: what they hold side by side is the units of a
    layer or, in batches, the samples. Any other compiler goes number by number. */
@@ -87,6 +89,10 @@ static inline hz_lanes hz_spread(hz_real x) {
 
 static inline hz_lanes hz_select(hz_masks where, hz_lanes a, hz_lanes b) {
   return (hz_lanes)((where & (hz_masks)a) | (~where & (hz_masks)b));
+}
+
+static inline hz_lanes hz_wide_choose(hz_lanes a, hz_lanes b, hz_lanes x, hz_lanes y) {
+  return hz_select((hz_masks)(a > b), x, y);
 }
 
 static inline hz_lanes hz_wide_growth(hz_lanes y) {

@@ -167,6 +167,19 @@ static inline void hz_push(const hz_real *u, hz_real push[hz_N]) {
 #define hz_PASS_U
 #endif
 
+/* The move of what Newton has solved for: the move itself or, where dry friction can hold a coordinate, a number z of
+   which the move is what lies beyond the bound. */
+static inline hz_real hz_moved(const hz_problem *P, int i, hz_real z) {
+#if hz_STICKING
+  const hz_real below = z > P->bound[i] ? P->bound[i] : z;
+  return z - (-P->bound[i] > below ? -P->bound[i] : below);
+#else
+  (void)P;
+  (void)i;
+  return z;
+#endif
+}
+
 #if !hz_EXPLICIT
 /* The solution from the better of two guesses: t->move arrives as the step without what couples q1, and the other is
    the cubic through the last four positions. */
@@ -177,7 +190,7 @@ static inline int hz_solve_from_guess(hz_track *track, hz_terms *t, hz_real *res
     guess[0][i] = t->move[i];
     guess[1][i] = hz_R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
   }
-  better = track->known >= 3 && track->miss[1] < track->miss[0];
+  better = !hz_STICKING && track->known >= 3 && track->miss[1] < track->miss[0];
   for (i = 0; i < hz_N; i++) t->move[i] = guess[better][i];
   status = hz_solve(&track->P, t, residual);
   if (status) return status;
@@ -233,7 +246,7 @@ static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAK
 #endif
   for (i = 0; i < hz_N; i++) {
     low[i] = track->low_q[i];
-    q1[i] = hz_add(P->q0[i], x[i], &low[i]);
+    q1[i] = hz_add(P->q0[i], hz_moved(P, i, x[i]), &low[i]);
   }
   hz_potential(q1, &V1);
   hz_gains(P, &t, x, &V1, dp, &ds, &E);

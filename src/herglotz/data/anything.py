@@ -1,0 +1,109 @@
+"""Recordings in the form in which the user has them: files, DataFrames, Series, arrays, lists of these."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Number
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.readers import load
+from herglotz.data.table import from_frame
+from herglotz.data.trajectories import Trajectories
+from herglotz.data.units import in_radians_and_seconds
+from herglotz.errors import InputError
+
+OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles")
+
+
+def as_trajectories(
+    data: Any,
+    *,
+    h: float | None = None,  # time between the samples of arrays
+    time: Any = None,  # of a table: name of its column; of an array: the times (N,)
+    coordinates: Names | None = None,  # of a table: columns; of an array: what to call its columns
+    inputs: Any = None,  # of a table: columns; of an array: the inputs (N,) or (N, m)
+    drop: Names = (),
+    group: str | None = None,
+    angles: Names | bool | None = None,  # coordinates that are angles in rad; True for all, () for none
+) -> Trajectories:
+    """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
+
+    A list holds one recording an entry, unless its entries are numbers: that is one recording of one coordinate.
+    Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time` gives them.
+
+    Raises
+    ------
+    InputError
+        If arrays come without times, or as `load` and `read_csv` do.
+    """
+    if isinstance(data, Trajectories):
+        if (h, time, coordinates, inputs, group) != (None,) * 5 or drop:
+            raise InputError("trajectories have their columns already; of the options, only angles changes them")
+        return _marked(data, angles)
+    names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
+    if isinstance(data, (str, Path)):
+        return _marked(load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}), angles)
+    if hasattr(data, "columns"):
+        found = from_frame(data, Wanted(time, **names)) if h is None else _array(np.asarray(data), h, time, names)
+        return _marked(in_radians_and_seconds(found), angles)
+    if _is_list_of_recordings(data):
+        options = {"h": h, "time": time, **names, "angles": angles}
+        if len(data) > 1 and (time is not None or inputs is not None) and not isinstance(time, str):
+            raise InputError("time and inputs of several arrays: give h, or Trajectories.of(...) for each of them")
+        rows = [_floats("positions", one) if isinstance(one, (list, tuple)) else one for one in data]
+        return Trajectories.cat([as_trajectories(one, **options) for one in rows])
+    if time is None and h is None and hasattr(data, "index") and not callable(data.index):
+        time = _index(data.index)
+        names["coordinates"] = coordinates or (str(data.name) if data.name is not None else None)
+    return _marked(_array(data, h, time, names), angles)
+
+
+def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The options of `as_trajectories` among keyword arguments, and the others."""
+    return {k: v for k, v in settings.items() if k in OPTIONS}, {k: v for k, v in settings.items() if k not in OPTIONS}
+
+
+def _is_list_of_recordings(data: Any) -> bool:
+    if isinstance(data, (np.ndarray, Tensor)):
+        return data.ndim == 3
+    if hasattr(data, "index") and not callable(data.index):  # a Series
+        return False
+    return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
+
+
+def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
+    q = data.detach().double() if isinstance(data, Tensor) else torch.from_numpy(_floats("positions", data))
+    if (h is None) == (time is None):
+        raise InputError("positions without times: give h, the time between two samples, or time, an array of times")
+    if names["group"] is not None or names["drop"]:
+        raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
+    n = len(q)
+    t = np.arange(n) * float(h) if h is not None else _floats("time", time)
+    coordinates = names["coordinates"]
+    called = (coordinates,) if isinstance(coordinates, str) else coordinates
+    u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
+    return Trajectories.of(t, q, names=called, u=u, source="array")
+
+
+def _index(index: Any) -> np.ndarray:
+    raw = np.asarray(index)
+    return (raw - raw[:1]) / np.timedelta64(1, "s") if raw.dtype.kind == "M" else raw
+
+
+def _floats(name: str, x: Any) -> np.ndarray:
+    try:
+        return np.array(x.detach().cpu() if isinstance(x, Tensor) else x, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not numbers in rows of one length ({error})") from None
+
+
+def _marked(data: Trajectories, angles: Any) -> Trajectories:
+    if angles is not None:
+        data = data.with_angles((data.names if angles else ()) if isinstance(angles, bool) else angles)
+    return data.unwrapped()

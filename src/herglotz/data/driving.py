@@ -1,0 +1,79 @@
+"""Times and inputs of a rollout: recorded inputs act at the times at which they were recorded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from herglotz.data.readers import load
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+CLOSE = 1e-3  # of a step: a start this near to a recorded time is at that time
+
+
+def clean(values: Tensor, digits: int = 14) -> Tensor:
+    """Numbers without the last two digits of float64, so that 0.1 + 0.2 prints as 0.3."""
+    return torch.tensor([float(f"{x:.{digits}g}") for x in values.double().tolist()], dtype=torch.float64)
+
+
+def even_times(t0: float, h: float, steps: int) -> Tensor:
+    """The times of K equal steps from t0, (K + 1,)."""
+    return clean(t0 + float(f"{h:.12g}") * torch.arange(steps + 1, dtype=torch.float64))
+
+
+def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str) -> Trajectories:
+    """The recording whose inputs drive the model: the trajectory of that number, or the only one.
+
+    Raises
+    ------
+    InputError
+        If the file holds no inputs, has no such trajectory, or counts time in another unit.
+    """
+    found = path if isinstance(path, Trajectories) else load(path)
+    path = found.source or "recording"
+    if found.u is None:
+        raise InputError(f"inputs {path}: holds no inputs; name their columns u, u_*, force or torque")
+    if found.time_unit != time_unit:
+        raise InputError(f"inputs {path}: time is in {found.time_unit}, the model's in {time_unit}; convert it")
+    if len(found) == 1:
+        return found[0]
+    if trajectory >= len(found):
+        raise InputError(f"inputs {path}: there is no trajectory {trajectory}; choose one from 0 to {len(found) - 1}")
+    return found[trajectory]
+
+
+def driven(found: Trajectories, t0: float, steps: int, h: float | None) -> tuple[Tensor, Tensor]:
+    """Inputs (K, m) and times (K + 1,) of K steps from t0: the recording's own steps, or steps of h.
+
+    An input is held from its sample to the next; a step of h takes the mean over its time.
+
+    Raises
+    ------
+    InputError
+        If the recording does not cover these steps, or has no sample at t0 where its own steps are taken.
+    """
+    t, u = found.t.double(), found.u
+    assert u is not None  # `recorded` has refused others
+    where, spans = f"inputs {found.source}", f"the recording spans {float(t[0]):g} to {float(t[-1]):g}"
+    if h is None:
+        row = int((t - t0).abs().argmin())
+        if abs(float(t[row]) - t0) > CLOSE * found.typical_step:
+            raise InputError(f"{where}: no sample at the start t = {t0:g}; {spans}: give t0, or h for equal steps")
+        if row + steps >= len(t):
+            raise InputError(f"{where}: {steps} steps from t = {t0:g} need {row + steps + 1} samples, it has {len(t)}")
+        return u[row : row + steps], t[row : row + steps + 1]
+    times = even_times(t0, h, steps)
+    slack = CLOSE * h
+    if float(times[0]) < float(t[0]) - slack or float(times[-1]) > float(t[-1]) + slack:
+        raise InputError(f"{where}: the rollout lasts from {t0:g} to {float(times[-1]):g}, but {spans}; give t0")
+    total = torch.cat([torch.zeros_like(u[:1]), (u[:-1] * t.diff()[:, None]).cumsum(0)])
+    at = torch.searchsorted(t, times).clamp(1, len(t) - 1)
+    passed = (times - t[at - 1])[:, None]  # time since the last sample; ∫u grows linearly there
+    integral = total[at - 1] + u[at - 1] * passed
+    return integral.diff(dim=0) / times.diff()[:, None], times

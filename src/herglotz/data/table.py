@@ -1,0 +1,94 @@
+"""`Trajectories` from the columns of a table, whether a csv file or a DataFrame holds it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
+from herglotz.data.rows import group_rows, quote
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError
+
+
+def from_table(
+    path: Path,  # begins messages
+    columns: Columns,
+    at: Sequence[int],  # (N,) row number of each sample in the file, for messages
+    labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one
+    values: Any,  # (N, columns.numeric) numbers
+) -> Trajectories:
+    """Group the rows into trajectories; a coordinate in rad is taken for an angle.
+
+    Raises
+    ------
+    InputError
+        If the time of a trajectory does not increase, or a trajectory is too short.
+    """
+    values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
+    groups = group_rows(path, at, labels, values[:, 0].tolist(), _called(columns))
+    table = values[[i for group in groups for i in group]]
+    widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
+    t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
+    units = tuple(columns.units[i] or "1" for i in columns.q)
+    return Trajectories.of(
+        t[:, 0],
+        q,
+        tuple(len(group) for group in groups),
+        names=tuple(columns.names[i] for i in columns.q),
+        units=units,
+        angles=tuple(unit == "rad" for unit in units),
+        s=s[:, 0] if s.size else None,
+        p=p if p.size else None,
+        u=u if u.size else None,
+        time_unit=columns.units[columns.time] or "s",
+        source=path.name,
+        columns=columns.roles(),
+    )
+
+
+def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
+    """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
+
+    Raises
+    ------
+    InputError
+        Naming column, row (counted from 0), value and remedy.
+    """
+    where, heads = Path("DataFrame"), [str(name) for name in frame.columns]
+    columns = assign(heads, str(where), wanted)
+    raw = [np.asarray(frame[name]) for name in frame.columns]
+    numbers = np.stack([_numbers(columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
+    labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
+    return from_table(where, columns, range(len(numbers)), labels, numbers)
+
+
+def moment(text: str) -> datetime | None:
+    """A date with time in ISO 8601, such as 2026-03-01 12:00:00.25; None for other text."""
+    try:
+        return datetime.fromisoformat(text.strip())
+    except ValueError:
+        return None
+
+
+def _called(columns: Columns) -> tuple[str, str]:
+    label = "trajectory" if columns.trajectory is None else columns.names[columns.trajectory]
+    return label, columns.names[columns.time]
+
+
+def _numbers(name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
+    """A column as finite float64; dates become seconds since the first of them."""
+    if is_time and column.dtype.kind == "M":
+        return (column - column[:1]) / np.timedelta64(1, "s")
+    try:
+        found = column.astype(np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"DataFrame, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+    bad = np.nonzero(~np.isfinite(found))[0]
+    if len(bad):
+        raise InputError(f"DataFrame, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
+    return found

@@ -1,0 +1,28 @@
+"""Degrees become radians and other times seconds, so that angles unwrap and rates are per second."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from herglotz.data.trajectories import Trajectories
+
+DEGREES = ("deg", "°", "degree", "degrees")
+PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9, "min": 1 / 60}
+
+
+def in_radians_and_seconds(data: Trajectories) -> Trajectories:
+    """Return the set with coordinates in degrees as angles in rad, and a time in ms, µs, ns or min in s."""
+    degrees = [unit in DEGREES for unit in data.units]
+    if any(degrees):
+        factor = data.q.new_tensor([math.pi / 180 if turned else 1.0 for turned in degrees])
+        data = replace(
+            data,
+            q=data.q * factor,
+            units=tuple("rad" if turned else unit for turned, unit in zip(degrees, data.units, strict=True)),
+            angles=tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True)),
+        )
+    if data.time_unit in PER_SECOND:
+        # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
+        data = replace(data, t=data.t / PER_SECOND[data.time_unit], time_unit="s")
+    return data

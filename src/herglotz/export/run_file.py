@@ -1,0 +1,56 @@
+"""`export_run`: a run as one file, with its names, units, start and metrics inside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from herglotz.errors import InputError
+from herglotz.export.c_header import export_c
+from herglotz.export.lower.aoti import export_aoti
+from herglotz.export.lower.onnx import export_onnx
+from herglotz.export.lower.pt2 import export_pt2
+from herglotz.training import Run
+
+WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}
+KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file, by the end of its name
+
+
+def export_run(
+    run: Run, path: str | Path, kind: str | None = None, *, h_range: tuple[float, float] | None = None
+) -> Path:
+    """Write the model of a run as one file that steps without this package.
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    path
+        File ending in .pt2, .onnx or .h.
+    kind
+        "pt2", "aoti", "onnx" or "c"; None: by the end of the name.
+    h_range
+        Steps that the file is for; None: those of the data.
+
+    Raises
+    ------
+    InputError
+        If the name has another end, or the format cannot hold the model.
+    """
+    path = Path(path)
+    kind = kind or KINDS.get(path.suffix.lower())
+    if kind not in WRITERS:
+        raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
+    (q, p, s), t = run.last_fitted()
+    metadata = {
+        "names": list(run.data.names),
+        "time_unit": run.data.time_unit,
+        "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
+        "metrics": run.metrics,
+        "h_range": list(h_range or run.h_range),
+    }
+    described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
+    if run.setting and kind == "c":
+        described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
+    WRITERS[kind](run.model, path, **described)
+    return path

@@ -1,0 +1,38 @@
+"""What a run can do by rooms that stand above `training`: pictures, exported files, verification."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from herglotz.errors import InputError
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from herglotz.training import Run
+    from herglotz.verify import Report
+
+
+def plot(run: Run, name: str) -> Figure:
+    """One of the figures of `herglotz.plots.FIGURES`, by name."""
+    from herglotz.plots import FIGURES
+
+    known = {Path(file).stem: draw for file, draw in FIGURES.items()}
+    if name not in known:
+        raise InputError(f"there is no figure {name!r}; choose one of {', '.join(known)}")
+    return known[name](run)
+
+
+def export(run: Run, path: str | Path, kind: str | None, **settings: Any) -> Path:
+    """Write one file that steps the model; see `herglotz.export.export_run`."""
+    from herglotz.export import export_run
+
+    return export_run(run, path, kind, **settings)
+
+
+def verify(run: Run, **settings: Any) -> Report:
+    """Measure every identity of the run; see `herglotz.verify.verify`."""
+    from herglotz.verify import verify
+
+    return verify(run, **settings)

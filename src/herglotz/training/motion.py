@@ -1,0 +1,109 @@
+"""`Run.rollout`: numbers in, numpy arrays out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.driving import driven, even_times, recorded
+from herglotz.errors import InputError
+from herglotz.stepping import State, Stepper
+
+Numbers = float | Sequence | np.ndarray | Tensor
+
+
+class Steppable(Protocol):
+    """The attributes of a run that `free_motion` uses."""
+
+    @property
+    def stepper(self) -> Stepper: ...  # noqa: D102
+    @property
+    def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def h(self) -> float: ...  # noqa: D102
+
+    def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
+        """State and time at the last training sample of a trajectory."""
+        ...
+
+
+@dataclass(frozen=True, repr=False)
+class Motion:
+    """A motion of a model as numpy arrays: K + 1 samples, the start first. Everything after a failed step is NaN."""
+
+    t: np.ndarray  # (K+1,) time
+    q: np.ndarray  # (..., K+1, n) position
+    p: np.ndarray  # (..., K+1, n) momentum; the first mass is 1
+    s: np.ndarray  # (..., K+1) action
+    status: np.ndarray  # (..., K) of every step, 0 where it was solved (`herglotz.Status`)
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    time_unit: str
+
+    @property
+    def ok(self) -> bool:
+        """Whether every step was solved."""
+        return not self.status.any()
+
+    def __repr__(self) -> str:
+        failed = "" if self.ok else f", {int((self.status != 0).sum())} steps failed"
+        names, shape = ", ".join(self.names), tuple(self.q.shape)
+        return f"Motion(t {self.t[0]:g} to {self.t[-1]:g} {self.time_unit}, q {shape} of {names}{failed})"
+
+
+def free_motion(
+    run: Steppable,
+    steps: int,
+    *,
+    q0: Numbers | None = None,
+    p0: Numbers | None = None,
+    s0: Numbers | None = None,
+    t0: float | None = None,
+    h: float | None = None,
+    inputs: Any = None,
+    trajectory: int = 0,
+) -> Motion:
+    """Step a run from its last fitted state, or from (q0, p0, s0); see `Run.rollout`."""
+    if (q0 is None) != (p0 is None):
+        raise InputError("q0 and p0 go together; give both, or neither to start from the last fitted state")
+    state, time = run.last_fitted(trajectory) if q0 is None or p0 is None else _given(run, q0, p0, s0)
+    time = time if t0 is None else t0
+    dtype = state.q.dtype
+    u, times = _inputs(run, inputs, (time, steps, h), (trajectory, q0 is not None and t0 is None))
+    step: Any = times.diff().to(dtype) if isinstance(inputs, (str, Path, Trajectories)) else (h or run.h)
+    with torch.no_grad():
+        found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
+    arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
+    return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit)
+
+
+def _given(run: Steppable, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:
+    like, n = run.last_fitted()[0].q, run.data.dof
+    q, p = (torch.atleast_1d(torch.as_tensor(x, dtype=like.dtype)) for x in (q0, p0))
+    if q.shape[-1] != n or p.shape != q.shape:
+        raise InputError(f"q0 and p0 need {n} numbers each, one a coordinate; got {tuple(q.shape)}, {tuple(p.shape)}")
+    s = q.new_zeros(q.shape[:-1]) if s0 is None else torch.as_tensor(s0, dtype=like.dtype).expand(q.shape[:-1])
+    return State(q, p, s), 0.0
+
+
+def _inputs(
+    run: Steppable, inputs: Any, span: tuple[float, int, float | None], recording: tuple[int, bool]
+) -> tuple[Tensor | None, Tensor]:
+    """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
+    (time, steps, h), (trajectory, from_first) = span, recording
+    if isinstance(inputs, (str, Path, Trajectories)):
+        found = recorded(inputs, trajectory, run.data.time_unit)
+        return driven(found, float(found.t[0]) if from_first else time, steps, h)
+    times = even_times(time, h or run.h, steps)
+    if inputs is None:
+        return None, times
+    u = torch.as_tensor(inputs, dtype=torch.float64)
+    u = u.reshape(1) if u.ndim == 0 else u[:, None] if u.ndim == 1 and len(u) == steps else u
+    return u.expand(steps, u.shape[-1]), times

@@ -1,0 +1,81 @@
+"""What a run reached, in words: for the screen, a notebook and a file."""
+
+from __future__ import annotations
+
+from html import escape
+from textwrap import fill
+from typing import Any, Protocol
+
+from herglotz.data import Trajectories
+from herglotz.training.config import FitConfig
+
+MOST_FEATURES, COLUMNS = 5, 80
+
+
+class Judged(Protocol):
+    """The attributes of a run that are told."""
+
+    @property
+    def config(self) -> FitConfig: ...  # noqa: D102
+    @property
+    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
+    @property
+    def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def train_lengths(self) -> tuple[int, ...]: ...  # noqa: D102
+
+
+def rows(run: Judged) -> list[tuple[str, str]]:
+    """Names and values of what was reached, those that the run has."""
+    m, data = run.metrics, run.data
+    unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
+    kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
+    found = [
+        ("data", data.summary()),
+        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
+        ("features", features_in_words(run.config.features)),
+        ("extrapolation RMS", show(m.get("extrapolation_rms"), unit, "  free run over the unseen samples")),
+        ("training RMS", show(m.get("train_rms"), unit)),
+        ("one-step RMS", show(m.get("one_step_rms"), unit)),
+        ("damping rate", show(m.get("rate"), f"per {per}")),
+        ("time", show(m.get("seconds"), "s")),
+    ]
+    return [(name, value) for name, value in found if value]
+
+
+def summary(run: Judged) -> str:
+    """A few lines for people, the verdict last."""
+    table = rows(run)
+    width = max(len(name) for name, _ in table)
+    lines = [fill(value, COLUMNS, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4))
+             for name, value in table]  # fmt: skip
+    if run.metrics.get("extrapolation_status") not in (None, "ok"):
+        lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", COLUMNS))
+    return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
+
+
+def one_line(run: Judged) -> str:
+    """The run in one line of 80 characters or little more."""
+    names, verdict = ", ".join(run.data.names), run.metrics.get("verdict", "not judged").split(":")[0]
+    return f"Run({run.config.level} level, {names} of {run.data.source or 'data'}; {verdict})"
+
+
+def as_html(run: Judged) -> str:
+    """A small table for notebooks."""
+    cells = [*rows(run), ("verdict", run.metrics.get("verdict", "not judged"))]
+    body = "".join(
+        f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td></tr>"
+        for name, value in cells
+    )
+    return f"<table>{body}</table>"
+
+
+def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
+    """What the model is made of beside its terms, told or found; "" without."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
+
+
+def show(value: Any, unit: str, after: str = "") -> str:
+    """Three digits and a unit; "" where there is no value."""
+    return "" if value is None else f"{value:.3g} {unit}".rstrip() + after

@@ -1,0 +1,81 @@
+"""Recordings as users have them: arrays, lists, Series, DataFrames, paths."""
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.data import Trajectories, as_trajectories, save
+from herglotz.errors import InputError
+
+T = np.array([0.0, 0.1, 0.3, 0.4])
+Q = np.array([[1.0, 5.0], [2.0, 6.0], [3.0, 7.0], [4.0, 8.0]])
+
+
+class Series(list):
+    """The part of a pandas Series that is used."""
+
+    def __init__(self, values, index, name):
+        super().__init__(values)
+        self.index, self.name = np.asarray(index), name  # type: ignore[assignment]
+
+
+class Frame(dict):
+    """The part of a DataFrame that is used."""
+
+    columns = property(lambda self: list(self))
+
+
+def test_one_array(tmp_path):  # fails if times, names, angles or inputs of an array are lost
+    one = as_trajectories(Q, time=T, coordinates=("a", "b"), angles="b", inputs=T * 2)
+    assert (one.lengths, one.names, one.angles, one.units) == ((4,), ("a", "b"), (False, True), ("1", "rad"))
+    assert one.q.tolist() == Q.tolist()
+    assert one.t.tolist() == T.tolist()
+    assert one.u is not None
+    assert one.u[:, 0].tolist() == (T * 2).tolist()
+    assert as_trajectories([1, 2, 4], h=0.5).t.tolist() == [0, 0.5, 1]
+    assert as_trajectories(torch.tensor(Q, requires_grad=True), h=0.5, angles=True).angles == (True, True)
+    save(tmp_path / "a.npz", one)
+    assert as_trajectories(str(tmp_path / "a.npz")).digest() == one.digest()
+
+
+def test_angles_are_continuous():  # fails if an array's angle keeps a jump of 2π, which would read as a motion
+    assert as_trajectories([3.0, -3.0, -2.9], h=1, angles=True).q[1:, 0].tolist() == pytest.approx(
+        [3.2832, 3.3832], 1e-4
+    )
+
+
+@pytest.mark.parametrize("several", [[Q, Q[:3]], [Q.tolist(), Q[:3].tolist()], (torch.tensor(Q), Q[:3])])
+def test_a_list_is_several_recordings(
+    several,
+):  # fails if two recordings are joined into one, or rows become recordings
+    assert as_trajectories(several, h=0.1).lengths == (4, 3)
+    assert as_trajectories(np.stack([Q, Q]), h=0.1).lengths == (4, 4)
+    one = Trajectories.of(T, Q)
+    assert as_trajectories([one, one]).lengths == (4, 4)
+
+
+def test_tables():  # fails if a Series' index is not its time, or a DataFrame's options are dropped
+    found = as_trajectories(Series([1, 2, 3, 4], T, "theta"), angles=True)
+    assert (found.names, found.t.tolist(), found.angles) == (("theta",), T.tolist(), (True,))
+    frame = Frame({"clock": T, "theta[deg]": Q[:, 0], "tau": Q[:, 1]})
+    found = as_trajectories(frame, time="clock")
+    assert (found.names, found.units) == (("theta",), ("rad",))
+    assert found.u is not None
+    assert as_trajectories([frame, frame], time="clock", inputs=()).lengths == (4, 4)
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        (Q, {}, "positions without times: give h"),
+        (Q, {"h": 0.1, "time": T}, "positions without times: give h, the time between two samples, or time"),
+        ([[1, 2], [1, 2, "x"]], {"h": 0.1}, "not numbers|trajectory 0 has 2 samples"),
+        ("nothing.csv", {}, "no such file"),
+        (Q, {"h": 0.1, "group": "run"}, "group and drop are of tables"),
+        (Trajectories.of(T, Q), {"h": 0.1}, "have their columns already"),
+        ([Q, Q], {"time": T}, "time and inputs of several arrays"),
+    ],
+)
+def test_mistakes(data, options, message):  # fails if a mistake is a traceback, or an option is ignored
+    with pytest.raises(InputError, match=message):
+        as_trajectories(data, **options)

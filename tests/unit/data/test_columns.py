@@ -1,0 +1,137 @@
+"""What a column is taken for: by its name and unit, by the user's word, and said in a table."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.cli import main
+from herglotz.data import Trajectories, load
+from herglotz.data.table import from_frame
+from herglotz.errors import InputError
+
+
+class Frame(dict):
+    """The part of a DataFrame that is used: `columns` and `frame[name]`."""
+
+    columns = property(lambda self: list(self))
+
+
+def read(folder, text, **options):
+    path = folder / "motion.csv"
+    path.write_text(text)
+    return load(path, **options)
+
+
+def rows(*columns):
+    return "\n".join(",".join(map(str, row)) for row in zip(*columns, strict=True)) + "\n"
+
+
+@pytest.mark.parametrize(
+    "head",
+    ["force[N]", "F[N]", "F", "torque[Nm]", "Torque", "tau", "tau_1", "tau2", "motor_left", "u1", "u2", "u_0",
+     "push[N]", "M[N*m]"],
+)  # fmt: skip
+def test_forces_are_inputs(tmp_path, head):  # fails if a force becomes a second coordinate
+    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
+    assert data.names == ("x",)
+    assert data.u is not None
+    assert data.u[:, 0].tolist() == [8, 9, 7]
+
+
+@pytest.mark.parametrize("head", ["f", "N", "taut", "motion", "uplift", "forceful", "x[m]", "up", "unit[Nms]"])
+def test_other_names_stay_coordinates(tmp_path, head):  # fails if a pattern swallows names that only begin like a force
+    assert read(tmp_path, f"t,{head}\n0,1\n1,2\n2,3\n").u is None
+
+
+def test_degrees_and_milliseconds(tmp_path):
+    # fails if degrees are fitted as lengths, if an angle is not unwrapped, or if 300 ms are not the float 0.3
+    data = read(tmp_path, "t[ms],theta[deg]\n0,170\n100,-175\n300,-160\n")
+    assert (data.units, data.angles, data.time_unit) == (("rad",), (True,), "s")
+    assert data.t.tolist() == [0, 0.1, 0.3]
+    torch.testing.assert_close(data.q[:, 0], torch.tensor([170.0, 185.0, 200.0]).double() * math.pi / 180)
+
+
+def test_dates(tmp_path):  # fails if a date is refused, or its fractions of a second are lost
+    text = "timestamp,x\n2026-03-01 23:59:59.50,1\n2026-03-01T23:59:59.75,2\n2026-03-02 00:00:01,3\n"
+    data = read(tmp_path, text)
+    assert (data.t.tolist(), data.time_unit) == ([0, 0.25, 1.5], "s")
+    with pytest.raises(InputError, match=r"row 3: .* differ in having a time zone"):
+        read(tmp_path, "time,x\n2026-03-01T10:00:00Z,1\n2026-03-01T10:00:01,2\n2026-03-01T10:00:02,2\n")
+
+
+def test_the_users_word_counts(tmp_path):  # fails if a column keeps the role of its name against the user's word
+    text = "clock,t,run,a,b,u,F\n" + rows([0, 1, 2], [9, 9, 9], list("zzz"), [1, 2, 3], [4, 5, 6], [7, 8, 9], [1, 1, 1])
+    data = read(tmp_path, text, time="clock", group="run", inputs="b", drop="a", coordinates=["u"])
+    assert (data.t.tolist(), data.q[:, 0].tolist()) == ([0, 1, 2], [7, 8, 9])
+    assert data.u is not None
+    assert data.u.tolist() == [[4], [5], [6]]
+    assert read(tmp_path, text, time="clock", inputs=(), drop=["run"]).u is None
+    with pytest.raises(InputError, match=r"there is no column 'c'; the columns are clock, t, run, a, b, u, F"):
+        read(tmp_path, text, drop="c")
+
+
+def test_an_unknown_clock_lists_the_columns(tmp_path):  # fails if the user is not told what there is to choose from
+    with pytest.raises(InputError, match=r"no time column; the columns are Zeit, x: choose one with --time NAME"):
+        read(tmp_path, "Zeit[s],x[m]\n0,1\n1,2\n2,3\n")
+
+
+def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
+    # fails if a column is left out of the table, a conversion is not said, or the table soils stdout
+    read(tmp_path, "t[ms],theta[deg],theta_dot,tau[Nm]\n" + rows([0, 1, 2], [1, 2, 3], [0, 0, 0], [4, 5, 6]))
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert [line.split() for line in err.splitlines()] == [
+        ["motion.csv:"],
+        ["column", "is", "taken", "for", "unit"],
+        ["t", "time", "ms,", "converted", "to", "s"],
+        ["theta", "angle", "deg,", "converted", "to", "rad"],
+        ["theta_dot", "left", "aside", "-"],
+        ["tau", "input", "Nm"],
+    ]
+    read(tmp_path, "t,x\n0,1\n1,2\n2,3\n", show=False)
+    assert capsys.readouterr().err == ""
+
+
+def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the command line is dropped on the way
+    path = tmp_path / "motion.csv"
+    path.write_text("clock,a,b\n0,1,2\n1,2,3\n")
+    flags = ["--time", "clock", "--coordinates", "a", "--inputs", "none", "--drop", "b", "--group", "lap"]
+    for command in (["fit", str(path), "--out", str(tmp_path / "run")], ["select", str(path), "--out", str(tmp_path)]):
+        assert main([*command, *flags]) == 2
+        assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
+
+
+def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning
+    np.savez(tmp_path / "a.npz", t=np.arange(4.0), q=np.arange(4.0))
+    with pytest.raises(InputError, match=r"columns are chosen in a csv table; this is arrays t, q"):
+        load(tmp_path / "a.npz", drop="q")
+
+
+def test_a_frame_is_read_like_a_csv_file():  # fails if a DataFrame's columns get other roles than a file's
+    frame = Frame({"time": np.arange(6) % 3, "lap": list("aaabbb"), "x[m]": np.arange(6.0), "torque": np.ones(6)})
+    from herglotz.data.csv_columns import Wanted
+
+    data = from_frame(frame, Wanted(group="lap"))
+    assert (data.lengths, data.names, data.units) == ((3, 3), ("x",), ("m",))
+    assert data.u is not None
+    frame["time"] = np.array(
+        ["2026-01-01T00:00:00", "2026-01-01T00:00:02", "2026-01-01T00:00:03"] * 2, "datetime64[ns]"
+    )
+    assert from_frame(frame, Wanted(group="lap")).t.tolist() == [0, 2, 3, 0, 2, 3]
+    frame["x[m]"][4] = np.nan
+    with pytest.raises(InputError, match=r"DataFrame, row 4, column 'x': nan is not finite; drop that row"):
+        from_frame(frame, Wanted(group="lap"))
+
+
+def test_irregular_sampling_is_called_so():  # fails if every long step of an irregular recording is counted as a gap
+    h = np.random.default_rng(0).uniform(0.5, 1.5, 200)
+    irregular = Trajectories.of(h.cumsum(), np.arange(200.0))
+    assert irregular.irregular
+    assert irregular.summary().endswith(f"irregular steps, {h[1:].min():.3g} to {h[1:].max():.3g} s")
+    clock = 0.01 * (1 + 0.01 * np.random.default_rng(0).standard_normal(200))  # jitter of one per cent, and two gaps
+    t = np.delete(clock.cumsum(), [50, 120, 121])
+    regular = Trajectories.of(t, np.arange(197.0))
+    assert not regular.irregular
+    assert regular.summary().endswith("2 gaps")

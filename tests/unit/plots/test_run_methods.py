@@ -1,0 +1,85 @@
+"""What a run offers beside its numbers: rollouts in numpy, pictures, files, words."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from fake_run import fake_run
+
+import herglotz as hz
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.export.run_file import WRITERS
+from herglotz.training.motion import Motion
+
+
+def test_a_rollout_is_numpy_without_gradients():
+    # fails if a rollout carries a graph of the parameters, starts elsewhere than the free run, or at another time
+    run = fake_run(trajectories=2)
+    first = run.data.offsets[1] + run.train_lengths[1] - 1
+    found = run.rollout(5, trajectory=1)
+    assert all(isinstance(x, np.ndarray) for x in (found.t, found.q, found.p, found.s, found.status))
+    np.testing.assert_allclose(found.q, run.prediction[first : first + 6].detach().numpy(), atol=1e-10)
+    np.testing.assert_allclose(found.t, run.data.t[first : first + 6], atol=1e-12)
+    assert found.ok
+    assert repr(found) == f"Motion(t {found.t[0]:g} to {found.t[-1]:g} s, q (6, 1) of theta)"
+
+
+def test_a_start_may_be_numbers_or_a_batch():  # fails if a number, a list or an array is refused, or s0 is dropped
+    run = fake_run()
+    one = run.rollout(4, q0=1.0, p0=0.2, s0=0.5, h=0.1, t0=3.0)
+    many = run.rollout(4, q0=np.array([[1.0], [0.3]]), p0=[[0.2], [0.0]], h=0.1)
+    assert (one.s[0], one.t[-1], many.q.shape) == (0.5, 3.4, (2, 5, 1))
+    np.testing.assert_allclose(one.q, many.q[0], atol=1e-12)
+    with pytest.raises(InputError, match="q0 and p0 go together"):
+        run.rollout(4, q0=1.0)
+    with pytest.raises(InputError, match="q0 and p0 need 1 numbers each"):
+        run.rollout(4, q0=[1.0, 2.0], p0=[0.0, 0.0])
+    with pytest.raises(InputError, match="there is no trajectory 3"):
+        run.rollout(4, trajectory=3)
+
+
+def test_words_are_short():  # fails if a run, data or a prediction fill the screen again (repr had 64 kB)
+    run = replace(fake_run(), metrics={"verdict": "fits to the noise: windows", "train_rms": 0.01, "rate": 0.2})
+    assert repr(run).startswith("Run(linear level, theta of simulate(damped_pendulum")
+    assert repr(run).endswith("; fits to the noise)")
+    assert max(map(len, (repr(run), repr(run.data)))) < 200
+    assert "<th style='text-align:left'>training RMS</th>" in run._repr_html_()
+    assert "Verdict: fits to the noise" in run.summary()
+    assert max(map(len, run.summary().splitlines())) <= 80
+    data = Trajectories.of(run.data.t, run.data.q, names=("theta",), angles=(True,))
+    assert len(repr(run.predict(data))) < 100
+
+
+def test_pictures_files_and_checks(tmp_path, monkeypatch):  # fails if a method of a run does not reach its room
+    run, calls = fake_run(), []
+    assert run.plot("phase_portrait").axes
+    with pytest.raises(InputError, match="no figure 'x'; choose one of trajectory, phase_portrait"):
+        run.plot("x")
+    with pytest.raises(InputError, match=r"must end in .pt2, .onnx, .h"):
+        run.export(tmp_path / "a.txt")
+    monkeypatch.setitem(
+        WRITERS, "c", lambda *given, **described: calls.append((*given, described["metadata"]["start"]))
+    )
+    monkeypatch.setattr("herglotz.verify.verify", lambda target, **settings: (target, settings))
+    assert run.export(tmp_path / "a.h", h_range=(0.1, 0.3)) == tmp_path / "a.h"
+    state, t = run.last_fitted()
+    assert calls == [(run.model, tmp_path / "a.h", {**{k: getattr(state, k).tolist() for k in "qps"}, "t": t})]
+    assert run.verify(samples=4) == (run, {"samples": 4})
+    run.save(tmp_path / "run")
+    assert hz.load_run(tmp_path / "run").data.digest() == run.data.digest()
+
+
+def test_settings_by_name():
+    # fails if a setting given by name is ignored, a misspelt one is swallowed, or an array is not read
+    q = fake_run().data.q.numpy()
+    with pytest.raises(InputError, match="unknown level 'afine'"):
+        hz.fit(q, h=0.2, level="afine")
+    with pytest.raises(InputError, match=r"unknown setting 'levle' of a fit; did you mean level\?"):
+        hz.fit(q, h=0.2, levle="affine")
+    with pytest.raises(InputError, match="positions without times"):
+        hz.fit(q, level="affine")
+    assert hz.FitConfig().changed({"features": "cos(q1)", "departures": 0.5}).features == ("cos(q1)",)
+    assert torch.get_num_threads() >= 1
+    assert isinstance(fake_run().rollout(2), Motion)

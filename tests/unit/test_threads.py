@@ -1,0 +1,38 @@
+"""What computes small matrices does so on one thread, and gives the caller's number back."""
+
+import pytest
+import torch
+
+from herglotz.threads import one_thread
+from herglotz.training import ensemble_bands, fit, laplace, select
+from herglotz.training.predict import predict
+from herglotz.tune import tune
+from herglotz.verify import verify
+
+
+@pytest.fixture
+def recorded(monkeypatch):
+    """Every number of threads that is set; PyTorch's own number stays."""
+    calls = []
+    monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
+    monkeypatch.setattr(torch, "get_num_threads", lambda: 7)
+    monkeypatch.setattr(torch, "set_num_threads", calls.append)
+    return calls
+
+
+@pytest.mark.parametrize("function", [fit, select, predict, verify, laplace, ensemble_bands, tune])
+def test_one_thread_inside_and_the_callers_number_afterwards(function, recorded):
+    # fails if a function computes on all cores, which on a busy machine took ten times as long, or if it leaves one
+    # thread behind after a failure
+    wrong: list = [object()] * (2 if function is predict else 1)
+    with pytest.raises((AttributeError, TypeError, ValueError)):
+        function(*wrong)
+    assert recorded == [1, 7]
+
+
+def test_a_user_who_chose_keeps_the_number(recorded, monkeypatch):
+    # fails if OMP_NUM_THREADS, which the command line respects, is overruled from Python
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    with one_thread():
+        pass
+    assert recorded == [7]
