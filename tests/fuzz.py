@@ -107,7 +107,7 @@ def try_one(kind: Kind, content: bytes, make: random.Random, count: Count) -> No
         count.silent += kind.hashed
 
 
-def kinds(folder: Path, only: str = "") -> list[Kind]:
+def kinds(folder: Path, only: str = "", exports: bool = True) -> list[Kind]:
     """One good file of each kind."""
     data = simulate(scene("damped_oscillator"), trajectories=2, steps=20, h=0.2, seed=0)
     for name in ("motion.csv", "motion.npz"):
@@ -127,15 +127,17 @@ def kinds(folder: Path, only: str = "") -> list[Kind]:
     trusted = {"pt2": load_pt2, "h": load_c}
     readers = {name: partial(load, trust_code=True) for name, load in trusted.items()} | {"onnx": load_onnx}
     for name, write in writers.items():
-        if only in name:
+        if exports and only in name:
             found.append(Kind(name, write(model, folder / f"model.{name}", h=0.1), readers[name]))
     return [kind for kind in found if only in kind.name]
 
 
-def fuzz(folder: Path, seconds: float = 0.0, least: int = 0, seed: int = 0, only: str = "") -> dict[str, Count]:
+def fuzz(
+    folder: Path, seconds: float = 0.0, *, least: int = 0, seed: int = 0, only: str = "", exports: bool = True
+) -> dict[str, Count]:
     """Damage the files of every kind for so many seconds each, or so many times if that takes longer."""
     counts = {}
-    for kind in kinds(folder, only):
+    for kind in kinds(folder, only, exports):
         content, make, count = kind.path.read_bytes(), random.Random(f"{seed} {kind.name}"), Count()
         kind.open(kind.path)  # the good file loads
         end = time.monotonic() + seconds

@@ -177,7 +177,7 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
         "names": len(entries.get("names") or range(n)) == n,
         "input_zero": len(entries.get("input_zero") or range(entries["inputs"])) == entries["inputs"],
         "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
-        "start": start is None or set(start) == {"q", "p", "s"},
+        "start": start is None or set(start) >= {"q", "p", "s"},
     }
     wrong = [name for name, fine in good.items() if not fine]
     if wrong:

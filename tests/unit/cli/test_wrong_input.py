@@ -105,7 +105,7 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["rollout", "missing", "--steps", "5", "--out", "OUT.csv"], "no model.pt"),
         (["rollout", "missing.pt2", "--steps", "5", "--out", "OUT.csv"], "no such file"),
         (["export", "missing", "--out", "OUT.pt2"], "no model.pt"),
-        (["export", "missing", "--out", "OUT.onnx"], "must end in .pt2"),
+        (["export", "missing", "--out", "OUT.txt"], "must end in .pt2"),
         ([], "required"),
         (["train"], "invalid choice"),
     ],

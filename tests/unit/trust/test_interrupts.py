@@ -159,4 +159,4 @@ def test_a_stopped_worker_is_said(tmp_path):
     finally:
         for worker in workers:
             worker.kill()
-            worker.wait()
+            worker.communicate()
