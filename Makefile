@@ -5,7 +5,7 @@ WORKERS ?= 2
 # One thread a test worker: two workers on two cores do not fight over them.
 ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 
-.PHONY: demo lint check test test-anywhere test-slow mutants census clean
+.PHONY: demo lint check test test-anywhere test-slow mutants fuzz census clean
 
 .venv/installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
@@ -39,6 +39,10 @@ test-slow: .venv/installed
 # Break the geometry line by line; every mutant must be noticed (several minutes).
 mutants: .venv/installed
 	$(ENV) $(PY) tests/mutants.py
+
+# Damage every kind of file: ten minutes; counts of tried, refused, executed, silently wrong. A slice is in the tests.
+fuzz: .venv/installed
+	$(ENV) PYTHONPATH=. $(PY) tests/fuzz.py
 
 # Lines a room, long functions, complexity, import circles.
 census: .venv/installed

@@ -1,19 +1,25 @@
 """The command line: one module a subcommand.
 
-A user's mistake is one line on stderr and exit code 2; a failed verification is exit code 1; Ctrl-C is 130. Only the
+A user's mistake is one line on stderr and exit code 2; a failed verification is exit code 1; Ctrl-C and SIGTERM are
+130; a fault of the package itself is 70, with a line that says how to report it. Only the
 subcommands that need PyTorch import it, so that help is immediate.
 """
 
 from __future__ import annotations
 
 import os
+import shlex
 import sys
+import traceback
 from collections.abc import Sequence
+from pathlib import Path
 
+import herglotz
+from herglotz.cli.interrupts import orderly
 from herglotz.cli.parser import build_parser
 from herglotz.errors import InputError
 
-OK, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
+OK, FAILED, WRONG_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -27,14 +33,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns
     -------
     int
-        The exit code: 0, 1 (a check failed), 2 (wrong input) or 130 (interrupted).
+        The exit code: 0, 1 (a check failed), 2 (wrong input), 70 (a fault of the package) or 130 (interrupted).
     """
     # Small matrices are fastest on one thread: on a busy machine a second thread waits for the first (9 times slower
     # was measured). PyTorch reads the variable when it is imported; a value that the user has set stays.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
-        arguments = build_parser().parse_args(argv)
-        return int(arguments.run(arguments) or OK)
+        with orderly():
+            arguments = build_parser().parse_args(argv)
+            return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
         return stop.code if isinstance(stop.code, int) else OK
     except KeyboardInterrupt as interrupt:
@@ -44,6 +51,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         return OK
     except (InputError, OSError) as error:
         return _say(f"error: {error}", WRONG_INPUT)
+    except Exception as error:
+        return _say(_internal(error, argv), INTERNAL)
+
+
+def _internal(error: Exception, argv: Sequence[str] | None) -> str:
+    """What happened where, for the people who mend it; the whole traceback where HERGLOTZ_TRACEBACK is set."""
+    if os.environ.get("HERGLOTZ_TRACEBACK"):
+        traceback.print_exception(error)
+    frame = traceback.extract_tb(error.__traceback__)[-1]
+    command = shlex.join(["herglotz", *(sys.argv[1:] if argv is None else argv)])
+    what = " ".join(str(error).split())[:200]
+    return (
+        f"internal error: {type(error).__name__}: {what} ({Path(frame.filename).name}:{frame.lineno}). This is a fault "
+        f"of herglotz {herglotz.__version__}, not yours: please report it with this line, the command `{command}`, and "
+        "what HERGLOTZ_TRACEBACK=1 in front of it prints"
+    )
 
 
 def _say(message: str, code: int) -> int:

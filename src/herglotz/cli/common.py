@@ -41,14 +41,14 @@ def count(text: str) -> int:
     return int(text)
 
 
-def check_output_file(path: Path, suffixes: Sequence[str]) -> None:
+def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) -> None:
     """Raise unless a file of this name could be written now; no file is left behind.
 
     Raises
     ------
     InputError
-        If the extension is not one of `suffixes`, the folder does not exist or cannot be written to, or the path is a
-        folder.
+        If the extension is not one of `suffixes`, the folder does not exist or cannot be written to, the path is a
+        folder, or there is such a file already and it is not to be overwritten by `force`.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"--out {path}: the name must end in {' or '.join(suffixes)}")
@@ -56,6 +56,8 @@ def check_output_file(path: Path, suffixes: Sequence[str]) -> None:
         raise InputError(f"--out {path}: is a folder; name a file in it")
     if not path.parent.is_dir():
         raise InputError(f"--out {path}: the folder {path.parent} does not exist; make it first")
+    if path.exists() and not force:
+        raise InputError(f"--out {path}: exists already; choose another name, or overwrite it with --force")
     _probe(path, path.parent)
 
 

@@ -6,9 +6,11 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import KICKS, check_output_file, positive, print_json
+from herglotz.cli.flags import add_force_flag
 
 # File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
+FORMAT = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file whose format is not named
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
@@ -20,9 +22,9 @@ Write the model of a run as one file; every format checks its own steps and repo
 
 examples:
   herglotz export runs/pendulum --out pendulum.pt2
-  herglotz export runs/pendulum --format onnx --out stepper.onnx
+  herglotz export runs/pendulum --out stepper.onnx
   herglotz export runs/pendulum --format aoti --out stepper.aoti.pt2
-  herglotz export runs/pendulum --format c --out stepper.h
+  herglotz export runs/pendulum --out stepper.h
 """
 
 
@@ -33,18 +35,22 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2, .onnx or (C) .h"
     )
-    parser.add_argument("--format", choices=tuple(SUFFIX), default="pt2", help="kind of file (default %(default)s)")
+    parser.add_argument("--format", choices=tuple(SUFFIX), help="kind of file (default: as the name says)")
     parser.add_argument(
         "--h-range", type=positive, nargs=2, metavar=("LOW", "HIGH"),
         help="range of steps h (default: that of the data); C flags other steps, Python refuses them",
     )  # fmt: skip
+    add_force_flag(parser)
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Export, load again and say what it is."""
-    check_output_file(arguments.out, (SUFFIX[arguments.format],))
+    form: str | None = arguments.format or FORMAT.get(arguments.out.suffix.lower())
+    check_output_file(arguments.out, tuple(FORMAT) if form is None else (SUFFIX[form],), arguments.force)
+    assert form is not None  # the name ends in one of them
+    arguments.format = form
     kicks = arguments.source / KICKS
     if kicks.is_file() and arguments.format == "c":
         return _kicks(arguments, kicks)

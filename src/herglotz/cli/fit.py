@@ -159,6 +159,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_run_folder(out, arguments.resume)
 
     from herglotz.data import load
+    from herglotz.data.lock import locked
     from herglotz.training import FitConfig, fit, load_run, save_run
 
     config = FitConfig(
@@ -175,7 +176,8 @@ def run(arguments: argparse.Namespace) -> int:
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     made = _make(out)
     try:
-        save_run(fit(data, config, out=out, resume=arguments.resume, progress=progress(arguments.quiet)), out)
+        with locked(out):
+            save_run(fit(data, config, out=out, resume=arguments.resume, progress=progress(arguments.quiet)), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():
             raise KeyboardInterrupt("; the same command with --resume goes on") from None

@@ -52,6 +52,19 @@ def add_machine_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
 
 
+def add_force_flag(parser: argparse.ArgumentParser) -> None:
+    """Add --force."""
+    parser.add_argument("--force", action="store_true", help="overwrite the file that --out names")
+
+
+def add_trust_flag(parser: argparse.ArgumentParser) -> None:
+    """Add --trust-code."""
+    parser.add_argument(
+        "--trust-code", action="store_true",
+        help="open a .pt2 or .h file that was not written by this user on this machine: that runs the code in it",
+    )  # fmt: skip
+
+
 def check_run_folder(out: Path, resume: bool) -> None:
     """Raise unless a run can be written there: nothing in the way, and no finished run that would be lost."""
     check_output_folder(out)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, positive, print_json, print_table
-from herglotz.cli.flags import add_column_flags, columns_of, parse_angles
+from herglotz.cli.flags import add_column_flags, add_force_flag, columns_of, parse_angles
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -51,6 +51,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the predicted motion: .csv or .npz, and a .png")
     parser.add_argument("--angles", metavar="NAMES", help="coordinates that are angles (default: those in rad or deg)")
     add_column_flags(parser)
+    add_force_flag(parser)
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
     parser.set_defaults(run=run)
 
@@ -59,7 +60,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Predict, write, draw, report."""
     out: Path | None = arguments.out
     if out is not None:
-        check_output_file(out, (".csv", ".npz"))
+        check_output_file(out, (".csv", ".npz"), arguments.force)
 
     from herglotz.data import load
     from herglotz.training import load_run

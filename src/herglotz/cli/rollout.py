@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.cli.flags import add_force_flag, add_trust_flag
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -80,13 +81,15 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--t0", type=finite, metavar="T", help="time of the start (default: of the fitted state; 0 with --q0)"
     )
+    add_force_flag(parser)
+    add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print a summary as JSON")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Read the model, step it, write the motion."""
-    check_output_file(arguments.out, (".csv", ".npz"))
+    check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     if arguments.steps < 2:
         raise InputError(f"--steps must be at least 2, got {arguments.steps}")
     if (arguments.q0 is None) != (arguments.p0 is None):
@@ -96,7 +99,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import Trajectories, save
 
-    source = read_source(arguments.source, arguments.trajectory)
+    source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
     u, times = _driven(arguments, source, t0)
     h = times.diff().to(start.q.dtype) if arguments.inputs else (arguments.h or source.h)
@@ -148,7 +151,7 @@ def _note(text: str) -> None:
     print(f"herglotz: note: {text}", file=sys.stderr)
 
 
-def read_source(path: Path, trajectory: int) -> Source:
+def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
     """Read a run or an exported model, to be stepped.
 
     Raises
@@ -172,7 +175,7 @@ def read_source(path: Path, trajectory: int) -> Source:
 
     from herglotz.export import load_exported
 
-    stepper = load_exported(path)
+    stepper = load_exported(path, trust_code=trust_code)
     m, n = stepper.metadata, stepper.dof
     stored = m.get("start")
     start = stored and State(*(torch.tensor(stored[name], dtype=stepper.dtype) for name in "qps"))

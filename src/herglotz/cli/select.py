@@ -42,6 +42,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import load
     from herglotz.data.files import write_atomically
+    from herglotz.data.lock import locked
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import FitConfig, save_run, select
 
@@ -52,10 +53,11 @@ def run(arguments: argparse.Namespace) -> int:
     levels = None
     if arguments.levels is not None:
         levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
-    found = select(data, levels, arguments.seeds, config, out=out, resume=arguments.resume)
-    save_run(found.run, out)
-    write_atomically(out / "selection.json", found.to_json().encode())
-    save_figure(plot_selection(found), out / "selection.png")
+    with locked(out):
+        found = select(data, levels, arguments.seeds, config, out=out, resume=arguments.resume)
+        save_run(found.run, out)
+        write_atomically(out / "selection.json", found.to_json().encode())
+        save_figure(plot_selection(found), out / "selection.png")
     if arguments.json:
         print_json(json.loads(found.to_json()))
     else:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.cli.flags import add_force_flag
 from herglotz.errors import InputError
 
 ABOUT = """\
@@ -67,13 +68,14 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--param", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of the scene, for example gamma=0.3; may come more than once",
     )  # fmt: skip
+    add_force_flag(parser)
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Simulate and write."""
-    check_output_file(arguments.out, (".csv", ".npz"))
+    check_output_file(arguments.out, (".csv", ".npz"), arguments.force)
     parameters = parse_parameters(arguments.param)
 
     from herglotz.data import save, simulate

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
 import math
 from pathlib import Path
 from typing import Any
 
 from herglotz.cli.common import check_output_folder, count, positive, print_json
+from herglotz.cli.flags import add_trust_flag
 from herglotz.errors import InputError
 
 DESCRIPTION = """\
@@ -45,6 +47,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--plots", type=Path, metavar="FOLDER", help="draw two identities of the action of a RUN, to rounding"
     )
+    add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
     parser.set_defaults(run=run)
 
@@ -55,11 +58,8 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
     target, path = arguments.target, None
     if Path(target).is_file():
-        from herglotz.export import load_exported
-
-        path, target = Path(target), load_exported(target)
-        if arguments.against is None:
-            arguments.against = _exported_from(target, path)
+        path = Path(target)
+        target = _opened(path, arguments)
     elif arguments.against is not None:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
@@ -98,7 +98,24 @@ def _draw(target: Any, folder: Path) -> None:
     save_figures(run, folder, IDENTITIES)
 
 
-def _exported_from(exported: Any, file: Path) -> Path | None:
+def _opened(path: Path, arguments: argparse.Namespace) -> Any:
+    """Open a file; a C header of a run that is at hand is generated again, and opened where it is the same text."""
+    from herglotz.export import load_c, load_exported
+    from herglotz.export.c_stepper import read_header
+    from herglotz.training import load_run
+
+    if path.suffix.lower() in (".csv", ".npz", ".txt"):
+        raise InputError(f"{path}: is data, not a model; fit it first: herglotz fit {path} --out RUN")
+    if path.suffix.lower() != ".h":
+        found = load_exported(path, trust_code=arguments.trust_code)
+        arguments.against = arguments.against or _exported_from(found.metadata, path)
+        return found
+    arguments.against = arguments.against or _exported_from(read_header(path)[1], path)
+    model = None if arguments.against is None else load_run(arguments.against).model
+    return load_c(path, trust_code=arguments.trust_code, model=model)
+
+
+def _exported_from(metadata: dict[str, Any], file: Path) -> Path | None:
     """Return a run with the weights of the file, from a folder near the file or the current one."""
     from herglotz.export import weights_digest
     from herglotz.training import load_run
@@ -106,7 +123,7 @@ def _exported_from(exported: Any, file: Path) -> Path | None:
     for folder in dict.fromkeys((file.parent, file.parent / "runs", Path(), Path("runs"))):
         for model in sorted(folder.glob("*/model.pt")):
             try:
-                if weights_digest(load_run(model.parent).model) == exported.metadata["weights_sha256"]:
+                if weights_digest(load_run(model.parent).model) == metadata["weights_sha256"]:
                     return model.parent
             except InputError:  # not a run of this package
                 continue
@@ -126,7 +143,17 @@ def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
     result = compare(target, found.stepper, h=arguments.h, states=states, seed=arguments.seed)
     bound = AGREEMENT[target.metadata["dtype"]]
     close = all(result[name] <= bound for name in "qpsc")
-    return {**result, "bound": bound, "passed": close and result["status"] == 0 and result["same_weights"] is not False}
+    other = other_metadata(target.metadata, found)
+    passed = close and result["status"] == 0 and result["same_weights"] is not False and not other
+    return {**result, "bound": bound, "other_metadata": other, "passed": passed}
+
+
+def other_metadata(metadata: dict[str, Any], run: Any) -> list[str]:
+    """Names of what a file says of its model and its run does not."""
+    expected = json.loads(json.dumps(run.model.config.to_dict()))  # tuples become lists, as in the file
+    said = {"level": run.model.config.level, "dof": run.model.config.dof, "model": expected}
+    metadata = json.loads(json.dumps({name: metadata[name] for name in said}))
+    return [name for name, value in said.items() if metadata[name] != value]
 
 
 def _table(agreement: dict[str, Any], against: Path | None) -> str:
@@ -137,5 +164,7 @@ def _table(agreement: dict[str, Any], against: Path | None) -> str:
         lines.append(f"  {size:>6}{numbers}  {one['failed']:>6}  {one['status']:>12}")
     if agreement["same_weights"] is False:
         lines.append("  the weights of the file are not those of the run")
+    if agreement["other_metadata"]:
+        lines.append(f"  the file does not say what the run says of: {', '.join(agreement['other_metadata'])}")
     lines.append(f"  {'agrees' if agreement['passed'] else 'DOES NOT AGREE'} (bound {agreement['bound']:g})")
     return "\n".join(lines)

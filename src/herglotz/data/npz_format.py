@@ -19,6 +19,7 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 LABELS = ("names", "units", "angles", "time_unit", "source", "hold")
+USED = (*ARRAYS, "lengths", "metadata")
 # Exceptions that numpy and zipfile raise on a damaged archive.
 DAMAGE = (
     *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
@@ -38,8 +39,12 @@ def read_npz(path: PathLike) -> Trajectories:
     InputError
         Naming the file, the array, what is wrong with it and the remedy.
     """
-    path = Path(path)
-    arrays = _arrays(path, read_bytes(path))
+    return trajectories_of(read_bytes(path), Path(path))
+
+
+def trajectories_of(content: bytes, path: Path) -> Trajectories:
+    """As `read_npz`, from what was read; the path is for messages."""
+    arrays = _arrays(path, content)
     for name in ("t", "q"):
         if name not in arrays:
             found = ", ".join(sorted(arrays)) or "none"
@@ -62,11 +67,16 @@ def write_npz(path: PathLike, trajectories: Trajectories) -> None:
     InputError
         If the file cannot be written.
     """
+    write_atomically(path, npz_bytes(trajectories))
+
+
+def npz_bytes(trajectories: Trajectories) -> bytes:
+    """The archive itself."""
     arrays = {name: x.detach().cpu().numpy() for name in ARRAYS if (x := getattr(trajectories, name)) is not None}
     metadata = json.dumps({label: getattr(trajectories, label) for label in LABELS})
     buffer = io.BytesIO()
     np.savez_compressed(buffer, lengths=np.array(trajectories.lengths), metadata=np.array(metadata), **arrays)
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
@@ -76,8 +86,8 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     name = ""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
-            for name in archive.files:
-                arrays[name] = np.asarray(archive[name])
+            for name in archive.files:  # only what is used is inflated: an archive can hold gigabytes of zeros
+                arrays[name] = np.asarray(archive[name]) if name in USED else np.empty(0)
     except DAMAGE as error:
         if "allow_pickle" in str(error):
             raise InputError(

@@ -14,7 +14,9 @@ from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
 
-def compile(source: Stepper | ContactLagrangian | PathLike | Any) -> CompiledStepper | Stepper:
+def compile(
+    source: Stepper | ContactLagrangian | PathLike | Any, *, trust_code: bool = False
+) -> CompiledStepper | Stepper:
     """A stepper with the interface of `Stepper` that steps in C, without derivatives.
 
     Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
@@ -24,6 +26,8 @@ def compile(source: Stepper | ContactLagrangian | PathLike | Any) -> CompiledSte
     ----------
     source
         A model, a `Stepper` of one, a run (its h, box and units are recorded), or a header that `export_c` wrote.
+    trust_code
+        As in `load_c`, for a header.
 
     Returns
     -------
@@ -36,7 +40,7 @@ def compile(source: Stepper | ContactLagrangian | PathLike | Any) -> CompiledSte
         If the source is none of these, or a header cannot be compiled: it has no eager stepper to fall back on.
     """
     if isinstance(source, str | os.PathLike):
-        return load_c(source)
+        return load_c(source, trust_code=trust_code)
     eager = source if isinstance(source, Stepper) else None
     described: dict[str, Any] = {}
     model: Any = source

@@ -14,15 +14,18 @@ from typing import Any
 import torch
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, model_source
-from herglotz.export.metadata import describe
+from herglotz.export.metadata import check_metadata, describe
 from herglotz.export.step_parts import pushed
+from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
 
 MARK = "herglotz-metadata: "
+NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"  # of the prefix
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
 MAX_ITERATIONS = 30
 MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
@@ -154,7 +157,9 @@ def export_c(
     path = Path(path)
     name = _identifier(path.stem) if name is None else name
     entries = described(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
-    write_atomically(path, c_source(model, entries, path.name).encode())
+    content = sealed_text(c_source(model, entries, path.name)).encode()
+    write_atomically(path, content)
+    remember(content)
     return path
 
 
@@ -204,15 +209,18 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If there are none.
+        If there are none, or they cannot be.
     """
     found = re.search(rf"^ *{re.escape(MARK)}(.*)$", text, re.MULTILINE)
     try:
         entries = json.loads(found[1]) if found else None
     except json.JSONDecodeError:
         entries = None
-    if not isinstance(entries, dict) or not {"name", "dof", "dtype", "h", "box", "angles"} <= set(entries):
+    if not isinstance(entries, dict) or not {"name", "format"} <= set(entries):
         raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export.export_c")
+    check_metadata(entries, path)
+    if not re.fullmatch(NAME, entries["name"]):
+        raise InputError(f"{path}: metadata: name must be a C identifier, got {entries['name']!r}; export it again")
     return entries
 
 
@@ -228,7 +236,7 @@ def described(
     extra: Mapping[str, Any],
 ) -> dict[str, Any]:
     """The checked entries of the comment at the top, from the arguments of `export_c`."""
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,40}", name):
+    if not re.fullmatch(NAME, name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
         raise InputError(f"dtype must be 'float64' or 'float32', got {dtype!r}")

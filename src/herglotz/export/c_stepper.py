@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import re
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -11,12 +12,16 @@ import torch
 from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
+from herglotz.data.seal import check_seal, sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, MAX_ITERATIONS, c_source, described, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
+from herglotz.export.metadata import weights_digest
+from herglotz.export.trusted import check_trusted
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
+from herglotz.stepping.state import check_started
 
 
 class CompiledStepper:
@@ -58,7 +63,7 @@ class CompiledStepper:
         h: Tensor | float = 1.0,
         u: Tensor | None = None,
     ) -> State:
-        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. NaN where it is not finite."""
+        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0. Errors as `Stepper.init`."""
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0)
         h = spread_h(self._checked_h(h), s0).contiguous()
@@ -68,7 +73,7 @@ class CompiledStepper:
         status = torch.zeros(s0.shape, dtype=torch.uint8)
         starts = [x.contiguous() for x in (q0, q1, s0)]
         self._call("herglotz_inits", s0.numel(), *starts, h, 1, u, self.inputs, p, s, status)
-        return State(q1, p, s)
+        return check_started(State(q1, p, s))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step.
@@ -248,13 +253,31 @@ class CompiledStepper:
                 )
 
 
-def load_c(path: PathLike) -> CompiledStepper:
+def read_header(path: PathLike) -> tuple[str, dict[str, Any]]:
+    """The text of a header and its metadata; nothing of it is compiled.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, was changed or is no such header.
+    """
+    content = read_bytes(path)
+    check_seal(content, path, text=True)
+    text = content.decode("utf-8", "replace")
+    return text, read_metadata(text, path)
+
+
+def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian | None = None) -> CompiledStepper:
     """Compile a header that `export_c` wrote, and load it.
 
     Parameters
     ----------
     path
         The header.
+    trust_code
+        Compile a header that was not written by this user on this machine: that runs what stands in it.
+    model
+        Of the run it was exported from: a header that is what this model gives, letter for letter, needs no trust.
 
     Returns
     -------
@@ -264,9 +287,24 @@ def load_c(path: PathLike) -> CompiledStepper:
     Raises
     ------
     InputError
-        If the file cannot be read or is no such header, or there is no compiler.
+        If the file cannot be read, was changed, is no such header or not trusted, or there is no compiler.
     """
-    return CompiledStepper(read_bytes(path).decode("utf-8", "replace"), path)
+    text, _ = read_header(path)
+    content = text.encode()
+    check_trusted(content, path, trust_code or (model is not None and _is_of(text, path, model)))
+    return CompiledStepper(text, path)
+
+
+def _is_of(text: str, path: PathLike, model: ContactLagrangian) -> bool:
+    """Whether the header is what the model gives with the header's own metadata."""
+    entries = read_metadata(text, path)
+    if entries.get("weights_sha256") != weights_digest(model):
+        return False
+    file = re.search(r'#include "([^"\n]*)"', text)
+    try:
+        return text == sealed_text(c_source(model, entries, file[1] if file else ""))
+    except (KeyError, ValueError, TypeError, AttributeError):  # metadata that this version would not have written
+        return False
 
 
 def compile_c(
@@ -277,6 +315,7 @@ def compile_c(
     units: Sequence[str] = (),
     dtype: str | None = None,
     tolerance: float | None = None,
+    trust_code: bool = False,
 ) -> CompiledStepper:
     """Compile a header that `export_c` wrote, or a model directly, and load it.
 
@@ -289,6 +328,8 @@ def compile_c(
         A header, or a model.
     h, box, units, dtype, tolerance
         As in `export_c`, for a model only; dtype defaults to the model's.
+    trust_code
+        As in `load_c`, for a header only.
 
     Returns
     -------
@@ -301,7 +342,7 @@ def compile_c(
         If there is no compiler, or the source is not usable.
     """
     if not isinstance(source, ContactLagrangian):
-        return load_c(source)
+        return load_c(source, trust_code=trust_code)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
     entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
     kept = copy.deepcopy(source)  # the model may be trained on

@@ -15,8 +15,10 @@ import tempfile
 from pathlib import Path
 
 from herglotz.data.files import write_atomically
+from herglotz.data.seal import check_seal, sealed_bytes
 from herglotz.errors import InputError
 from herglotz.export.c_header import runtime
+from herglotz.export.trusted import private_folder
 
 # No -ffast-math: a shared library built with it flushes denormals of the whole process, and drops the compensation of
 # rounding. Fused multiply-adds are what -std=c99 alone would turn off.
@@ -52,18 +54,22 @@ def build(header: str, name: str) -> ctypes.CDLL:
     loops = re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
     key = "\0".join([header, loops, *words, *FLAGS, sys.platform, _processor()])
     digest = hashlib.sha256(key.encode()).hexdigest()[:32]
-    folder = _cache()
-    library = folder / f"{digest}.so"
-    if not library.exists():
-        write_atomically(library, _compile(words, header, loops))
-    try:
-        return ctypes.CDLL(str(library))
-    except OSError:  # a damaged file
-        write_atomically(library, _compile(words, header, loops))
+    library = private_folder("c") / f"{digest}.so"
+    if not _is_whole(library):
+        write_atomically(library, sealed_bytes(_compile(words, header, loops)))
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
         raise InputError(f"{library}: cannot be loaded ({error}); check the compiler {words[0]}") from None
+
+
+def _is_whole(library: Path) -> bool:
+    """Whether a library is there as it was written: loading half of one would end the process."""
+    try:
+        check_seal(library.read_bytes(), library)
+    except (OSError, InputError):
+        return False
+    return True
 
 
 def _compile(words: list[str], header: str, loops: str) -> bytes:
@@ -84,19 +90,6 @@ def _compile(words: list[str], header: str, loops: str) -> bytes:
             lines = done.stderr.strip().splitlines() or ["no message"]
             message = next((x.strip() for x in lines if "error" in x.lower()), lines[0])  # the first names the files
     raise InputError(f"{words[0]}: does not compile the header ({message[:200]}); export the model again")
-
-
-def _cache() -> Path:
-    """A folder that only this user can write to."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.join(os.path.expanduser("~"), ".cache")
-    folder = Path(base, "herglotz", "c")
-    try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        if os.access(folder, os.W_OK):
-            return folder
-    except OSError:
-        pass
-    return Path(tempfile.mkdtemp(prefix="herglotz-c-"))
 
 
 def _processor() -> str:

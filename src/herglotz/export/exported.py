@@ -12,7 +12,8 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.export.box import Box
 from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
-from herglotz.stepping import Linearised, Rollout, State, Step, step_sizes
+from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
+from herglotz.stepping.state import check_started
 
 Program = Callable[..., tuple[Tensor, ...]]
 
@@ -68,7 +69,7 @@ class ExportedStepper:
         self._check(q0, q1, s0, ("q0", "q1", "s0"))
         h = self._checked_h(h)
         p, s = self.programs["init"](*self._flat(State(q0, q1, s0), spread_h(h, s0), u))
-        return State(q1, p.reshape(q1.shape), s.reshape(s0.shape))
+        return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
 
     def step(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Step:
         """One step.
@@ -159,7 +160,12 @@ class ExportedStepper:
         q_all, p_all, s_all, c, *rest = (x.movedim(0, 1).reshape(*s.shape, *_tail(x)) for x in out)
         status, residual, outside = rest[1], rest[0], (rest[2] if len(rest) > 2 else None)
         sigma = torch.cat([torch.ones_like(s)[..., None], c], -1).cumprod(-1)
-        q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in ((q, q_all), (p, p_all), (s, s_all)))
+        lost = ~torch.isfinite(sigma[..., 1:])  # σ is no number of the file's: too large a one is found here
+        status = torch.where(lost & (status == 0), int(Status.DIVERGED), status).to(torch.uint8)
+        nan = torch.where(lost, torch.nan, torch.zeros_like(c))
+        sigma = torch.cat([sigma[..., :1], sigma[..., 1:] + nan], -1)
+        ends = (q_all + nan[..., None], p_all + nan[..., None], s_all + nan)
+        q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in zip((q, p, s), ends, strict=True))
         found = Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual, outside=outside)
         return decimated(found, every)
 

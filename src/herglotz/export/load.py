@@ -12,21 +12,32 @@ import torch
 from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
+from herglotz.data.seal import check_seal
 from herglotz.errors import InputError
 from herglotz.export.exported import ExportedStepper, Program
 from herglotz.export.metadata import AOTI, KEY, METADATA, from_json
 from herglotz.export.programs import quiet
+from herglotz.export.trusted import check_trusted
 
 
-def load_pt2(path: PathLike) -> ExportedStepper:
+def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     """Read a file that `export_pt2` or `export_aoti` wrote.
+
+    Parameters
+    ----------
+    path
+        The file.
+    trust_code
+        Open a file that was not written by this user on this machine: that runs what stands in it.
 
     Raises
     ------
     InputError
-        If the file is missing, damaged, not one of ours, or of another format version.
+        If the file is missing, damaged, changed, not one of ours, of another format version, or not trusted.
     """
     content = read_bytes(path)
+    check_seal(content, path)
+    check_trusted(content, path, trust_code)
     try:
         with quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
             if _is_compiled(content):
@@ -56,6 +67,7 @@ def load_onnx(path: PathLike) -> ExportedStepper:
         If onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another version.
     """
     content = read_bytes(path)
+    check_seal(content, path)
     try:
         import onnxruntime as ort
     except ImportError:
@@ -81,8 +93,15 @@ def load_onnx(path: PathLike) -> ExportedStepper:
     return ExportedStepper(programs, metadata, str(path), "onnx")
 
 
-def load_exported(path: PathLike) -> Any:
+def load_exported(path: PathLike, *, trust_code: bool = False) -> Any:
     """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    trust_code
+        As in `load_pt2`, also for a header. An ONNX file needs no trust: opening it runs nothing.
 
     Returns
     -------
@@ -100,8 +119,8 @@ def load_exported(path: PathLike) -> Any:
     if suffix == ".h":
         from herglotz.export.c_stepper import load_c
 
-        return load_c(path)
-    return load_pt2(path)
+        return load_c(path, trust_code=trust_code)
+    return load_pt2(path, trust_code=trust_code)
 
 
 def _is_compiled(content: bytes) -> bool:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Literal, TypedDict
 
 import torch
 
@@ -14,14 +14,45 @@ from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.export.equation import input_count
 from herglotz.models import ContactLagrangian
+from herglotz.schema import check_entries
 
 FORMAT = 3  # 1 held a single step; 2 added rollouts and starts from positions, 3 the Jacobian of a step
 METADATA = "metadata.json"  # of our entries in a .pt2 archive
 KEY = "herglotz"  # of our entries among the metadata of an ONNX or compiled model
 AOTI = {"rollout": "model", "init": "init"}  # our names of the programs in a compiled package, and the package's
 BOX_KEYS = tuple(f"{name}_{end}" for name in "qps" for end in ("low", "high"))
-REQUIRED = ("format", "dof", "dtype", "h", "box", "newton_iterations", "newton_tolerance")
+REMEDY = "export the model again"
 TOLERANCE = 4  # machine epsilons, of Δ = q1 − q0: what is left of it goes into p divided by h, and adds up
+
+
+class _Needed(TypedDict):
+    """What every file says of itself."""
+
+    format: int
+    model: dict[str, Any]
+    weights_sha256: str
+    level: str
+    dof: int
+    inputs: int
+    dtype: Literal["float32", "float64"]
+    h: float
+    angles: list[bool]
+    units: list[str]
+    box: dict[str, list[float]] | None
+    newton_iterations: int
+    newton_tolerance: float
+
+
+class Metadata(_Needed, total=False):
+    """What the command line adds, and C."""
+
+    input_zero: list[float]
+    h_range: list[float] | None
+    names: list[str]
+    time_unit: str
+    start: dict[str, float | list[float]] | None
+    metrics: dict[str, Any]
+    name: str
 
 
 def describe(
@@ -116,13 +147,43 @@ def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
         entries = json.loads(text or "")
     except json.JSONDecodeError:
         entries = None
-    if not isinstance(entries, dict) or any(key not in entries for key in REQUIRED):
+    if not isinstance(entries, dict) or "format" not in entries:
         raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export")
+    check_metadata(entries, path)
+    return entries
+
+
+def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
+    """Refuse the metadata of another format version, and entries that cannot be.
+
+    Raises
+    ------
+    InputError
+        That names the file, the entry and the remedy.
+    """
     if entries["format"] != FORMAT:
         raise InputError(
             f"{path}: is of format {entries['format']}, this herglotz reads {FORMAT}; export the model again"
         )
-    return entries
+    check_entries(Metadata, entries, f"{path}: metadata", REMEDY)
+    n, where = entries["dof"], f"{path}: metadata"
+    span, start = entries.get("h_range"), entries.get("start")
+    good = {
+        "dof": n >= 1,
+        "h": 0 < entries["h"] < float("inf"),
+        "inputs": entries["inputs"] >= 0,
+        "angles": len(entries["angles"]) == n,
+        "units": len(entries["units"]) in (0, n),
+        "names": len(entries.get("names") or range(n)) == n,
+        "input_zero": len(entries.get("input_zero") or range(entries["inputs"])) == entries["inputs"],
+        "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
+        "start": start is None or set(start) >= {"q", "p", "s"},
+    }
+    wrong = [name for name, fine in good.items() if not fine]
+    if wrong:
+        raise InputError(f"{where}: {wrong[0]} cannot be {entries.get(wrong[0])} with {n} coordinate(s); {REMEDY}")
+    if entries["box"] is not None:
+        _box(entries["box"], n)
 
 
 def _box(box: Mapping[str, Sequence[float]], dof: int) -> dict[str, list[float]]:

@@ -21,7 +21,7 @@ from torch.utils.checkpoint import checkpoint as save_start_only
 from herglotz.errors import InputError
 from herglotz.stepping.events import Watch
 from herglotz.stepping.guess import LENGTH, Extrapolation
-from herglotz.stepping.state import Crossings, Step, StepError
+from herglotz.stepping.state import Crossings, Status, Step, StepError
 
 PROGRESS_AFTER = 2.0  # seconds
 
@@ -163,7 +163,17 @@ def roll_out(start: Any, drive: Drive) -> Track:
     axis = sigma.ndim - 1  # behind those of the batch
     events = () if drive.watch is None else drive.watch.crossings(carry.state)
     move = lambda x: x.movedim(0, axis)  # noqa: E731
-    return Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
+    track = Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
+    return track if bool(torch.isfinite(carry.sigma).all()) else _without_lost_factors(track)
+
+
+def _without_lost_factors(track: Track) -> Track:
+    """Steps from where σ = ∏ c_j is too large a number are lost: they are NaN and have a status, as in C."""
+    lost = ~torch.isfinite(track.sigma) & (torch.arange(track.sigma.shape[-1]) > 0).to(track.sigma.device)
+    nan = torch.where(lost, torch.nan, 0.0).to(track.sigma.dtype)
+    states = tuple(x + nan.reshape(nan.shape + (1,) * (x.ndim - nan.ndim)) for x in track.states)
+    found = torch.where(lost[..., 1:] & (track.status == 0), int(Status.DIVERGED), track.status).to(torch.uint8)
+    return track._replace(states=states, sigma=track.sigma + nan, status=found)
 
 
 def _segment(carry: Carry, ks: range, drive: Drive, progress: _Progress | None = None) -> tuple[Carry, Block]:

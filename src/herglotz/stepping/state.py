@@ -98,26 +98,56 @@ class Rollout:
         return ((self.status == Status.CONVERGED) | (self.status == Status.STOPPED)).all(-1)
 
 
-def check_state(state: State, L_d: DiscreteLagrangian | None = None) -> State:
+def check_state(
+    state: State,
+    L_d: DiscreteLagrangian | None = None,
+    names: tuple[str, str, str] = ("q", "p", "s"),
+    finite: bool = False,
+) -> State:
     """The same state.
 
     Raises
     ------
     InputError
-        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any.
+        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any; with `finite`, if a
+        number is not.
     """
     q, p, s = state
-    check_arguments(q, p, s, ("q", "p", "s"))
+    check_arguments(q, p, s, names)
     if q.dtype not in (torch.float32, torch.float64):  # linear solves know no others, and 8 bits no increments
-        raise InputError(f"q must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()")
+        raise InputError(
+            f"{names[0]} must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()"
+        )
     if p.shape != q.shape or s.shape != q.shape[:-1]:
-        raise InputError(f"q, p, s need shapes (..., n), (..., n), (...); got {[tuple(x.shape) for x in state]}")
+        shapes = [tuple(x.shape) for x in state]
+        raise InputError(f"{', '.join(names)} need shapes (..., n), (..., n), (...); got {shapes}")
     if p.dtype != q.dtype or s.dtype != q.dtype:
         raise InputError(f"q, p and s need one dtype, got {q.dtype}, {p.dtype}, {s.dtype}")
     parameter = next(L_d.parameters(), None) if isinstance(L_d, torch.nn.Module) else None
     if parameter is not None and parameter.dtype != q.dtype:
         raise InputError(f"the state is {q.dtype} and the model {parameter.dtype}; convert one with .to(dtype)")
+    n = getattr(getattr(L_d, "config", None), "dof", None)
+    if n is not None and q.shape[-1] != n:
+        raise InputError(f"{names[0]} has {q.shape[-1]} coordinates, the model {n}; its shape must be (..., {n})")
+    for name, x in zip(names, state, strict=True):
+        if finite and not bool(torch.isfinite(x).all()):
+            raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
     return State(q, p, s)
+
+
+def check_started(state: State) -> State:
+    """The same state, made by `init`.
+
+    Raises
+    ------
+    StepError
+        If a number of it is not finite.
+    """
+    good = torch.isfinite(state.p).all(-1) & torch.isfinite(state.s)
+    if not bool(good.all()):
+        sample = tuple(int(i) for i in (~good).nonzero()[0])
+        raise StepError(f"init failed at sample {sample}: p1 or s1 is not finite; take positions closer together")
+    return state
 
 
 def check_h(h: Tensor | float, like: Tensor) -> Tensor:
@@ -126,11 +156,12 @@ def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     Raises
     ------
     InputError
-        If it is not positive.
+        If it is not positive and finite.
     """
     h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
-    if not bool((h > 0).all()):
-        raise InputError(f"h must be > 0, got {float(h.min()):g}")
+    if not bool(((h > 0) & (h < torch.inf)).all()):
+        wrong = float(h[~((h > 0) & (h < torch.inf))].flatten()[0])
+        raise InputError(f"h must be {'finite' if wrong > 0 else '> 0'}, got {wrong:g}")
     return h
 
 

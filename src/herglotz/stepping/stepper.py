@@ -19,6 +19,7 @@ from herglotz.stepping.state import (
     Step,
     StepError,
     check_h,
+    check_started,
     check_state,
     step_sizes,
     throw_failure,
@@ -70,9 +71,18 @@ class Stepper(OneStepMethod):
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0 (a choice of gauge).
 
         `u`, (..., m), is the input of the step from q0 to q1 where L_d takes inputs.
+
+        Raises
+        ------
+        InputError
+            If shapes or dtypes do not fit, a number is not finite, h is not positive, or L_d takes no inputs.
+        StepError
+            If p1 or s1 of a sample is too large a number.
         """
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
-        return State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h))
+        check_state(State(q0, q1, s0), self.L_d, ("q0", "q1", "s0"), finite=True)
+        h = check_h(h, q0)
+        return check_started(State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h)))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step: guess → solve → momentum → action.

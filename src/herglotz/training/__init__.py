@@ -11,7 +11,8 @@ from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.problems.supervised import SupervisedProblem
-from herglotz.training.run import Run, load_run, save_run
+from herglotz.training.run import Run
+from herglotz.training.run_folder import load_run, save_run
 from herglotz.training.selection import Selection, select
 from herglotz.training.smoother import Smoothed, smooth
 from herglotz.training.solvers.adam import adam

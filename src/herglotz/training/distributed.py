@@ -11,6 +11,7 @@ import functools
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from datetime import timedelta
 
 import torch
 import torch.distributed as dist
@@ -18,6 +19,7 @@ from torch import Tensor
 
 PARTS, LEAST = 8, 512  # rows are divided into at most PARTS parts of at least LEAST rows
 LANES = 2
+TIMEOUT = 60  # seconds that a process waits for the others; they do equal shares of the work between two sums
 
 
 def world() -> tuple[int, int]:
@@ -94,12 +96,26 @@ def everywhere(holds: bool) -> bool:
 
 @contextmanager
 def process_group() -> Iterator[None]:
-    """Join the processes that `torchrun` started (NCCL with a GPU, gloo without), and part from them at the end."""
+    """Join the processes that `torchrun` started (NCCL with a GPU, gloo without), and part from them at the end.
+
+    Raises
+    ------
+    RuntimeError
+        If one of them does not answer for 60 seconds.
+    """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield
         return
-    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo")
+    limit = timedelta(seconds=float(os.environ.get("HERGLOTZ_TIMEOUT", TIMEOUT)))
+    dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo", timeout=limit)
     try:
         yield
+    except RuntimeError as error:
+        if "timed out" not in str(error).lower():
+            raise
+        raise RuntimeError(
+            f"a process of torchrun has not answered for {limit.total_seconds():g} s: it was stopped or killed, or is "
+            "slower than that (HERGLOTZ_TIMEOUT sets the seconds); start again with resume"
+        ) from error
     finally:
         dist.destroy_process_group()

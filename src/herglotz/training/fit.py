@@ -6,13 +6,14 @@ import hashlib
 import json
 import math
 import time
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
+from herglotz.data.lock import locked
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
@@ -74,7 +75,7 @@ def fit(
     Raises
     ------
     InputError
-        If the data cannot be used or the settings are wrong.
+        If the data cannot be used, the settings are wrong, or another process is fitting into `out`.
 
     Examples
     --------
@@ -82,10 +83,22 @@ def fit(
     >>> run = hz.fit(df, time="t", angles="theta", group="run")
     >>> run = hz.fit([a, b], h=0.01)
     """
-    started = time.perf_counter()
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = as_trajectories(data, **reading)
+    with nullcontext() if out is None else locked(out):
+        return _fit(data, config, plan, out, progress, resume)
+
+
+def _fit(
+    data: Trajectories,
+    config: FitConfig,
+    plan: Plan | None,
+    out: str | Path | None,
+    progress: bool | Literal["lines"] | None,
+    resume: bool,
+) -> Run:
+    started = time.perf_counter()
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
     seen = look(data, config, stages, plan)

@@ -1,24 +1,21 @@
-"""A finished fit, in memory and on disk."""
+"""A finished fit, in memory."""
 
 from __future__ import annotations
 
-import json
 from dataclasses import dataclass
 from importlib import import_module
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories, as_trajectories, read_npz, write_npz
+from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
-from herglotz.data.files import write_atomically
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.mechanics import Driven
-from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.stepping.method import OneStepMethod
 from herglotz.theory import ContinuousEquation, FractionalStepper
@@ -28,8 +25,6 @@ from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.predict import Prediction, predict
 from herglotz.training.summary import as_html, one_line, summary
-
-FORMAT = 1
 
 
 @dataclass(frozen=True, repr=False)
@@ -188,7 +183,7 @@ class Run:
 
     def save(self, folder: str | Path) -> None:
         """Write the run into a folder, as `herglotz fit` does; `herglotz.load_run` reads it."""
-        save_run(self, folder)
+        import_module("herglotz.training.run_folder").save_run(self, folder)  # which knows runs
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
         """Write one file that steps without this package: .pt2, .onnx or .h (`herglotz.export.export_run`)."""
@@ -216,69 +211,6 @@ class Run:
 def _front() -> Any:
     """The module that knows the rooms above this one; loaded when a run is asked for something of theirs."""
     return import_module("herglotz.front")
-
-
-def save_run(run: Run, folder: str | Path) -> None:
-    """Write model.pt, config.json, metrics.json and fit.npz into a folder; each file whole or not at all."""
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
-    write_npz(folder / "fit.npz", run.data)
-    model = {
-        "format": FORMAT,
-        "model": run.model.config.to_dict(),
-        "parameters": {k: v.detach().cpu() for k, v in run.model.state_dict().items()},
-        "states": {k: v.detach().cpu() for k, v in run.states._asdict().items()},
-        "train_lengths": list(run.train_lengths),
-        "h": run.h,
-        "box": run.box,
-        "history": run.history,
-        "data_digest": run.data.digest(),
-    }
-    buffer = BytesIO()
-    torch.save(model, buffer)
-    write_atomically(folder / "model.pt", buffer.getvalue())
-    for name, values in (("config.json", run.config.to_dict()), ("metrics.json", run.metrics)):
-        write_atomically(folder / name, (json.dumps(values, indent=2, allow_nan=False) + "\n").encode())
-
-
-def load_run(folder: str | Path) -> Run:
-    """Read what `save_run` wrote.
-
-    Raises
-    ------
-    InputError
-        If a file is missing, damaged or of another format.
-    """
-    folder = Path(folder)
-    if not (folder / "model.pt").is_file():
-        raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
-    try:
-        stored = torch.load(folder / "model.pt", weights_only=True)
-    except Exception as error:  # torch raises many kinds for a damaged file
-        raise InputError(f"{folder / 'model.pt'}: cannot be read ({type(error).__name__}); fit again") from None
-    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        raise InputError(f"{folder / 'model.pt'}: not a herglotz model of format {FORMAT}; fit again")
-    config = FitConfig.from_dict({**_json(folder / "config.json"), "device": "cpu"})
-    model = ContactLagrangian(ModelConfig.from_dict(stored["model"])).to(config.torch_dtype)
-    model.load_state_dict(stored["parameters"])
-    return Run(
-        model,
-        config,
-        _json(folder / "metrics.json"),
-        read_npz(folder / "fit.npz"),
-        tuple(stored["train_lengths"]),
-        State(**stored["states"]),
-        stored["h"],
-        stored["box"],
-        stored["history"],
-    )
-
-
-def _json(path: Path) -> dict[str, Any]:
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read ({error}); fit again") from None
 
 
 def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:

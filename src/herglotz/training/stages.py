@@ -7,26 +7,55 @@ import time
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict
 
 import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from herglotz.data.files import write_atomically
+from herglotz.data.files import read_bytes, write_atomically
+from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
+from herglotz.schema import check_entries
 from herglotz.training.distributed import is_first
-from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
 
-Callback = Callable[[int, float, Tensor], None]
+FORMAT = 2  # 2 holds all that a search goes on from
+REMEDY = "delete it and fit from the start"
 EVERY = 25  # iterations between two checkpoints inside a stage
+
+
+class _Stored(TypedDict):
+    """What a checkpoint holds."""
+
+    format: Literal[2]
+    key: str
+    stages: dict[str, dict[str, Any]]
+    kept: dict[str, dict[str, Any]]
+
+
+class Callback:
+    """What a stage's optimiser reports to; it shows progress and stores the search."""
+
+    def __init__(self, bar: Any, store: Callable[[dict[str, Any]], None], resumed: dict[str, Any] | None):
+        self.bar, self.store, self.resumed = bar, store, resumed
+        self.start: float | None = None
+
+    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
+        """See `levenberg_marquardt.Progress`."""
+        self.bar.update(1)
+        self.start = cost if self.start is None else self.start
+        self.bar.set_postfix_str(f"cost {cost / self.start:.3g} of its start" if self.start else "", refresh=False)
+        if iteration % EVERY == 0:
+            self.store(search())
 
 
 class Stages:
     """Run optimisations one after the other, and record them.
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
-    and an unfinished one goes on from its best point.
+    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
+    bits as one that was not interrupted, on the same machine with as many threads.
 
     Parameters
     ----------
@@ -63,59 +92,65 @@ class Stages:
         return self.kept[name]
 
     def run(
-        self, name: str, x: Tensor, total: int, optimise: Callable[[Tensor, Callback], OptimiserResult]
+        self,
+        name: str,
+        x: Tensor,
+        total: int,
+        optimise: Callable[[Tensor, Callback], OptimiserResult],
+        problem: Any = None,
     ) -> OptimiserResult:
-        """Run one stage from x (or from where the checkpoint left it) and record its history."""
+        """Run one stage from x (or from where the checkpoint left it) and record its history.
+
+        `problem` is what the stage optimises, where later work goes on from what it remembers.
+        """
         stored = self.done.get(name)
-        if stored is not None:
-            x = stored["x"].to(x)
         if stored is not None and stored["done"]:
-            result = OptimiserResult(x, stored["cost"], stored["reason"], stored["iterations"], stored["history"])
+            kept = {key: stored[key] for key in ("cost", "reason", "iterations", "history", "memory")}
+            result = OptimiserResult(stored["x"].to(x), **kept)
+            remind(problem, result.memory)
         else:
             with tqdm(total=total, desc=name, disable=self.disable, leave=False) as bar:
-                start: float | None = None
+                resumed = None if stored is None else stored["search"]
 
-                def callback(iteration: int, cost: float, best: Tensor) -> None:
-                    nonlocal start
-                    bar.update(1)
-                    start = cost if start is None else start
-                    bar.set_postfix_str(f"cost {cost / start:.3g} of its start" if start else "", refresh=False)
-                    if iteration % EVERY == 0:
-                        self._store(name, OptimiserResult(best, cost, "interrupted", iteration), done=False)
+                def store(search: dict[str, Any]) -> None:
+                    self.done[name] = {"done": False, "search": search}
+                    self._write()
 
                 began = time.monotonic()
-                result = optimise(x, callback)
+                result = optimise(x, Callback(bar, store, resumed))
             if self.lines:
                 took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
                 print(f"{name}: {took}", file=sys.stderr, flush=True)
-            self._store(name, result, done=True)
+            self._store(name, result)
         start = len(self.history)
         self.history += [{"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)]
         return result
 
-    def _store(self, name: str, r: OptimiserResult, done: bool) -> None:
+    def _store(self, name: str, r: OptimiserResult) -> None:
         self.done[name] = {
             "x": r.x.detach().cpu(),
             "cost": r.cost,
             "reason": r.reason,
             "iterations": r.iterations,
             "history": r.history,
-            "done": done,
+            "memory": r.memory,
+            "done": True,
         }
         self._write()
 
     def _write(self) -> None:
         if self.checkpoint is not None and is_first():
             buffer = BytesIO()
-            torch.save({"key": self.key, "stages": self.done, "kept": self.kept}, buffer)
-            write_atomically(self.checkpoint, buffer.getvalue())
+            torch.save({"format": FORMAT, "key": self.key, "stages": self.done, "kept": self.kept}, buffer)
+            write_atomically(self.checkpoint, sealed_zip(buffer.getvalue()))
 
 
 def _read(checkpoint: Path) -> dict[str, Any]:
+    content = read_bytes(checkpoint)
+    check_seal(content, checkpoint, REMEDY)
     try:
-        stored = torch.load(checkpoint, weights_only=True)
-        return {"key": stored["key"], "stages": stored["stages"], "kept": stored.get("kept", {})}
+        stored = torch.load(BytesIO(content), weights_only=True, map_location="cpu")
     except Exception as error:  # torch raises many kinds for a damaged file
-        raise InputError(
-            f"{checkpoint}: cannot be read ({type(error).__name__}); delete it and fit from the start"
-        ) from None
+        raise InputError(f"{checkpoint}: cannot be read ({type(error).__name__}); {REMEDY}") from None
+    check_entries(_Stored, stored, str(checkpoint), REMEDY)
+    return stored

@@ -159,6 +159,7 @@ class SegmentStages:
             lambda x, callback: levenberg_marquardt(
                 target, x, max_iterations=total, rtol=1e-4, patience=3, callback=callback
             ),
+            problem,
         )  # fmt: skip
         if not self.frozen:
             theta = problem.unpack(result.x)[0]

@@ -12,7 +12,6 @@ Levenberg–Marquardt converges. States of the run are states of the distilled m
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import torch
@@ -26,7 +25,6 @@ from herglotz.training import Prior, levenberg_marquardt
 from herglotz.training.parameter_vector import ParameterVector
 
 EXACT = 1e-8  # σ of the residuals relative to the motion's size
-Callback = Callable[[int, float, Tensor], None]
 
 
 class FlowProblem:
@@ -107,7 +105,6 @@ def distil(
     h: float,
     *,
     iterations: int = 80,
-    callback: Callback | None = None,
 ) -> tuple[ContactLagrangian, float]:
     """Fit every parameter of a model to a flow map over h; the given model is the starting point.
 
@@ -117,7 +114,7 @@ def distil(
         The distilled model, and the RMS of its one-step residuals, in units of q.
     """
     problem = FlowProblem(model, before, after, h)
-    result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3, callback=callback)
+    result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3)
     new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)
     ParameterVector(new).set(result.x)
     return new, float(problem.residuals(result.x).square().mean().sqrt())

@@ -60,11 +60,12 @@ class Report:
     target: str
     checks: tuple[Check, ...]
     details: dict[str, Any] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()  # names of checks that this target calls for and that could not be judged
 
     @property
     def passed(self) -> bool:
-        """Whether there are checks and every one passed."""
-        return bool(self.checks) and all(check.passed for check in self.checks)
+        """Whether there are checks, every one passed, and none is missing."""
+        return bool(self.checks) and not self.missing and all(check.passed for check in self.checks)
 
     def __getitem__(self, name: str) -> Check:
         """Return the check called `name`."""
@@ -89,6 +90,8 @@ class Report:
             f"  {_pad(claim, widths[0])}  {value:>{widths[1]}}  {bound:<{widths[2]}}  {verdict}".rstrip()
             for claim, value, bound, verdict in rows
         ]
+        if self.missing:
+            lines.append(f"  could not be judged: {', '.join(self.missing)}")
         lines += [f"  [{i}] {note}" for i, note in enumerate(notes, 1)]
         lines += [f"  Not judged: {self.details['not_judged']}"] if "not_judged" in self.details else []
         return "\n".join(lines)
@@ -99,6 +102,7 @@ class Report:
             "target": self.target,
             "passed": self.passed,
             "details": self.details,
+            "missing": list(self.missing),
             "checks": [check.to_dict() for check in self.checks],
         }
 

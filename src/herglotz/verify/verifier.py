@@ -107,9 +107,11 @@ def verify(
     behind = replace(known, L_d=model) if known.forced else known
     force = _forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
+    missing: tuple[str, ...] = ()
     if not known.differenced:  # else DΦ̃ is made of differences
         checks.append(derivative(known, w))
     if known.forced and force is None:
+        missing = ("contact", "momentum")
         checks[2] = replace(checks[2], note=f"{checks[2].note}. {FORCED}")
     elif force is None:
         loose = identity
@@ -143,7 +145,7 @@ def verify(
         more, numbers = data_checks(known.run)
         checks += more
         details["data"] = numbers
-    return Report(known.name, tuple(checks), details)
+    return Report(known.name, tuple(checks), details, missing)
 
 
 def _not_judged(known: Subject) -> str:

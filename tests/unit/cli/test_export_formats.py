@@ -8,6 +8,7 @@ import torch
 
 from herglotz.cli import main
 from herglotz.data import load
+from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
 
@@ -46,13 +47,13 @@ def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):
 @pytest.mark.skipif(not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH")
 def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     # fails if a run or a file steps at any h in silence, or a motion leaves the data in silence
-    out, motion = str(tmp_path / "a.h"), ["--steps", "3", "--out", str(tmp_path / "a.csv")]
+    out, motion = str(tmp_path / "a.h"), ["--steps", "3", "--out", str(tmp_path / "a.csv"), "--force"]
     assert main(["export", str(tiny_run), "--format", "c", "--out", out]) == 0
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--h", "0.05"]) == 0
         note = "note: steps of 0.05 s are outside of 0.2 to 0.2, those that the model was fitted to"
         assert note in capsys.readouterr().err
-    assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", "0.2"]) == 0
+    assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", "0.2", "--force"]) == 0
     assert main(["rollout", out, *motion, "--h", "0.05", "--q0", "0.1", "--p0", "0"]) == 0
     assert "note" not in capsys.readouterr().err
     for source in (out, str(tiny_run)):
@@ -65,10 +66,9 @@ def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys
     # user is not told
     monkeypatch.chdir(tmp_path)
     few = ["verify", str(tiny_onnx), "--samples", "4", "--steps", "2"]
-    shutil.copytree(tiny_run, tmp_path / "runs" / "one")
-    stored = torch.load(tmp_path / "runs/one/model.pt", weights_only=True)
-    stored["parameters"] = {key: 2 * value for key, value in stored["parameters"].items()}
-    torch.save(stored, tmp_path / "runs/one/model.pt")
+    other = load_run(tiny_run)
+    other.model.load_state_dict({key: 2 * value for key, value in other.model.state_dict().items()})
+    save_run(other, tmp_path / "runs" / "one")
     assert main(few) == 0
     assert "not compared with its model" in capsys.readouterr().out
     shutil.copytree(tiny_run, tmp_path / "runs" / "two")

@@ -105,7 +105,7 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["rollout", "missing", "--steps", "5", "--out", "OUT.csv"], "no model.pt"),
         (["rollout", "missing.pt2", "--steps", "5", "--out", "OUT.csv"], "no such file"),
         (["export", "missing", "--out", "OUT.pt2"], "no model.pt"),
-        (["export", "missing", "--out", "OUT.onnx"], "must end in .pt2"),
+        (["export", "missing", "--out", "OUT.txt"], "must end in .pt2"),
         ([], "required"),
         (["train"], "invalid choice"),
     ],
@@ -133,5 +133,5 @@ def test_bad_rollouts(tmp_path, capsys, tiny_run, options, message):  # fails if
 def test_a_damaged_run_and_file(tmp_path, capsys):  # fails if torch's own error gets through
     (tmp_path / "model.pt").write_bytes(b"junk")
     (tmp_path / "a.pt2").write_bytes(b"junk")
-    assert "cannot be read" in mistake(capsys, tmp_path, "verify", tmp_path)
-    assert "not a readable .pt2" in mistake(capsys, tmp_path, "verify", tmp_path / "a.pt2")
+    assert "has no manifest.json" in mistake(capsys, tmp_path, "verify", tmp_path)
+    assert "does not end with its sha256" in mistake(capsys, tmp_path, "verify", tmp_path / "a.pt2")

@@ -12,6 +12,7 @@ from torch.export import ExportedProgram
 from torch.export.graph_signature import InputKind
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.seal import sealed_onnx
 from herglotz.errors import InputError
 from herglotz.export.lower.onnx_table import write
 from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of
@@ -75,7 +76,8 @@ def export_onnx(
     for name, (inputs, outputs) in further.items():
         second = graph_of(programs[name], (*inputs, *u), outputs, {})
         properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
-    write_atomically(path, graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties))
+    content = graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties)
+    write_atomically(path, sealed_onnx(content))
     return Path(path)
 
 

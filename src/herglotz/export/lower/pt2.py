@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.seal import sealed_zip
 from herglotz.export.metadata import METADATA, describe, to_json
 from herglotz.export.newton import ITERATIONS
 from herglotz.export.programs import programs_of, quiet
+from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
 
 
@@ -69,5 +71,7 @@ def export_pt2(
 
         buffer = io.BytesIO()
         package_pt2(buffer, exported_programs=programs, extra_files={METADATA: text})
-    write_atomically(path, buffer.getvalue())
+    content = sealed_zip(buffer.getvalue())
+    write_atomically(path, content)
+    remember(content)
     return Path(path)

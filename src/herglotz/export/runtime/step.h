@@ -250,8 +250,9 @@ static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAK
   }
   hz_potential(q1, &V1);
   hz_gains(P, &t, x, &V1, dp, &ds, &E);
-  for (i = 0; i < hz_N; i++) sum += hz_fabs(x[i]) + hz_fabs(dp[i]) + hz_fabs(q1[i]);
-  if (!hz_finite(sum + hz_fabs(ds))) return hz_DIVERGED;
+  for (i = 0; i < hz_N; i++) sum += hz_fabs(x[i]) + hz_fabs(P->p0[i] + dp[i]) + hz_fabs(q1[i]);
+  sum += hz_fabs(P->s0 + ds) + hz_fabs(state->sigma + E * state->sigma);
+  if (!hz_finite(sum)) return hz_DIVERGED;
   if (!(hz_R(1.0) + E > hz_R(0.0))) return hz_SINGULAR;
   for (i = 0; i < hz_N; i++) {
     state->q[i] = q1[i];

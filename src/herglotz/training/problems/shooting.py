@@ -62,8 +62,20 @@ class ShootingProblem(StatesProblem):
         self.s = s
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
+        self._at: Tensor | None = None  # the unknowns of `path`
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
+
+    def memory(self) -> dict[str, Any]:
+        """The last path and where it was solved: the next solve starts there, and its last bits depend on it."""
+        if self.path is None or self._at is None:
+            return {}
+        return {"at": self._at, "x": self.path.x, "A": self.path.A}
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        """Inverse of `memory`."""
+        at, x, A = (memory[name].to(self.data.q) for name in ("at", "x", "A"))
+        self._at, self.path = at, Path(x, A)
 
     def states(self, q: Tensor, p: Tensor, s: Tensor | None = None) -> Tensor:
         """Join states (S, n), (S, n), (S,) into the unknowns' layout (S, d)."""
@@ -80,6 +92,8 @@ class ShootingProblem(StatesProblem):
 
     def solve(self, x: Tensor) -> Path | None:
         """The trajectories of all segments at x, or None where a step has no solution."""
+        if self._at is not None and torch.equal(self._at, x):
+            return self.path
         if self._solved is not None and torch.equal(self._solved[0], x):
             return self._solved[1]  # an accepted step has been solved for its cost
         theta, states = self.unpack(x)
@@ -110,7 +124,7 @@ class ShootingProblem(StatesProblem):
         if not everywhere(path is not None) or path is None:
             unknowns = len(x) - self.P * held
             return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
-        self.path = path
+        self.path, self._at = path, x.clone()
         grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
         Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
         fit, joints = self._residuals(path.x)

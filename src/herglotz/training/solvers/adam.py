@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import Protocol
+from collections.abc import Iterator
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
-from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, Progress
 
 DECAY = 1e-2  # of AdamW's weights (Loshchilov & Hutter 2019)
 QUIET, PATIENCE = 1e-8, 50  # so many costs in a row that differ by less than this, relative, end the search
@@ -40,7 +40,7 @@ def adam(
     decay: float = 0.0,
     batch: int | None = None,
     seed: int = 0,
-    callback: Callable[[int, float, Tensor], None] | None = None,
+    callback: Progress | None = None,
 ) -> OptimiserResult:
     """Adam with a cosine schedule; returns the best finite point visited.
 
@@ -60,7 +60,7 @@ def adam(
     seed
         Of the order of the rows.
     callback
-        Called with (iteration, best cost, best x).
+        Called after each iteration; an interrupted search goes on from what it holds, and gives the same bits.
     """
     current = x.clone().requires_grad_()
     optimiser = torch.optim.AdamW([current], lr=learning_rate, weight_decay=decay)
@@ -68,7 +68,26 @@ def adam(
     best, best_x, history, reason = float("inf"), x, [], "max_iterations"
     last, quiet, iteration = float("nan"), 0, 0
     rounds = None if batch is None or batch >= problem.rows else _rounds(problem.rows, batch, seed)
-    for iteration in range(1, max_iterations + 1):
+    resumed = None if callback is None else callback.resumed
+    if resumed is not None:
+        iteration, best, best_x = resumed["iteration"], resumed["best"], resumed["best_x"].to(x)
+        history, last, quiet = list(resumed["history"]), resumed["last"], resumed["quiet"]
+        with torch.no_grad():
+            current.copy_(resumed["current"])
+        current.grad = torch.zeros_like(x)
+        optimiser.load_state_dict(resumed["optimiser"])
+        schedule.load_state_dict(resumed["schedule"])
+        for _ in range(iteration if rounds is not None else 0):
+            next(rounds)
+
+    def search() -> dict[str, Any]:
+        return {
+            "iteration": iteration, "best": best, "best_x": best_x, "history": history, "last": last, "quiet": quiet,
+            "current": current.detach(), "optimiser": optimiser.state_dict(), "schedule": schedule.state_dict(),
+        }  # fmt: skip
+
+    while iteration < max_iterations and quiet < PATIENCE:
+        iteration += 1
         rows, last_of_round = (None, True) if rounds is None else next(rounds)
         here = current.detach()
         cost, gradient = problem.cost_and_gradient(here, rows)
@@ -87,10 +106,9 @@ def adam(
         optimiser.step()
         schedule.step()
         if callback is not None:
-            callback(iteration, best, best_x)
-        if quiet >= PATIENCE:
-            reason = "converged"
-            break
+            callback(iteration, best, best_x, search)
+    if quiet >= PATIENCE:
+        reason = "converged"
     return OptimiserResult(best_x, best, reason, iteration, history)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Protocol, cast
+from dataclasses import asdict, dataclass, field
+from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor
@@ -42,6 +42,27 @@ class SumOfSquares(Protocol):
         ...
 
 
+class Progress(Protocol):
+    """What an optimiser reports to, and goes on from."""
+
+    resumed: dict[str, Any] | None  # what `search` gave in the interrupted run; None: start from x
+
+    def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]], /) -> None:
+        """Called after each iteration; `search()` is all that decides how the search goes on, as plain values."""
+        ...
+
+
+def memory_of(problem: Any) -> dict[str, Any]:
+    """What a problem remembers of its last evaluation and later ones start from; {} of most."""
+    return problem.memory() if hasattr(problem, "memory") else {}
+
+
+def remind(problem: Any, memory: dict[str, Any]) -> None:
+    """Inverse of `memory_of`."""
+    if memory:
+        problem.recall(memory)
+
+
 @dataclass
 class OptimiserResult:
     """The best point found and how the search went."""
@@ -51,6 +72,25 @@ class OptimiserResult:
     reason: str  # "converged", "max_iterations", "no_descent" or "not_finite"
     iterations: int
     history: list[float] = field(default_factory=list)  # accepted costs
+    memory: dict[str, Any] = field(default_factory=dict)  # of the problem, at the end
+
+
+@dataclass
+class _Search:
+    """All that decides how the search goes on, beside the equations at x."""
+
+    x: Tensor
+    best: float
+    damping: float
+    scale: Tensor
+    history: list[float]
+    growth: float = 2.0
+    quiet: int = 0
+    iteration: int = 0
+
+    def over(self, patience: int) -> str | None:
+        """Why the search is over; None while it is not."""
+        return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
 
 def levenberg_marquardt(
@@ -61,7 +101,7 @@ def levenberg_marquardt(
     rtol: float = 1e-6,
     patience: int = 5,
     damping: float = 1e-3,
-    callback: Callable[[int, float, Tensor], None] | None = None,
+    callback: Progress | None = None,
 ) -> OptimiserResult:
     """Minimise ½|r(x)|².
 
@@ -84,50 +124,55 @@ def levenberg_marquardt(
         λ of the first step. Where few combinations of the unknowns are free beside the diagonal (smoothed states), it
         has to be far smaller than where all are.
     callback
-        Called with (iteration, cost, x) after each iteration.
+        Called after each iteration; an interrupted search goes on from what it holds, and gives the same bits.
 
     Returns
     -------
     OptimiserResult
         Always the best finite point; `reason` tells why the search ended.
     """
+    resumed = None if callback is None else callback.resumed
+    if resumed is not None:
+        remind(problem, resumed["memory"])
+        x = resumed["search"]["x"].to(x)
     cost, A, b = _of_first(problem.normal_equations(x))
-    best = float(cost)
     if not bool(torch.isfinite(cost)):
-        return OptimiserResult(x, best, "not_finite", 0)
-    scale = A.diagonal().clone()
-    growth, quiet = 2.0, 0
+        return OptimiserResult(x, float(cost), "not_finite", 0)
+    at = _Search(x, float(cost), damping, A.diagonal().clone(), [float(cost)])
+    if resumed is not None:
+        at = _Search(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
-    history, reason, iteration = [best], "max_iterations", 0
-    for iteration in range(1, max_iterations + 1):
-        step = _damped_step(A, b, damping * _floored(scale))
-        new = of_first(problem.cost(x + step))[0] if step is not None else None
+    while at.iteration < max_iterations and at.over(patience) is None:
+        at.iteration += 1
+        step = _damped_step(A, b, at.damping * _floored(at.scale))
+        new = of_first(problem.cost(at.x + step))[0] if step is not None else None
         predicted = 0.0 if step is None else float(-(b @ step) - 0.5 * step @ (A @ step))
-        if new is not None and abs(best - float(new)) <= rounding * best:
+        if new is not None and abs(at.best - float(new)) <= rounding * at.best:
             # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
-            quiet += 1
-            damping, growth = damping * growth, growth * 2
-        elif step is not None and new is not None and bool(torch.isfinite(new)) and float(new) < best and predicted > 0:
-            gain = (best - float(new)) / predicted
-            quiet = quiet + 1 if best - float(new) <= rtol * best else 0
-            x = x + step
-            cost, A, b = _of_first(problem.normal_equations(x))
-            best = float(cost)
-            history.append(best)
-            scale = torch.maximum(scale, A.diagonal())
-            damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
-            damping, growth = max(damping, 1e-14), 2.0
+            at.quiet += 1
+            at.damping, at.growth = at.damping * at.growth, at.growth * 2
+        elif (
+            step is not None
+            and new is not None
+            and bool(torch.isfinite(new))
+            and float(new) < at.best
+            and predicted > 0
+        ):
+            gain = (at.best - float(new)) / predicted
+            at.quiet = at.quiet + 1 if at.best - float(new) <= rtol * at.best else 0
+            at.x = at.x + step
+            cost, A, b = _of_first(problem.normal_equations(at.x))
+            at.best = float(cost)
+            at.history.append(at.best)
+            at.scale = torch.maximum(at.scale, A.diagonal())
+            at.damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
+            at.damping, at.growth = max(at.damping, 1e-14), 2.0
         else:
-            damping, growth = damping * growth, growth * 2
+            at.damping, at.growth = at.damping * at.growth, at.growth * 2
         if callback is not None:
-            callback(iteration, best, x)
-        if quiet >= patience:
-            reason = "converged"
-            break
-        if damping > 1e12:
-            reason = "no_descent"
-            break
-    return OptimiserResult(x, best, reason, iteration, history)
+            callback(at.iteration, at.best, at.x, lambda: {"search": asdict(at), "memory": memory_of(problem)})
+    reason = at.over(patience) or "max_iterations"
+    return OptimiserResult(at.x, at.best, reason, at.iteration, at.history, memory_of(problem))
 
 
 def _floored(scale: Tensor) -> Tensor:

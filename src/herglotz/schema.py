@@ -1,0 +1,65 @@
+"""What stored entries must be: plain type hints, checked when a file is read, so that a wrong file is one message."""
+
+from __future__ import annotations
+
+import types
+from collections.abc import Mapping
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
+
+from herglotz.errors import InputError
+
+
+def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
+    """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
+
+    Parameters
+    ----------
+    kind
+        Keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, and list[T],
+        tuple[T, ...], dict[K, V] of these. A list and a tuple are one, as in JSON. No key of a dataclass is needed.
+    values
+        What was read.
+    where, remedy
+        The file, and what to do, for the message.
+
+    Raises
+    ------
+    InputError
+        That names the file, the key, its value and the remedy.
+    """
+    if not isinstance(values, Mapping):
+        raise InputError(f"{where}: must hold named entries, got {_shown(values)}; {remedy}")
+    needed = kind.__required_keys__ if is_typeddict(kind) else ()
+    missing = [key for key in needed if key not in values]
+    if missing:
+        raise InputError(f"{where}: lacks {', '.join(sorted(missing))}; {remedy}")
+    for key, hint in get_type_hints(kind).items():
+        if key in values and not matches(values[key], hint):
+            raise InputError(f"{where}: {key} must be {_named(hint)}, got {_shown(values[key])}; {remedy}")
+
+
+def matches(value: Any, hint: Any) -> bool:
+    """Whether a value is of a type, to its last entry."""
+    origin, inner = get_origin(hint), get_args(hint)
+    if hint is Any:
+        return True
+    if origin in (Union, types.UnionType):
+        return any(matches(value, one) for one in inner)
+    if origin is Literal:
+        return value in inner
+    if origin in (list, tuple):
+        return isinstance(value, (list, tuple)) and all(matches(x, inner[0]) for x in value)
+    if origin is dict:
+        return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
+    if hint in (int, float) and isinstance(value, bool):
+        return False
+    return isinstance(value, (int, float) if hint is float else hint)
+
+
+def _named(hint: Any) -> str:
+    return hint.__name__ if isinstance(hint, type) and not get_args(hint) else str(hint).replace("typing.", "")
+
+
+def _shown(value: Any) -> str:
+    text = " ".join(repr(value).split())
+    return f"{text[:60]}{'…' if len(text) > 60 else ''} ({type(value).__name__})"

@@ -1,0 +1,193 @@
+"""A finished fit on disk: four files, and the manifest that says which four belong together."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from io import BytesIO
+from pathlib import Path
+from typing import Any, TypedDict
+
+import torch
+from torch import Tensor
+
+import herglotz
+from herglotz.data.files import read_bytes, write_atomically
+from herglotz.data.npz_format import npz_bytes, trajectories_of
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.schema import check_entries
+from herglotz.stepping import State
+from herglotz.training.config import FitConfig
+from herglotz.training.run import Run
+
+FORMAT = 1
+FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
+MANIFEST = "manifest.json"
+REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
+
+
+class Manifest(TypedDict):
+    """What manifest.json holds: the sha256 of every file of the run."""
+
+    format: int
+    herglotz: str
+    files: dict[str, str]
+
+
+class StoredModel(TypedDict):
+    """What model.pt holds."""
+
+    format: int
+    model: dict[str, Any]
+    parameters: dict[str, Tensor]
+    states: dict[str, Tensor]
+    train_lengths: list[int]
+    h: float
+    box: dict[str, list[float]]
+    history: list[dict[str, Any]]
+    data_digest: str
+
+
+class Metrics(TypedDict, total=False):
+    """What later commands take from metrics.json, where it is there."""
+
+    plan: dict[str, Any]
+    verdict: str
+    level: str | None
+    objective: str | None
+    sigma: float | None
+    rate: float | None
+    departure: float | None
+    seconds: float
+    parameters: int
+    outliers: int
+    outlier_samples: list[int]
+    follows_data: bool
+    extrapolation_rms: float | None
+    train_rms: float | None
+    one_step_rms: float | None
+    extrapolation_status: str | None
+    tuned: dict[str, Any] | None
+
+
+def save_run(run: Run, folder: str | Path) -> None:
+    """Write model.pt, config.json, metrics.json, fit.npz and, last, manifest.json with the sha256 of these four.
+
+    Each file appears whole or not at all; a folder whose writing was interrupted does not fit its manifest.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    model = {
+        "format": FORMAT,
+        "model": run.model.config.to_dict(),
+        "parameters": {k: v.detach().cpu() for k, v in run.model.state_dict().items()},
+        "states": {k: v.detach().cpu() for k, v in run.states._asdict().items()},
+        "train_lengths": list(run.train_lengths),
+        "h": run.h,
+        "box": run.box,
+        "history": run.history,
+        "data_digest": run.data.digest(),
+    }
+    buffer = BytesIO()
+    torch.save(model, buffer)
+    contents = {
+        "model.pt": buffer.getvalue(),
+        "config.json": _json_bytes(run.config.to_dict()),
+        "metrics.json": _json_bytes(run.metrics),
+        "fit.npz": npz_bytes(run.data),
+    }
+    digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+    contents[MANIFEST] = _json_bytes({"format": FORMAT, "herglotz": herglotz.__version__, "files": digests})
+    for name, content in contents.items():
+        write_atomically(folder / name, content)
+
+
+def load_run(folder: str | Path) -> Run:
+    """Read what `save_run` wrote.
+
+    Raises
+    ------
+    InputError
+        If a file is missing, damaged, changed, of another run or of another format.
+    """
+    folder = Path(folder)
+    if not (folder / "model.pt").is_file():
+        raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
+    contents = _bound(folder)
+    path = folder / "model.pt"
+    try:
+        stored = torch.load(BytesIO(contents["model.pt"]), weights_only=True)
+    except Exception as error:  # torch raises many kinds for a damaged file
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}); {REMEDY}") from None
+    check_entries(StoredModel, stored, str(path), REMEDY)
+    if stored["format"] != FORMAT:
+        raise InputError(f"{path}: is of format {stored['format']}, not {FORMAT}; {REMEDY}")
+    settings = _json(folder / "config.json", contents["config.json"])
+    metrics = _json(folder / "metrics.json", contents["metrics.json"])
+    check_entries(Metrics, metrics, str(folder / "metrics.json"), REMEDY)
+    try:
+        config = FitConfig.from_dict({**settings, "device": "cpu"})
+        model = ContactLagrangian(ModelConfig.from_dict(stored["model"])).to(config.torch_dtype)
+        model.load_state_dict(stored["parameters"])
+        states = State(**stored["states"])
+    except (InputError, RuntimeError, TypeError) as error:  # another version's settings or parameters
+        line = " ".join(str(error).split())
+        raise InputError(f"{folder}: its settings and parameters are of no model ({line[:200]}); {REMEDY}") from None
+    data = trajectories_of(contents["fit.npz"], folder / "fit.npz")
+    run = Run(
+        model, config, metrics, data, tuple(stored["train_lengths"]), states, float(stored["h"]), stored["box"],
+        stored["history"],
+    )  # fmt: skip
+    _check_sizes(run, stored["data_digest"], folder)
+    return run
+
+
+def _bound(folder: Path) -> dict[str, bytes]:
+    """The four files, each with the sha256 that the manifest says."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise InputError(
+            f"{folder}: has no {MANIFEST}: the fit was interrupted while it was written (the same command with "
+            "--resume writes it again), or is of an older version of herglotz (fit again)"
+        )
+    manifest = _json(path, read_bytes(path))
+    check_entries(Manifest, manifest, str(path), REMEDY)
+    contents = {}
+    for name in FILES:
+        contents[name] = read_bytes(folder / name)
+        if hashlib.sha256(contents[name]).hexdigest() != manifest["files"].get(name):
+            raise InputError(
+                f"{folder / name}: is not the file that this run wrote ({MANIFEST} has another sha256): it was damaged "
+                f"or changed, or is of another run; {REMEDY}"
+            )
+    return contents
+
+
+def _check_sizes(run: Run, digest: str, folder: Path) -> None:
+    """Refuse states, lengths, box or data that are not of one another."""
+    N, n, path = run.data.samples, run.model.config.dof, folder / "model.pt"
+    shapes = {"q": (N, n), "p": (N, n), "s": (N,)}
+    bad = [name for name, x in run.states._asdict().items() if tuple(x.shape) != shapes[name]]
+    if bad or run.data.dof != n or run.data.digest() != digest:
+        raise InputError(f"{path}: states or data are not those of the fit in {folder / 'fit.npz'}; {REMEDY}")
+    trained = run.train_lengths
+    if len(trained) != len(run.data) or not all(0 <= a <= b for a, b in zip(trained, run.data.lengths, strict=True)):
+        raise InputError(f"{path}: train_lengths {trained} do not fit the data's lengths {run.data.lengths}; {REMEDY}")
+    sizes = {f"{name}_{end}": 1 if name == "s" else n for name in "qps" for end in ("low", "high")}
+    if {name: len(x) for name, x in run.box.items()} != sizes or not run.h > 0:
+        raise InputError(f"{path}: box and h are not those of a model with {n} coordinate(s); {REMEDY}")
+
+
+def _json_bytes(values: dict[str, Any]) -> bytes:
+    return (json.dumps(values, indent=2, allow_nan=False) + "\n").encode()
+
+
+def _json(path: Path, content: bytes) -> dict[str, Any]:
+    try:
+        values = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: cannot be read ({error}); {REMEDY}") from None
+    if not isinstance(values, dict):
+        raise InputError(f"{path}: must hold named entries, got a {type(values).__name__}; {REMEDY}")
+    return values

@@ -1,0 +1,116 @@
+"""A number that is not finite has a status, eager and exported; every wrong start is refused at one door."""
+
+import shutil
+
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.export import ExportedStepper, compile_c, load_exported
+from herglotz.export.metadata import describe
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, StepError, Stepper
+
+HAS_COMPILER = any(map(shutil.which, ("cc", "gcc", "clang")))
+needs_compiler = pytest.mark.skipif(not HAS_COMPILER, reason="no C compiler in the PATH")
+LARGEST = {torch.float32: 3.3e38, torch.float64: 1.7e308}
+
+
+def steppers(model):
+    return [Stepper(model), *([compile_c(model)] if HAS_COMPILER else [])]
+
+
+def silent(out):
+    """Whether a number that is not finite has no status."""
+    bad = ~torch.isfinite(torch.cat([out.q, out.p, out.s[..., None], out.sigma[..., None]], -1)).all(-1)[..., 1:]
+    return bool((bad & (out.status == 0)).any())
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("level", ["conservative", "linear", "affine", "full"])
+def test_sizes_at_the_end_of_the_numbers(level, dtype):
+    # fails if a step is CONVERGED with NaN, or one sample raises where three have a status
+    model = ContactLagrangian(ModelConfig(level=level, angles=(False,))).to(dtype)
+    big = LARGEST[dtype]
+    for stepper in steppers(model):
+        for batch in (1, 3):
+            zero = torch.zeros(batch, 1, dtype=dtype)
+            for q, p, s in ((big, 0.3, 0.0), (-big, 0.3, 0.0), (0.3, big, 0.0), (0.3, 0.3, big), (big, big, big)):
+                assert not silent(stepper.rollout(zero + q, zero + p, zero[:, 0] + s, h=0.1, steps=3)), (q, p, s)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("level", ["linear", "affine"])
+def test_growth_of_s_and_of_the_conformal_factor(level, dtype):
+    # fails if σ or s overflows in silence: c = e^60 a step, at rest, where q and p stay 0
+    model = ContactLagrangian(ModelConfig(level=level, rate=-60.0, potential_width=0)).to(dtype)
+    steps = {torch.float32: 2, torch.float64: 12}[dtype]  # e^60 ^ steps is the first beyond the largest number
+    for stepper in steppers(model):
+        for batch in (1, 3):
+            zero = torch.zeros(batch, 1, dtype=dtype)
+            still = stepper.rollout(zero, zero, h=1.0, steps=20)
+            assert not silent(still)
+            assert still.status[0].tolist() == [0] * (steps - 1) + [3] * (21 - steps)
+            assert bool(still.q[:, steps:].isnan().all())
+            moved = stepper.rollout(zero, zero, zero[:, 0] + 1e30, h=1.0, steps=20)
+            assert not silent(moved)
+
+
+def test_the_factor_of_an_exported_file(model):
+    # fails if a file's σ, which Python multiplies, overflows in silence
+    factor = torch.full((400, 1), 10.0, dtype=torch.float64)
+    zero = torch.zeros(400, 1, dtype=torch.float64)
+    said = (zero[..., None], zero[..., None], zero, factor, zero, zero.byte())
+    program = ExportedStepper({"rollout": lambda *_: said}, describe(model, 0.1, None, (), 30, {}))
+    out = program.rollout(zero[:1], zero[:1], h=0.1, steps=400)
+    assert not silent(out)
+    assert int((out.status == 0).sum()) == 308
+
+
+def test_s_that_is_no_number_where_nothing_depends_on_it():
+    # fails if the state of an L_d without s is not looked at
+    stepper = Stepper(lambda q0, q1, s0, h: ((q1 - q0) ** 2).sum(-1) / h)  # noqa: ARG005
+    x = torch.ones(2, 1, dtype=torch.float64)
+    step = stepper.step(State(x, x, torch.tensor([0.0, float("nan")], dtype=torch.float64)), 0.1)
+    assert step.status.tolist() == [0, 3]
+    assert stepper.step(State(x[:1], x[:1] * 1e300, x[:1, 0] * 1.7e308), 0.1).status.tolist() == [3]
+
+
+@needs_compiler
+@pytest.mark.parametrize("h", [1e-7, 1e-9, 1e-12])
+def test_short_steps_keep_the_momentum(h):
+    # fails if p = D2 L_d is made of a difference of positions: errors of 1e-3 at h = 1e-12; measured now: 3e-16
+    model = ContactLagrangian(ModelConfig(level="affine"))
+    start = torch.tensor([[0.7]], dtype=torch.float64)
+    with torch.no_grad():
+        eager = Stepper(model).rollout(start, start, h=h, steps=10)
+    compiled = compile_c(model).rollout(start, start, h=h, steps=10)
+    assert float((eager.p - compiled.p).abs().max()) < 1e-13
+
+
+def test_the_door(model):
+    # fails if eager `init` and `step` take what exported files refuse
+    one = torch.ones(3, 1, dtype=torch.float64)
+    stepper, s = Stepper(model), torch.zeros(3, dtype=torch.float64)
+    wrong = [
+        (one.repeat(1, 2), one.repeat(1, 2), s, 0.1, "the model 1"), (one, one[:2], s, 0.1, "need shapes"),
+        (one, one.float(), s, 0.1, "one dtype"), (one, one, s, 0.0, "h must be > 0"),
+        (one, one, s, float("inf"), "h must be finite, got inf"), (one, one, s, float("nan"), "got nan"),
+        (one.long(), one.long(), s.long(), 0.1, "floating point"), (one[0, 0], one[0, 0], s[0], 0.1, "need tensors"),
+    ]  # fmt: skip
+    for q, p, action, h, message in wrong:
+        for call in (lambda q, p, s, h: stepper.step(State(q, p, s), h), stepper.init):
+            with pytest.raises(InputError, match=message):
+                call(q, p, action, h)
+    with pytest.raises(InputError, match="q1 must be finite, got 1"):
+        stepper.init(one[:1], one[:1] * float("nan"), s[:1], 0.1)
+
+
+def test_a_start_that_is_too_fast_is_said(model, files):
+    # fails if `init`, which has no status, gives NaN in silence
+    far = torch.tensor([[0.0], [1e300]], dtype=torch.float64)
+    named = {"eager": Stepper(model), "onnx": load_exported(files("onnx"))}
+    named |= {"c": compile_c(model)} if HAS_COMPILER else {}
+    for stepper in named.values():
+        with pytest.raises(StepError, match=r"init failed at sample \(1,\)"):
+            stepper.init(torch.zeros_like(far), far, h=1e-20)
