@@ -15,10 +15,10 @@ if TYPE_CHECKING:
 
 
 def plot(run: Run, name: str) -> Figure:
-    """One of the figures of `herglotz.plots.FIGURES`, by name."""
-    from herglotz.plots import FIGURES
+    """One of the figures of `herglotz.plots.FIGURES` or `IDENTITIES`, by name."""
+    from herglotz.plots import FIGURES, IDENTITIES
 
-    known = {Path(file).stem: draw for file, draw in FIGURES.items()}
+    known = {**FIGURES, **IDENTITIES}
     if name not in known:
         raise InputError(f"there is no figure {name!r}; choose one of {', '.join(known)}")
     return known[name](run)
@@ -36,3 +36,11 @@ def verify(run: Run, **settings: Any) -> Report:
     from herglotz.verify import verify
 
     return verify(run, **settings)
+
+
+def report(run: Run, folder: str | Path, against: Any) -> list[Path]:
+    """Write report.html and report.md; see `herglotz.report.write_report`."""
+    from herglotz.data import as_trajectories
+    from herglotz.report import write_report
+
+    return write_report(run, folder, None if against is None else as_trajectories(against), name=str(folder))

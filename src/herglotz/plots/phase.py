@@ -27,7 +27,8 @@ def plot_phase_portrait(run: Run) -> Figure:
     """Draw momentum against position, one panel a coordinate: states at the samples over rollouts of the model.
 
     The grey lines are rollouts from a grid of starts where the motion does not depend on s, and from the first state of
-    each trajectory otherwise (or with more than one coordinate, where a start needs all of them).
+    each trajectory otherwise (or with more than one coordinate, where a start needs all of them). A model with inputs
+    has no flow of its own, and none is drawn.
     """
     data = run.data
     panels = min(data.dof, MOST_PANELS)
@@ -44,7 +45,8 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
     q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
     fine = np.isfinite(q) & np.isfinite(p)
     (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])
-    for line in _background(run, (q_low, q_high), (p_low, p_high)):
+    driven = run.model.inputs > 0  # the flow changes with the input: no one flow is the model's
+    for line in [] if driven else _background(run, (q_low, q_high), (p_low, p_high)):
         _draw_line(ax, line[:, 0, i], line[:, 1, i])
     seen = trained_mask(run).numpy()
     for mask, color in ((fine & seen, MODEL), (fine & ~seen, UNSEEN)):
@@ -56,7 +58,8 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
         _mark_pi(ax, q_low, q_high)
     if i == 0:
         unseen = [("● unseen", UNSEEN)] if bool((~seen).any()) else []
-        captions(ax, [("○ start", INK), ("● trained", MODEL), *unseen, ("→ flow of the model", "#666666")])
+        flow = [] if driven else [("→ flow of the model", "#666666")]
+        captions(ax, [("○ start", INK), ("● trained", MODEL), *unseen, *flow])
 
 
 def _background(run: Run, q_range: tuple[float, float], p_range: tuple[float, float]) -> np.ndarray:
@@ -122,6 +125,8 @@ def _title(run: Run) -> str:
     """Return a title: the share of the momentum that one unit of time leaves, where the model has one damping rate."""
     damping = getattr(run.model, "damping", None)
     rate = getattr(damping, "rate", None)
+    if run.model.inputs:
+        return "States of the driven motion"
     if rate is None or not getattr(damping, "constant", False):
         return "States and flow of the learned model"
     unit = "" if run.data.time_unit in ("", "1") else f" per {run.data.time_unit}"

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -13,12 +14,15 @@ from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
 
 DPI = 150
 # Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
 INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", "#8A8A8A"
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
 SHADE = "#FBEDE3"  # behind what was not trained on
+SUPPORT = "#EAF2F8"  # where the data are
+FORMATS = ("png", "svg", "pdf")
 
 STYLE: Any = {
     "figure.dpi": DPI,
@@ -64,10 +68,19 @@ def new_figure(width: float, height: float, title: str) -> Figure:
 
 
 def save_figure(figure: Figure, path: PathLike) -> None:
-    """Write a figure as PNG; the file appears whole or not at all."""
+    """Write a figure as PNG, SVG or PDF, by the end of the name; the file appears whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If the name has another end, or the file cannot be written.
+    """
+    form = Path(path).suffix.lower().removeprefix(".")
+    if form not in FORMATS:
+        raise InputError(f"{path}: a figure's name must end in .{', .'.join(FORMATS)}")
     buffer = io.BytesIO()
     with styled():
-        figure.savefig(buffer, format="png", dpi=DPI)
+        figure.savefig(buffer, format=form, dpi=DPI)
     write_atomically(path, buffer.getvalue())
 
 

@@ -1,29 +1,33 @@
-"""The cost while training, stage by stage."""
+"""The cost while training, one panel a stage."""
 
 from __future__ import annotations
 
+import math
 from itertools import groupby
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from herglotz.errors import InputError
-from herglotz.plots.style import SERIES, new_figure, styled
+from herglotz.plots.style import MODEL, MUTED, new_figure, styled
 
 if TYPE_CHECKING:
     from herglotz.training import Run
 
 Stage = tuple[str, list[float]]  # name and costs
-MOST_NAMES = 24
-SETTLED = 1e-12  # a smaller relative excess is round-off and not drawn
+MOST_PANELS, COLUMNS = 12, 4
+SETTLED = 0.01  # change in the last iteration, of the whole fall in the stage
 
 
 def plot_training(run: Run) -> Figure:
-    """Draw the cost of every iteration; a stage minimises its own cost, so lines of two stages are not joined.
+    """Draw the cost of every iteration, each stage in a panel of its own: each minimises another cost.
 
-    Below: how far each cost is from the last of its stage, relative to it; a straight fall is linear convergence.
+    With more than twelve stages, the last twelve are drawn. A stage is said to have settled where its last iteration
+    changed the cost by less than 1 % of the
+    stage's whole fall.
 
     Raises
     ------
@@ -33,51 +37,49 @@ def plot_training(run: Run) -> Figure:
     if not run.history:
         raise InputError("the run has no history of its cost; fit it again to get one")
     stages = [(name, [float(row["cost"]) for row in rows]) for name, rows in groupby(run.history, lambda r: r["stage"])]
+    shown = stages[-MOST_PANELS:]
+    columns = min(COLUMNS, len(shown))
+    rows = math.ceil(len(shown) / columns)
     with styled():
-        figure = new_figure(8.6, 5.0, _title(stages))
-        top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=[1.2, 1.0])
-        start = 0
-        for k, (_, cost) in enumerate(stages):
-            x, y = start + np.arange(len(cost)), np.array(cost)
-            style = {"color": SERIES[k % len(SERIES)], "marker": "o", "ms": 3 if len(run.history) < 300 else 0}
-            top.plot(x, y, **style)
-            excess = y / y[-1] - 1.0 if y[-1] else y
-            bottom.plot(x, np.where(excess > SETTLED, excess, np.nan), **style)
-            for ax in (top, bottom) if k else ():
-                ax.axvline(start - 0.5, color="#CCCCCC", lw=0.8, zorder=0)
-            start += len(cost)
-        _label_stages(top, stages)
-        everything = np.concatenate([cost for _, cost in stages])
-        if (everything > 0).all() and np.isfinite(everything).all():
-            top.set_yscale("log")
-            bottom.set_yscale("log")
-        top.set(ylabel="cost (each stage its own)", xlim=(-0.8, max(start - 0.2, 1)))
-        bottom.set(ylabel="excess over the stage's last cost", xlabel="iteration, all stages")
-        for ax in (top, bottom):
-            ax.grid(axis="y", color="#EEEEEE", lw=0.8)
+        figure = new_figure(max(4.8, 2.6 * columns), 1.0 + 2.1 * rows, _title(stages, len(shown)))
+        axes = figure.subplots(rows, columns, squeeze=False).ravel()
+        for k, (ax, stage) in enumerate(zip(axes, shown, strict=False)):
+            _draw(ax, len(stages) - len(shown) + k + 1, stage)
+        for ax in axes[len(shown) :]:
+            ax.set_axis_off()
+        for ax in axes[::columns]:
+            ax.set_ylabel("cost")
+        figure.supxlabel("iteration of the stage", fontsize=9.5)
     return figure
 
 
-def _label_stages(ax: Axes, stages: list[Stage]) -> None:
-    """Name each stage over its part; with many stages a number there, and the names beside the panel."""
-    many, start = len(stages) > 4, 0
-    for k, (name, cost) in enumerate(stages):
-        color = SERIES[k % len(SERIES)]
-        options: Any = {"color": color, "fontsize": 8.5}
-        text = str(k + 1) if many else _short(name)
-        middle = start + (len(cost) - 1) / 2
-        ax.text(middle, 1.01, text, ha="center", va="bottom", transform=ax.get_xaxis_transform(), **options)
-        if many and k < MOST_NAMES:
-            ax.text(1.01, 1.0 - 0.085 * k, f"{k + 1}  {_short(name)}", va="top", transform=ax.transAxes, **options)
-        start += len(cost)
+def settled(cost: list[float]) -> bool:
+    """Whether the last iteration changed the cost by less than 1 % of the stage's whole fall."""
+    return len(cost) > 2 and abs(cost[-2] - cost[-1]) <= SETTLED * (max(cost) - min(cost))
 
 
-def _title(stages: list[Stage]) -> str:
+def _draw(ax: Axes, number: int, stage: Stage) -> None:
+    name, cost = stage
+    y = np.array(cost)
+    ax.plot(np.arange(len(y)), y, color=MODEL, marker="o", ms=3 if len(y) < 60 else 0)
+    if (y > 0).all() and np.isfinite(y).all() and y.max() > 3 * y.min():
+        ax.set_yscale("log")
+    else:
+        ax.ticklabel_format(axis="y", useOffset=False)
+    ax.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+    ax.tick_params(labelsize=8)
+    ax.set_title(f"{number}  {_short(name)}", fontsize=8.5)
+    ax.text(0.97, 0.95, "settled" if settled(cost) else f"ends at {cost[-1]:.3g}", transform=ax.transAxes, ha="right",
+            va="top", fontsize=8.5, color=MUTED)  # fmt: skip
+    ax.grid(axis="y", color="#EEEEEE", lw=0.8)
+
+
+def _title(stages: list[Stage], shown: int) -> str:
     count, plural = sum(len(cost) for _, cost in stages), "" if len(stages) == 1 else "s"
-    last = stages[-1][1]
-    settled = len(last) > 2 and abs(last[-2] - last[-1]) <= 1e-3 * abs(last[-1])
-    return f"{count} iterations in {len(stages)} stage{plural}" + (": the cost has settled" if settled else "")
+    last = f", the last {shown} shown" if shown < len(stages) else ""
+    end = ": the last one has settled" if settled(stages[-1][1]) else ""
+    return f"{count} iterations in {len(stages)} stage{plural}{last}{end}"
 
 
 def _short(name: str) -> str:
-    return name if len(name) <= 24 else name[:23] + "…"
+    return name if len(name) <= 28 else name[:27] + "…"

@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.newton import Root
+from herglotz.mechanics.partials import check_arguments
 
 
 class Status(IntEnum):
@@ -112,9 +113,7 @@ def check_state(
         number is not.
     """
     q, p, s = state
-    if not all(isinstance(x, Tensor) for x in state) or q.ndim < 1:
-        given = [tuple(x.shape) if isinstance(x, Tensor) else type(x).__name__ for x in state]
-        raise InputError(f"{', '.join(names)} need tensors of shapes (..., n), (..., n), (...); got {given}")
+    check_arguments(q, p, s, names)
     if q.dtype not in (torch.float32, torch.float64):  # linear solves know no others, and 8 bits no increments
         raise InputError(
             f"{names[0]} must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()"

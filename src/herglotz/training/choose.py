@@ -33,7 +33,7 @@ def _named(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 
 
 def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
-    return "a joint that stands still says nothing about its forces in one step" if config.sticking else None
+    return "a joint that stands still says nothing about its forces in one step" if seen.settings.sticking else None
 
 
 def _structured(seen: Look, config: FitConfig) -> str | None:
@@ -88,8 +88,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     sigma = None if one_step or probe is None or not probe.enough else probe.rms / NOISE_OF_R
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
-        level=c.level, objective=objective, network=network, order=c.order, features=c.features,
-        forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal},
+        level=c.level, objective=objective, network=network, order=c.order, features=c.features, hold=seen.data.hold,
+        forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
         reasons={
@@ -98,7 +98,8 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "network": why_network,
             "order": _structure_reason(seen, c.order == user_settings.order),
             "features": _structure_reason(seen, c.features == user_settings.features),
-            "forces": _structure_reason(seen, seen.structure is None),
+            "hold": seen.hold,
+            "forces": seen.friction if seen.structure is None else seen.structure,
             "start": "least squares on finite differences" if not base.start else "one linear problem",
             "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",

@@ -26,6 +26,7 @@ class Plan:
     network: str  # correction, covered (one wide layer), potential or plain
     order: int  # of the rule, 2 or 4
     features: tuple[str, ...]  # what L may hold beside its terms
+    hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
     forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
     start: dict[str, tuple[float, ...]]  # starting values of parameters by name
     outliers: bool  # the first one-step fit takes Student's t
@@ -50,7 +51,7 @@ class Plan:
 
     def table(self, width: int = 120) -> str:
         """One decision a line with its reason, for people."""
-        rows = [(name, _show(getattr(self, name)), self.reasons.get(name, "")) for name in DECISIONS]
+        rows = [(name, show(getattr(self, name)), self.reasons.get(name, "")) for name in DECISIONS]
         left, middle = max(len(row[0]) for row in rows), min(24, max(len(row[1]) for row in rows))
         lines = []
         for name, value, reason in rows:
@@ -76,11 +77,12 @@ class Plan:
 DECISIONS = tuple(f.name for f in fields(Plan) if f.name not in ("start", "reasons"))
 
 
-def _show(value: Any) -> str:
+def show(value: Any) -> str:
+    """One decision in words."""
     if isinstance(value, dict):
         return ", ".join(name for name, on in value.items() if on) or "none"
     if isinstance(value, tuple):
         return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
     if value is None:
         return "to be measured"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value) or "none"

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
@@ -37,11 +39,13 @@ class Callback:
 
     def __init__(self, bar: Any, store: Callable[[dict[str, Any]], None], resumed: dict[str, Any] | None):
         self.bar, self.store, self.resumed = bar, store, resumed
+        self.start: float | None = None  # the first cost
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""
         self.bar.update(1)
-        self.bar.set_postfix_str(f"cost {cost:.4g}", refresh=False)
+        self.start = cost if self.start is None else self.start
+        self.bar.set_postfix_str(f"cost {cost / self.start:.3g} of its start" if self.start else "", refresh=False)
         if iteration % EVERY == 0:
             self.store(search())
 
@@ -56,7 +60,7 @@ class Stages:
     Parameters
     ----------
     progress
-        Show progress bars; None shows them on a terminal only.
+        Show progress bars; None shows them on a terminal only; "lines" prints one line on stderr after every stage.
     checkpoint
         File to write, or None.
     key
@@ -65,8 +69,9 @@ class Stages:
         Read the checkpoint if there is one.
     """
 
-    def __init__(self, progress: bool | None, checkpoint: Path | None, key: str, resume: bool):
-        self.disable = (None if progress is None else not progress) if is_first() else True
+    def __init__(self, progress: bool | Literal["lines"] | None, checkpoint: Path | None, key: str, resume: bool):
+        self.lines = progress == "lines" and is_first()
+        self.disable = (None if progress is None else self.lines or not progress) if is_first() else True
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
@@ -111,7 +116,11 @@ class Stages:
                     self.done[name] = {"done": False, "search": search}
                     self._write()
 
+                began = time.monotonic()
                 result = optimise(x, Callback(bar, store, resumed))
+            if self.lines:
+                took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
+                print(f"{name}: {took}", file=sys.stderr, flush=True)
             self._store(name, result)
         start = len(self.history)
         self.history += [{"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)]

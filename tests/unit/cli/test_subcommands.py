@@ -1,6 +1,8 @@
 """Each subcommand end to end on tiny data."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,12 +14,16 @@ import herglotz
 import herglotz.cli
 import herglotz.cli.fit
 import herglotz.cli.flags
+import herglotz.cli.plot
 import herglotz.cli.simulate
 from herglotz.cli import main
+from herglotz.cli.parser import build_parser
 from herglotz.data import load
+from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
+from herglotz.plots.style import FORMATS
 from herglotz.scenes import scene_names
-from herglotz.training import load_run
+from herglotz.training import FitConfig, load_run
 from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 
 
@@ -33,7 +39,7 @@ def test_version(capsys):  # fails if the version is not the package's
     assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
 
 
-COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "tune", "plot")
+COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "report", "tune", "plot")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
@@ -62,7 +68,10 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit, flags = herglotz.cli.fit, herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION) == (fit.ROBUST, fit.SUPERVISION)
+    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
+    assert FitConfig().departures == fit.DEPARTURES
+    assert build_parser().parse_args(["fit", "a", "--out", "b"]).iterations == FitConfig().iterations
+    assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
 
@@ -88,9 +97,10 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "extrapolation RMS" in out
     assert f"Next: herglotz verify {folder}" in out
     assert err.startswith("tiny.csv:\n  column")
-    assert "\r" not in err  # no bar where there is no terminal
+    assert "\r" not in err  # no bar where there is no terminal, but a line a stage
+    assert re.search(r"^segments of 20: \d+ iterations, [\d.]+ s$", err, re.M)
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
-    assert len(list(folder.glob("*.png"))) == 5
+    assert len(list(folder.glob("*.png"))) == 4
     run = load_run(folder)
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
 
@@ -110,9 +120,9 @@ def test_fit_says_what_it_found(tmp_path, capsys):
 def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped, or resume fits again
     folder = tmp_path / "run"
     arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
-    arguments += ["--objective", "trajectory", "--level", "affine"]
+    arguments += ["--objective", "trajectory", "--level", "conservative"]  # the cheapest that is no default
     code, found = run_json(capsys, *arguments)
-    assert (found["level"], found["objective"]) == ("affine", "trajectory")
+    assert (found["level"], found["objective"]) == ("conservative", "trajectory")
     assert code == (3 if found["verdict"].startswith("does not fit") else 0)  # rounding decides, in float32
     run = load_run(folder)
     assert next(run.model.parameters()).dtype == torch.float32
@@ -196,9 +206,17 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 6
+    assert len(written) == 5
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_identities_are_drawn_by_verify(tiny_run, tmp_path, capsys):  # fails if they are lost, or drawn of a scene
+    few = ["--samples", "4", "--steps", "2"]
+    assert main(["verify", str(tiny_run), *few, "--plots", str(tmp_path)]) in (0, 1)
+    assert sorted(x.name for x in tmp_path.iterdir()) == ["hj_residual.png", "momentum_vs_dS.png"]
+    assert main(["verify", "damped_oscillator", *few, "--plots", str(tmp_path)]) == 2
+    assert "--plots draws a run; damped_oscillator is none" in capsys.readouterr().err
 
 
 def test_interrupt(monkeypatch, tiny_csv, tmp_path, capsys):  # fails if Ctrl-C prints a traceback or leaves a folder
@@ -246,5 +264,17 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
     assert found["traded"] == []
     assert 1 < found["effective_parameters"] < found["all_parameters"]
     assert main(["trust", str(tiny_run), "--out", str(tmp_path)]) == 0
-    assert "each parameter above is determined on its own" in capsys.readouterr().out.lower()
+    out, err = capsys.readouterr()
+    assert "each parameter above is determined on its own" in out.lower()
+    assert re.search(r"^  the damping rate γ: [\d.e-]+ ± [\d.e-]+ 1/s$", out, re.M)  # fails if names are the program's
+    assert max(len(line) for line in out.splitlines() if not line.startswith("Figure")) <= 80
+    assert "warning" not in err
     assert (tmp_path / "bands.png").stat().st_size > 10_000
+
+
+def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # fails if such numbers pass for results
+    shutil.copytree(tiny_run, tmp_path / "run")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps({**metrics, "verdict": "does not fit: it misses 1"}))
+    assert main(["trust", str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
+    assert "warning: the run does not fit its data" in capsys.readouterr().err

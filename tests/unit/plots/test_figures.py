@@ -18,7 +18,9 @@ from matplotlib.image import imread
 from herglotz.errors import InputError
 from herglotz.plots import (
     FIGURES,
+    IDENTITIES,
     plot_data,
+    plot_learned,
     plot_momentum_vs_generating_function,
     plot_phase_portrait,
     plot_training,
@@ -49,28 +51,38 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-@pytest.mark.parametrize("name", FIGURES)
+@pytest.mark.parametrize("name", [*FIGURES, *IDENTITIES])
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_figure_of_every_kind_of_run(tmp_path, kind, name):
     # fails if a figure warns, is empty, or cannot take several trajectories or coordinates, or no test part
-    figure = FIGURES[name](fake_run(**KINDS[kind]))
-    save_figure(figure, tmp_path / name)
-    width, height = png_size(tmp_path / name)
+    figure = {**FIGURES, **IDENTITIES}[name](fake_run(**KINDS[kind]))
+    path = tmp_path / f"{name}.png"
+    save_figure(figure, path)
+    width, height = png_size(path)
     inches = figure.get_size_inches()
     assert (width, height) == (int(150 * inches[0]), int(150 * inches[1]))
-    assert width >= 750
-    assert np.asarray(imread(tmp_path / name)).std() > 0.02  # something is drawn
+    assert width >= 700
+    assert np.asarray(imread(path)).std() > 0.02  # something is drawn
     assert title(figure)
 
 
 def test_save_figures_writes_all_and_nothing_else(tmp_path):
     # fails if a name changes, a temporary file stays, or the folder is not made
     folder = tmp_path / "a" / "b"
-    assert save_figures(fake_run(steps=20), folder) == [folder / name for name in FIGURES]
-    assert sorted(x.name for x in folder.iterdir()) == sorted(FIGURES)
-    assert set(FIGURES) == {
-        "trajectory.png", "phase_portrait.png", "momentum_vs_dS.png", "hj_residual.png", "training.png"
-    }  # fmt: skip
+    assert save_figures(fake_run(steps=20), folder) == [folder / f"{name}.png" for name in FIGURES]
+    assert sorted(x.name for x in folder.iterdir()) == sorted(f"{name}.png" for name in FIGURES)
+    assert (set(FIGURES), set(IDENTITIES)) == (
+        {"trajectory", "phase_portrait", "learned", "training"}, {"momentum_vs_dS", "hj_residual"}
+    )  # fmt: skip
+
+
+def test_formats(tmp_path):  # fails if a file holds another format than its name says, or a wrong name is written
+    figure = plot_training(fake_run(steps=12))
+    for end, begin in ((".svg", b"<?xml"), (".pdf", b"%PDF"), (".png", b"\x89PNG")):
+        save_figure(figure, tmp_path / f"a{end}")
+        assert (tmp_path / f"a{end}").read_bytes().startswith(begin)
+    with pytest.raises(InputError, match=r"a.jpg: a figure's name must end in .png, .svg, .pdf"):
+        save_figure(figure, tmp_path / "a.jpg")
 
 
 def test_a_folder_that_cannot_be_made(tmp_path):  # fails if an OSError escapes instead of one clear line
@@ -140,7 +152,7 @@ def test_momentum_figure_shows_a_wrong_momentum():  # fails if the figure compar
 
 
 def test_the_null_grows_with_the_square_of_the_distance():  # fails if the off-flow check would pass anything (E7)
-    figure = FIGURES["hj_residual.png"](fake_run(steps=20))
+    figure = IDENTITIES["hj_residual"](fake_run(steps=20))
     assert float(title(figure).split()[-1]) < 1e-12
     d, r = (np.asarray(x) for x in figure.axes[1].lines[0].get_data())
     slope = np.polyfit(np.log(d[:6]), np.log(r[:6]), 1)[0]
@@ -149,15 +161,29 @@ def test_the_null_grows_with_the_square_of_the_distance():  # fails if the off-f
 
 def test_stages_are_separate_lines():  # fails if costs of different objectives are joined, or a stage is lost
     figure = plot_training(fake_run(steps=12))
-    assert [len(np.asarray(line.get_xdata())) for line in figure.axes[0].lines if line.get_marker() == "o"] == [
-        12,
-        10,
-        8,
-    ]
-    texts = [text.get_text() for text in figure.axes[0].texts]
-    assert texts == ["residual", "horizon 30", "whole trajectory"]
+    assert [len(np.asarray(ax.lines[0].get_xdata())) for ax in figure.axes] == [12, 10, 8]
+    assert [ax.get_title(loc="left") for ax in figure.axes] == ["1  residual", "2  horizon 30", "3  whole trajectory"]
+    ends = [ax.texts[0].get_text() for ax in figure.axes]
+    assert ends == ["settled"] * 3
+    falling = [{"stage": "one", "iteration": k, "cost": 1e13 * (100 - k)} for k in range(9)]  # by 12 % of its fall
+    figure = plot_training(replace(fake_run(steps=12), history=falling))
+    assert figure.axes[0].texts[0].get_text() == "ends at 9.2e+14"
+    assert title(figure) == "9 iterations in 1 stage"
+    long = [{"stage": f"stage {k}", "iteration": k, "cost": 1.0 + (j == 0)} for k in range(20) for j in range(4)]
+    figure = plot_training(replace(fake_run(steps=12), history=long))
+    assert title(figure) == "80 iterations in 20 stages, the last 12 shown: the last one has settled"
     with pytest.raises(InputError, match="no history"):
         plot_training(replace(fake_run(steps=12), history=[]))
+
+
+def test_what_is_learned_is_the_models_own():  # fails if a panel shows another function, or another coordinate's
+    run = fake_run(steps=40)
+    potential, force = plot_learned(run).axes
+    x, V = (np.asarray(v) for v in potential.lines[1].get_data())
+    _, f = (np.asarray(v) for v in force.lines[1].get_data())
+    np.testing.assert_allclose(f[1:-1], -(V[2:] - V[:-2]) / (x[2] - x[0]), atol=2e-3 * np.abs(f).max())
+    seen = run.data.q[: run.train_lengths[0]]
+    assert x[0] < float(seen.min()) < float(seen.max()) < x[-1]
 
 
 def test_data_alone_leaves_gaps_open():  # fails if a line is drawn across missing samples
@@ -176,7 +202,7 @@ def test_nothing_global_changes(tmp_path):  # fails if rcParams leak either way,
     assert dict(mpl.rcParams) == before
     with mpl.rc_context({"savefig.dpi": 31, "savefig.bbox": "tight"}):
         save_figure(figure, tmp_path / "a.png")
-    assert png_size(tmp_path / "a.png") == (1290, 750)
+    assert png_size(tmp_path / "a.png") == tuple(int(150 * x) for x in figure.get_size_inches())
 
 
 def test_no_display_and_no_pyplot_needed():  # fails if pyplot, and with it a window system, is imported

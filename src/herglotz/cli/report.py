@@ -1,0 +1,47 @@
+"""`herglotz report`: one HTML file that says whether to believe a run."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from herglotz.cli.common import check_output_folder
+from herglotz.cli.flags import add_column_flags, columns_of, parse_angles
+
+DESCRIPTION = """\
+Write report.html, one self-contained page, and report.md, its words and tables: the verdict first, then the learned
+equation with standard deviations, a walk through the free run, the data, the plan of the fit with its reasons, errors
+on held-out time, what the data leave open, the verification, speed, and how to use the exported files.
+
+examples:
+  herglotz report runs/pendulum
+  herglotz report runs/pendulum --against another.csv --out reports/pendulum
+"""
+
+
+def add(commands: argparse._SubParsersAction) -> None:
+    """Add the subcommand."""
+    parser = commands.add_parser("report", help="write an HTML report of a run", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
+    parser.add_argument("--against", type=Path, metavar="DATA", help="another recording to score the model on")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for both files (default: RUN)")
+    parser.add_argument("--angles", metavar="NAMES", help="coordinates of DATA that are angles (default: rad or deg)")
+    add_column_flags(parser)
+    parser.set_defaults(run=run)
+
+
+def run(arguments: argparse.Namespace) -> int:
+    """Write both files and say where."""
+    folder = arguments.out or arguments.source
+    check_output_folder(folder)
+
+    from herglotz.data import load
+    from herglotz.report import write_report
+    from herglotz.training import load_run
+
+    result, against = load_run(arguments.source), None
+    if arguments.against is not None:
+        against = load(arguments.against, angles=parse_angles(arguments.angles), **columns_of(arguments))
+    for path in write_report(result, folder, against, name=str(arguments.source)):
+        print(path)
+    return 0

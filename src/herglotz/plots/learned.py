@@ -1,0 +1,145 @@
+"""What the model has learned: potential, force and friction along each coordinate, with the support of the data."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+import torch
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from torch import Tensor
+
+from herglotz.plots.fan import units
+from herglotz.plots.motion import trained_mask
+from herglotz.plots.style import MODEL, MUTED, SUPPORT, captions, new_figure, styled, with_unit
+from herglotz.stepping.field import FieldOf
+
+if TYPE_CHECKING:
+    from herglotz.training import Laplace, Run
+
+MOST_COLUMNS, POINTS = 3, 161
+BEYOND = 0.25  # of the data's range, drawn on both sides of it
+STEP = 1e-4  # of a difference with respect to parameters, which are of size 1
+Curves = list[Tensor]  # the curve and, with a posterior, its standard deviation, (POINTS,) each
+
+
+def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
+    """Draw V(q_i) and the force −∂V/∂q_i along each coordinate, the others at their median; and friction, if any.
+
+    The first mass is 1, so that forces are accelerations of the first coordinate. The range of the training data is
+    shaded: beyond it the model extrapolates.
+
+    Parameters
+    ----------
+    run
+        A fitted run.
+    posterior
+        Adds bands of two standard deviations.
+    """
+    columns = min(run.data.dof, MOST_COLUMNS)
+    rubs = run.model.friction is not None
+    momentum, _ = units(run)
+    force = momentum + "²" if momentum and run.data.time_unit not in ("", "1") else ""  # rad/s, rad/s²
+    with styled():
+        figure = new_figure(1.2 + 3.9 * columns, 2.3 * (2 + rubs) + 0.5, "What the model has learned, mass 1")
+        axes = figure.subplots(2 + rubs, columns, squeeze=False)
+        for i in range(columns):
+            x, low, high = _range(run.states.q[trained_mask(run), i])
+            name = with_unit(run.data.names[i], run.data.units[i])
+            _panel(axes[0, i], x, _curves(posterior, _potential(run, i, x)), (low, high))
+            axes[0, i].set(xlabel=name, ylabel="potential V")
+            _panel(axes[1, i], x, _curves(posterior, _force(run, i, x)), (low, high))
+            axes[1, i].set(xlabel=name, ylabel=with_unit(r"force $-\partial V/\partial q$", force))
+            if rubs:
+                v, low, high = _range(_speeds(run)[:, i])
+                _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))
+                axes[2, i].set(xlabel=with_unit(f"velocity of {run.data.names[i]}", momentum))
+                axes[2, i].set_ylabel(with_unit("friction", force))
+        band = [] if posterior is None else [("band: ±2 standard deviations", MODEL)]
+        captions(axes[0, 0], [("shaded: where the data are", "#666666"), *band])
+        axes[0, 0].margins(y=0.3)
+    return figure
+
+
+def _range(values: Tensor) -> tuple[Tensor, float, float]:
+    values = values[torch.isfinite(values)].double()
+    low, high = float(values.min()), float(values.max())
+    room = BEYOND * ((high - low) or 1.0)
+    return torch.linspace(low - room, high + room, POINTS, dtype=torch.float64), low, high
+
+
+def _speeds(run: Run) -> Tensor:
+    """Recorded velocities, (steps, n), by differences."""
+    data, steps = run.data.unwrapped(), run.data.steps()
+    return (data.q[steps.index + 1] - data.q[steps.index]) / steps.h[:, None]
+
+
+def _line(run: Run, i: int, x: Tensor) -> Tensor:
+    """Positions (POINTS, n): coordinate i along x, the others at the median of the data."""
+    like = run.states.q
+    q = like[torch.isfinite(like).all(-1)].median(0).values.detach().expand(len(x), -1).clone()
+    q[:, i] = x.to(q)
+    return q
+
+
+def _potential(run: Run, i: int, x: Tensor) -> Callable[[], Tensor]:
+    q = _line(run, i, x)
+
+    def V() -> Tensor:
+        value = FieldOf(run.model.potential)(q).V
+        return value - value.min()
+
+    return V
+
+
+def _force(run: Run, i: int, x: Tensor) -> Callable[[], Tensor]:
+    q = _line(run, i, x)
+    return lambda: -FieldOf(run.model.potential)(q).slope[:, i]
+
+
+def _friction(run: Run, i: int, v: Tensor) -> Callable[[], Tensor]:
+    friction = run.model.friction
+    speeds = torch.zeros(len(v), run.data.dof, dtype=run.states.q.dtype)
+    speeds[:, i] = v.to(speeds)
+
+    def f() -> Tensor:
+        assert friction is not None
+        smooth = friction.force(speeds, None).value
+        return (smooth - friction.grip(speeds)[0] * speeds.sign() if friction.sticking else smooth)[:, i]
+
+    return f
+
+
+def _curves(posterior: Laplace | None, curve: Callable[[], Tensor]) -> Curves:
+    """The curve at the fitted parameters θ, and its standard deviation to first order, sqrt(diag(J Σ Jᵀ)).
+
+    J along each principal axis of the covariance Σ of θ is a central difference; θ is put back.
+    """
+    with torch.no_grad():
+        found = [curve().double()]
+        if posterior is None:
+            return found
+        theta, parameters = posterior.theta, posterior.problem.parameters
+        values, vectors = torch.linalg.eigh(posterior.covariance[: len(theta), : len(theta)])
+        variance = torch.zeros_like(found[0])
+        try:
+            for value, axis in zip(values.clamp_min(0).tolist(), vectors.T, strict=True):
+                ends = []
+                for side in (STEP, -STEP):
+                    parameters.set(theta + (side * axis).to(theta))
+                    ends.append(curve().double())
+                variance += value * ((ends[0] - ends[1]) / (2 * STEP)).square()
+        finally:
+            parameters.set(theta)
+    return [*found, variance.sqrt()]
+
+
+def _panel(ax: Axes, x: Tensor, curves: Curves, support: tuple[float, float]) -> None:
+    ax.axvspan(*support, color=SUPPORT, lw=0, zorder=0)
+    ax.axhline(0.0, color=MUTED, lw=0.6, zorder=1)
+    if len(curves) > 1:
+        spread = 2 * curves[1]
+        ax.fill_between(x, curves[0] - spread, curves[0] + spread, color=MODEL, alpha=0.25, lw=0, zorder=2)
+    ax.plot(x, curves[0], color=MODEL, zorder=3)
+    ax.set_xlim(float(x[0]), float(x[-1]))

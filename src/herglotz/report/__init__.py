@@ -1,0 +1,5 @@
+"""A report for people: one HTML file without network, and its twin in Markdown."""
+
+from herglotz.report.write import write_report
+
+__all__ = ["write_report"]

@@ -1,0 +1,78 @@
+"""A report as one HTML file: styles, pictures and the script of the slider are inside; nothing is fetched."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+from html import escape
+from importlib.resources import files
+
+from herglotz.plots.style import DPI, styled
+from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
+
+COLOURS = {"fits to the noise": "#1b7f4d", "fits, worse": "#b26a00", "does not fit": "#b3261e"}
+
+
+def as_html(document: Document) -> str:
+    """Return the whole page."""
+    style = files("herglotz.report").joinpath("report.css").read_text(encoding="utf-8")
+    script = files("herglotz.report").joinpath("slider.js").read_text(encoding="utf-8")
+    colour = next((c for text, c in COLOURS.items() if document.verdict.startswith(text)), "#444444")
+    head = f'<strong style="color:{colour}">{escape(_head(document.verdict))}</strong>'
+    contents = "".join(f'<a href="#{_anchor(s.title)}">{escape(s.title)}</a>' for s in document.sections)
+    return f"""<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<title>{escape(document.title)}</title><style>{style}</style></head><body><main>
+<h1>{escape(document.title)}</h1>
+<p class="verdict" style="border-color:{colour}">{head}
+{escape(document.meaning)}<br><small>{escape(document.verdict)}</small></p>
+<nav>{contents}</nav>
+{"".join(map(_section, document.sections))}
+</main><script>{script}</script></body></html>
+"""
+
+
+def _head(verdict: str) -> str:
+    text = verdict.split(":")[0]
+    return text[:1].upper() + text[1:] + "."
+
+
+def _anchor(title: str) -> str:
+    return "".join(c if c.isalnum() else "-" for c in title.lower())
+
+
+def _section(section: Section) -> str:
+    body = "".join(map(_block, section.blocks))
+    return f'<section id="{_anchor(section.title)}"><h2>{escape(section.title)}</h2>{body}</section>\n'
+
+
+def _block(block: Block) -> str:
+    if isinstance(block, str):
+        return f"<p>{escape(block)}</p>"
+    if isinstance(block, Code):
+        return f"<pre><code>{escape(block.text)}</code></pre>"
+    if isinstance(block, Table):
+        head = "".join(f"<th>{escape(cell)}</th>" for cell in block.head)
+        rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows)
+        return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
+    if isinstance(block, Picture):
+        caption = escape(block.caption)
+        return f'<figure><img alt="{caption}" src="{_data(block)}"><figcaption>{caption}</figcaption></figure>'
+    return _slider(block)
+
+
+def _data(picture: Picture) -> str:
+    buffer = io.BytesIO()
+    with styled():
+        picture.figure.savefig(buffer, format="png", dpi=DPI)
+    return "data:image/png;base64," + base64.b64encode(buffer.getvalue()).decode()
+
+
+def _slider(slider: Slider) -> str:
+    values = json.dumps(slider.values, allow_nan=False).replace("<", "\\u003c")
+    return (
+        '<figure class="slider"><canvas width="900" height="320"></canvas><input type="range" min="0" value="0" '
+        f'aria-label="time"><output></output><script type="application/json">{values}</script>'
+        f"<figcaption>{escape(slider.caption)}</figcaption></figure>"
+    )

@@ -1,0 +1,235 @@
+"""`write_report`: one HTML file that says whether to believe a run and how to use it, and its twin in Markdown."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.data.files import write_atomically
+from herglotz.errors import InputError
+from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
+from herglotz.plots.prediction import plot_prediction
+from herglotz.report.html import as_html
+from herglotz.report.markdown import as_markdown
+from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
+from herglotz.stepping import Stepper
+from herglotz.threads import one_thread
+from herglotz.training import Laplace, Plan, Run, laplace, traded
+from herglotz.training.plan import DECISIONS, show
+from herglotz.training.quantities import held_out_rms, quantities
+from herglotz.training.summary import rows as summary_rows
+from herglotz.verify import verify
+
+MEANING = {
+    "fits to the noise": "Free runs of the model miss the data by no more than their noise, also where it was not "
+    "trained. Within the range of the data you can believe it.",
+    "fits, worse": "The model follows the data, but it misses more than their noise explains: something is not in the "
+    "model. Use it for what this error allows.",
+    "does not fit": "The model does not follow the data. Do not use it; the sentence below says what to try.",
+}
+USE = """\
+herglotz export {run} --out model.h --format c    # C: one header, <math.h> alone
+herglotz export {run} --out model.pt2              # PyTorch alone: torch.export.load("model.pt2").module()
+herglotz export {run} --out model.onnx --format onnx
+herglotz verify model.h --against {run}           # the file steps as the run does
+
+/* C */
+#include "model.h"                          /* the example at its top compiles with cc -O3 */
+
+# Python
+import herglotz as hz
+run = hz.load_run("{run}")
+motion = run.rollout(200)                   # numpy: motion.t, motion.q
+print(run.predict("another.csv").rms)"""
+
+
+@one_thread()
+def write_report(run: Run, folder: str | Path, against: Trajectories | None = None, *, name: str = "RUN") -> list[Path]:
+    """Write report.html and report.md into a folder.
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    folder
+        Where to write; made if missing.
+    against
+        Another recording, on which the model is scored (`Run.predict`).
+    name
+        What the commands in the report call the run: its folder.
+
+    Returns
+    -------
+    list of Path
+        Both files; the HTML file fetches nothing.
+    """
+    document = describe(run, against, name)
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    written = {folder / "report.html": as_html(document), folder / "report.md": as_markdown(document)}
+    for path, text in written.items():
+        write_atomically(path, text.encode())
+    return list(written)
+
+
+def describe(run: Run, against: Trajectories | None, name: str) -> Document:
+    """The report's contents."""
+    verdict = str(run.metrics.get("verdict", "not judged"))
+    meaning = next((words for start, words in MEANING.items() if verdict.startswith(start)), "The run has no verdict.")
+    posterior = _posterior(run)
+    sections = [
+        Section("The learned equation", _equation(run, posterior)),
+        Section("Walk through the free run", (*_sliders(run),)),
+        Section("Data", _data(run)),
+        Section("Plan of the fit, with reasons", _plan(run)),
+        Section("Errors on held-out time", _errors(run)),
+        *([] if against is None else [Section("Another recording", _against(run, against))]),
+        Section("What the data leave open", _open(run, posterior)),
+        Section("Verification", _verification(run)),
+        Section("Speed", _speed(run)),
+        Section("How to use it", (Code(USE.format(run=name)),)),
+        Section("Where it comes from", _origin(run)),
+    ]
+    return Document(f"herglotz: model of {run.data.source or 'a recording'}", verdict, meaning, tuple(sections))
+
+
+def _posterior(run: Run) -> Laplace | str:
+    """The posterior, or why there is none."""
+    try:
+        return laplace(run)
+    except InputError as error:
+        return f"No standard deviations: {error}."
+
+
+def _equation(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
+    equation = run.metrics.get("equation")
+    blocks: list[Block] = [Code(equation if isinstance(equation, str) else str(equation))] if equation else []
+    blocks.append("The first coordinate's mass is 1: positions alone do not fix the unit of force.")
+    if isinstance(posterior, str):
+        return (*blocks, posterior, Picture(plot_learned(run), "Potential and force of the model."))
+    found = quantities(posterior, run)
+    blocks.append(Table(("quantity", "value ± standard deviation"), tuple((x.words, str(x)) for x in found)))
+    caption = "What was learned, with bands of two standard deviations; shaded is the range of the training data."
+    return (*blocks, Picture(plot_learned(run, posterior), caption))
+
+
+def _sliders(run: Run) -> list[Block]:
+    data, trained = run.data.unwrapped(), max(run.train_lengths[0] - 1, 0)
+    rows = slice(0, data.lengths[0])
+    found: list[Block] = [
+        "Grey: recorded. Blue: the model on the training part. Orange: its free run, never corrected."
+    ]
+    for i, (name, unit) in enumerate(zip(data.names, data.units, strict=True)):
+        model = [x if math.isfinite(x) else None for x in run.prediction.detach()[rows, i].tolist()]
+        values = {
+            "t": data.t[rows].tolist(), "data": data.q[rows, i].tolist(), "model": model, "trained": trained,
+            "name": name, "unit": "" if unit == "1" else unit, "time_unit": data.time_unit,
+        }  # fmt: skip
+        found.append(Slider(values, f"{name} of trajectory 0"))
+    return found[:5]
+
+
+def _data(run: Run) -> tuple[Block, ...]:
+    data, m = run.data, run.metrics
+    h = data.steps().h
+    precision = m.get("precision")
+    rows = [
+        ("recording", data.summary()),
+        ("steps", f"{float(h.min()):.4g} to {float(h.max()):.4g} {data.time_unit}, median {data.typical_step:.4g}"),
+        ("precision, found in the data", "not found" if precision is None else f"{precision:.3g}"),
+        ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),
+        ("sha256", data.digest()),
+    ]
+    table = Table(("", ""), tuple(rows))
+    if not data.columns:
+        return (table,)
+    return (table, Table(("column", "is taken for", "unit"), tuple((a, b, c or "-") for a, b, c in data.columns)))
+
+
+def _plan(run: Run) -> tuple[Block, ...]:
+    if "plan" not in run.metrics:
+        return ("The run holds no plan.",)
+    plan = Plan.from_dict(run.metrics["plan"])
+    rows = tuple((name, show(getattr(plan, name)), plan.reasons.get(name, "")) for name in DECISIONS)
+    blocks: list[Block] = [Table(("decision", "taken", "because"), rows)]
+    if run.history:
+        blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))
+    return tuple(blocks)
+
+
+def _errors(run: Run) -> tuple[Block, ...]:
+    data = run.data
+    rows = [
+        (f"{b}", *(f"{x:.3g} {unit}".removesuffix(" 1") for x, unit in zip(each, data.units, strict=True)))
+        for b, each in enumerate(held_out_rms(run))
+    ]
+    table = Table(("trajectory", *(f"RMS {name}" for name in data.names)), tuple(rows[:20]))
+    about = [row for row in summary_rows(run) if "RMS" in row[0]]
+    return (
+        Table(("", ""), tuple(about)), "Free run from the last training sample to the end, of each trajectory:", table,
+        Picture(plot_trajectory(run), "Data, fit and free run; shaded is what the model never saw."),
+    )  # fmt: skip
+
+
+def _against(run: Run, data: Trajectories) -> tuple[Block, ...]:
+    found = run.predict(data)
+    rows = [(name, "not reached" if v is None else f"{v:.4g}") for name, v in (
+        *((f"RMS {k}", v) for k, v in (found.metrics()["rms_per_coordinate"] or {}).items()),
+    )]  # fmt: skip
+    rows.append(("steps that failed", f"{100 * found.failed_steps:.3g} %"))
+    return (data.summary(), Table(("", ""), tuple(rows)), Picture(plot_prediction(found), "Free run on the recording."))
+
+
+def _open(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
+    if isinstance(posterior, str):
+        return (posterior,)
+    worth = f"{posterior.effective_parameters():.1f} of {len(posterior.theta)}"
+    blocks: list[Block] = [f"The data determine {worth} parameters; the others stay where the prior holds them."]
+    trades = [str(trade) for trade in traded(posterior)]
+    if trades:
+        blocks.append("What these data cannot tell apart (record other motions, or give one of them):")
+        blocks += trades
+    else:
+        blocks.append("Each physical parameter is determined on its own: none can be traded for another.")
+    caption = "Data minus model, with the 90 % bands of the model (dark) and of a measured value (light)."
+    return (*blocks, Picture(plot_bands(run, posterior.bands()), caption))
+
+
+def _verification(run: Run) -> tuple[Block, ...]:
+    report = verify(run)
+    rows = tuple(
+        (c.statement, f"{c.value:.3g}", f"{'≤' if c.relation == '<=' else c.relation} {c.bound:.3g}",
+         "ok" if c.passed else "FAIL")
+        for c in report.checks
+    )  # fmt: skip
+    text = "Identities hold for every discrete contact Lagrangian: they prove the stepper. The last rows judge the fit."
+    return (
+        f"{'Verified' if report.passed else 'NOT verified'}. {text}",
+        Table(("claim", "measured", "bound", ""), rows),
+    )
+
+
+def _speed(run: Run) -> tuple[Block, ...]:
+    state, _ = run.last_fitted()
+    stepper, steps = Stepper(run.model), 50
+    with torch.no_grad():
+        stepper.rollout(*state, h=run.h, steps=2)
+        began = time.process_time()
+        stepper.rollout(*state, h=run.h, steps=steps)
+        cost = (time.process_time() - began) / steps
+    text = "For a control loop or many runs, step it in C: export it, or hz.compile(run.stepper)."
+    return (f"One step of one trajectory in PyTorch takes {1e6 * cost:.0f} µs of processor time here. {text}",)
+
+
+def _origin(run: Run) -> tuple[Block, ...]:
+    versions = run.metrics.get("versions", {})
+    rows: list[tuple[str, str]] = [(name, str(value)) for name, value in versions.items()]
+    settings: dict[str, Any] = run.config.to_dict()
+    default = type(run.config)().to_dict()
+    changed = ", ".join(f"{k}={v}" for k, v in settings.items() if v != default[k]) or "all by default"
+    return (Table(("", ""), (*rows, ("settings", changed), ("seed", str(run.config.seed)))),)

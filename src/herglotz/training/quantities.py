@@ -1,0 +1,71 @@
+"""The physical parameters of a run by their names in mechanics, with units and standard deviations."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from herglotz.training.identifiability import PHYSICAL, WORDS
+from herglotz.training.run import Run
+from herglotz.training.uncertainty import Laplace
+
+# Powers of the coordinate's unit and of time in each parameter's unit; the first coordinate's mass is 1.
+DIMENSIONS = {
+    "potential.stiffness": (0, -2),
+    "potential.tilt": (1, -2),
+    "damping.rate": (0, -1),
+    "friction.viscous": (0, -1),
+    "friction.coulomb": (1, -2),
+    "friction.breakaway": (1, -2),
+}
+LOGARITHMS = ("kinetic.log", "friction.log")  # stored as logarithms: such a value has no unit
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One number of the model that has a meaning of its own."""
+
+    name: str  # of the parameter, for programs
+    words: str  # for people, with the coordinate it belongs to
+    unit: str  # "" where it has none
+    value: float
+    std: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.5g} ± {self.std:.2g} {self.unit}".rstrip()
+
+
+def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
+    """Every entry of the physical parameters, those of a coordinate with its name."""
+    std, found = posterior.standard_deviations(), []
+    for name, parameter in run.model.named_parameters():
+        if not (name.startswith(PHYSICAL) and parameter.numel()):
+            continue
+        values = parameter.detach().reshape(-1).double()
+        for i, (value, spread) in enumerate(zip(values.tolist(), std[name].reshape(-1).tolist(), strict=True)):
+            words = WORDS.get(name, name)
+            words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
+            whose = f" of {run.data.names[i]}" if values.numel() == run.data.dof > 1 else ""
+            found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
+    return found
+
+
+def _unit(name: str, run: Run, i: int) -> str:
+    if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
+        return ""
+    length, time = DIMENSIONS[name]
+    own = run.data.units[min(i, run.data.dof - 1)]
+    above = own if length and own != "1" else "1"
+    return f"{above}/{run.data.time_unit}" + ("²" if time == -2 else "")
+
+
+def held_out_rms(run: Run) -> list[list[float]]:
+    """RMS of the free run over the unseen samples, [trajectory][coordinate]; NaN where nothing was held out."""
+    error = run.prediction.detach() - run.data.unwrapped().q
+    rows = zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
+    return [
+        torch.full((run.data.dof,), torch.nan).tolist() if trained == length
+        else error[first + trained : first + length].square().mean(0).sqrt().tolist()
+        for first, length, trained in rows
+    ]  # fmt: skip

@@ -1,0 +1,63 @@
+"""`herglotz report`: one page that fetches nothing and says the verdict first, and its twin in Markdown."""
+
+import json
+import re
+
+import pytest
+
+from herglotz.cli import main
+from herglotz.report.html import as_html
+from herglotz.report.markdown import as_markdown
+from herglotz.report.sections import Code, Document, Section, Slider, Table
+
+
+@pytest.fixture(scope="module")
+def written(tiny_run, tiny_csv, tmp_path_factory):
+    """The report of the tiny run, scored on its own data."""
+    folder = tmp_path_factory.mktemp("report")
+    assert main(["report", str(tiny_run), "--against", str(tiny_csv), "--out", str(folder)]) == 0
+    return (folder / "report.html").read_text(), (folder / "report.md").read_text()
+
+
+def test_the_page_stands_alone(written):  # fails if a style, script, font or picture would be fetched
+    page, _ = written
+    assert not re.findall(r"(?:src|href)=\"(?!data:image/png;base64,|#)", page)
+    assert not re.findall(r"https?://|@import|url\(", page)
+    assert page.count("data:image/png;base64,") == 5  # learned, training, trajectory, prediction, bands
+
+
+def test_the_verdict_comes_first_and_everything_is_said(written, tiny_run):
+    # fails if a section is lost, numbers are not the run's, or the verdict hides below a picture
+    page, text = written
+    metrics = json.loads((tiny_run / "metrics.json").read_text())
+    assert page.index(metrics["verdict"].split(":")[0].capitalize()) < page.index("<h2>")
+    titles = re.findall(r"<h2>(.*?)</h2>", page)
+    assert titles == re.findall(r"^## (.*)$", text, re.M)
+    assert titles == [
+        "The learned equation", "Walk through the free run", "Data", "Plan of the fit, with reasons",
+        "Errors on held-out time", "Another recording", "What the data leave open", "Verification", "Speed",
+        "How to use it", "Where it comes from",
+    ]  # fmt: skip
+    assert re.search(r"\| the damping rate γ \| [\d.e-]+ ± [\d.e-]+ 1/s \|", text)
+    assert f"{metrics['extrapolation_rms']:.3g} rad" in text
+    assert f"herglotz export {tiny_run}" in text
+
+
+def test_the_slider_holds_the_run(written, tiny_run):  # fails if data, model or the end of training are another's
+    from herglotz.training import load_run
+
+    run = load_run(tiny_run)
+    found = json.loads(re.findall(r'<script type="application/json">(.*?)</script>', written[0])[0])
+    assert found["data"] == run.data.q[:, 0].tolist()
+    assert found["model"] == run.prediction[:, 0].tolist()
+    assert found["trained"] == run.train_lengths[0] - 1
+
+
+def test_nothing_of_the_data_is_read_as_markup():  # fails if a name of a column can put a script into the page
+    evil = "</script><script>alert(1)</script>|"
+    blocks = (evil, Table((evil,), ((evil,),)), Code(evil), Slider({"name": evil}, evil))
+    document = Document(evil, f"does not fit: {evil}", evil, (Section(evil, blocks),))
+    page = as_html(document)
+    assert "<script>alert" not in page
+    assert page.count("</script>") == 2  # the slider's data, the slider's script
+    assert "\\|" in as_markdown(document)
