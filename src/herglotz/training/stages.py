@@ -39,7 +39,7 @@ class Callback:
 
     def __init__(self, bar: Any, store: Callable[[dict[str, Any]], None], resumed: dict[str, Any] | None):
         self.bar, self.store, self.resumed = bar, store, resumed
-        self.start: float | None = None
+        self.start: float | None = None  # the first cost
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""
