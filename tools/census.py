@@ -54,7 +54,7 @@ GOALS = {"src": 21_000, "outside tests": 26_000, "complexity": 15, "Newton loops
 GOALS["circles"] = 0
 BRANCHES = (ast.If, ast.IfExp, ast.For, ast.AsyncFor, ast.While, ast.ExceptHandler, ast.comprehension, ast.match_case)
 SOLVE = re.compile(r"(^|_)(solve|solver|solve_ex|inv_ex|pseudo_inverse)$")  # names that solve a linear problem
-STEP = re.compile(r"(^|\.)_?(step|take|advance)$")
+STEP = re.compile(r"^(?!.*(optim|schedule)).*\.(step|take|advance)$")
 C_NEWTON = re.compile(r"^\s*(?:static |inline |int |void )+\w*_solve\((?!real)", re.M)
 C_ROLLOUT = re.compile(r"^\s*(?:static |inline |int |long |void )+\w*_rollout\(", re.M)
 
@@ -125,7 +125,7 @@ def drives(function: Any) -> bool:
     inner = {m for n in ast.walk(function) if isinstance(n, FUNCTIONS) and n is not function for m in ast.walk(n)}
     loops = [n for n in ast.walk(function) if isinstance(n, LOOPS) and n not in inner]
     calls = [ast.unparse(n.func) for loop in loops for n in ast.walk(loop) if isinstance(n, ast.Call)]
-    return any(STEP.search(c) and "optim" not in c for c in calls) or ("rollout" in function.name and bool(loops))
+    return any(map(STEP.search, calls)) or ("rollout" in function.name and bool(loops))
 
 
 def imports(files: Files) -> dict[str, set[str]]:
@@ -133,26 +133,27 @@ def imports(files: Files) -> dict[str, set[str]]:
     paths = [p for p in files if p.startswith("src/") and p.endswith(".py")]
     module = {p[4:-3].replace("/", ".").removesuffix(".__init__"): p for p in paths}
     trees = {p: ast.parse(files[p]) for p in paths}
-
-    def origin(package: str, name: str) -> str | None:
-        """File that defines `name` of a module, or the submodule of that name."""
-        if f"{package}.{name}" in module:
-            return module[f"{package}.{name}"]
-        path = module.get(package)
-        if path is None or not path.endswith("__init__.py"):
-            return path
-        for node in trees[path].body:
-            if isinstance(node, ast.ImportFrom) and name in (a.asname or a.name for a in node.names):
-                return origin(node.module or "", name)
-        return path
-
     found: dict[str, set[str]] = {}
     for path, tree in trees.items():
         used = [] if path.endswith("__init__.py") else list(ast.walk(tree))  # a package only passes names on
-        origins = {origin(n.module or "", a.name) for n in used if isinstance(n, ast.ImportFrom) for a in n.names}
+        named = ((n.module or "", a.name) for n in used if isinstance(n, ast.ImportFrom) for a in n.names)
+        origins = {_origin(module, trees, *x) for x in named}
         origins |= {module.get(a.name) for n in used if isinstance(n, ast.Import) for a in n.names}
         found[path] = {f for f in origins if f and f != path}
     return found
+
+
+def _origin(module: dict[str, str], trees: dict[str, ast.Module], package: str, name: str) -> str | None:
+    """File that defines `name` of a module, or the submodule of that name."""
+    if f"{package}.{name}" in module:
+        return module[f"{package}.{name}"]
+    path = module.get(package)
+    if path is None or not path.endswith("__init__.py"):
+        return path
+    for node in trees[path].body:
+        if isinstance(node, ast.ImportFrom) and name in (a.asname or a.name for a in node.names):
+            return _origin(module, trees, node.module or "", name)
+    return path
 
 
 def circles(edges: dict[str, set[str]]) -> list[list[str]]:

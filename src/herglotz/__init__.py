@@ -73,6 +73,8 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    if name == "theory":
+        return import_module("herglotz.theory")
     if name not in _HOME:
         raise AttributeError(f"module 'herglotz' has no attribute {name!r}")
     return getattr(import_module(f"herglotz.{_HOME[name]}"), name)

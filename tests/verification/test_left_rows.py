@@ -115,7 +115,8 @@ def test_forces_are_verified_by_their_own_identity():
     # fails if a forced model is held to a contact map's identities, or its defect has a wrong sign
     report = verify((Pushed(), states(2)), h=H, steps=3)
     assert report.passed, report.table()
-    assert {check.name for check in report.checks} == {"converged", "positive_c", "regularity", "contact", "momentum"}
+    rows = {"converged", "positive_c", "regularity", "derivative", "contact", "momentum"}
+    assert {check.name for check in report.checks} == rows
 
     class Silent:  # null model: the forced steps, with the L_d alone as the claim
         L_d = staticmethod(nonlinear)

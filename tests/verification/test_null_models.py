@@ -98,6 +98,56 @@ def test_a_change_of_sign_of_det_M_fails():
     assert "regularity" in failed(report)
 
 
+def test_an_orientation_that_turns_over_fails():
+    # fails if the row of c reports the largest c, or its size: here c = tanh(5 q0)/2 has both signs
+    def turning(q0, q1, s0, h):
+        return ((q1 - q0) ** 2).sum(-1) / (2 * h) + (0.5 * torch.tanh(5 * q0).sum(-1) - 1) * s0
+
+    report = verify((turning, states()), h=H, steps=2)
+    assert "positive_c" in failed(report)
+    assert -0.5 <= report["positive_c"].value < 0
+
+
+def test_an_L_d_without_discrete_Hamiltonians_is_verified_and_says_so():
+    # fails if a regular L_d with D11 = D22 = 0 (E4), which has no H±, is refused, or its missing rows go unsaid
+    def product(q0, q1, s0, h):
+        return -(q0 * q1).sum(-1) / h - 0.05 * s0
+
+    report = verify((product, states()), h=1.0, steps=3)
+    assert report.passed, report.table()
+    for name in ("hamilton_jacobi", "left_equations", "left_hamilton_jacobi"):
+        assert not report[name].applies
+        assert "does not exist: det D" in report[name].note
+    assert report.table().count("n/a") == 3
+    whole = verify((OSCILLATOR, states()), h=H, steps=3)
+    assert all(check.applies for check in whole.checks)
+
+
+def test_positions_far_from_their_origin_are_verified():
+    # fails if p of size 1 beside q of size 1e5, which rounds it by 2e-10, is held to 1e-11; a wrong p still fails
+    def far(q0, q1, s0, h):
+        return OSCILLATOR(q0 - 1e5, q1 - 1e5, s0, h)
+
+    q, p, s = states()
+    assert verify((far, State(q + 1e5, p, s)), h=H, steps=3).passed
+
+    class Wrong:
+        L_d = staticmethod(far)
+
+        def step(self, state, h):
+            step = Stepper(far).step(state, h)
+            return with_state(step, p=1.001 * step.state.p)
+
+    assert {"contact", "D2S"} <= failed(verify((Wrong(), State(q + 1e5, p, s)), h=H, steps=3))
+
+
+def test_the_table_says_what_it_does_not_judge():
+    # fails if a reader may take the table of a lambda for a statement about a physical system
+    lines = verify((OSCILLATOR, states()), h=H, steps=2).table().splitlines()
+    assert lines[-1].startswith("  Not judged: whether the motion is that of the physical system")
+    assert "at this h alone" in lines[-1]
+
+
 def test_a_momentum_scaled_wrongly_fails():
     # fails if the contact defect or the momentum check compares p with itself
     report = verify((Altered(lambda _, step: with_state(step, p=1.01 * step.state.p)), states()), h=H)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+import textwrap
 from typing import NoReturn
 
 import herglotz
@@ -21,11 +22,22 @@ Learn a discrete contact Lagrangian from measured positions, step it, and prove 
 NEGATIVE_NUMBER = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")  # argparse takes -1e-3 for an option
 
 
+class Help(argparse.RawDescriptionHelpFormatter):
+    """Help as wide as the terminal: paragraphs are wrapped, lists and examples (indented lines) stay."""
+
+    def _fill_text(self, text: str, width: int, indent: str) -> str:
+        paragraphs = [
+            part if "\n " in f"\n{part}" else textwrap.fill(" ".join(part.split()), width)
+            for part in text.strip("\n").split("\n\n")
+        ]
+        return "\n\n".join(textwrap.indent(part, indent) for part in paragraphs)
+
+
 class Parser(argparse.ArgumentParser):
     """An `ArgumentParser` whose errors are one line."""
 
     def __init__(self, *args, **options):
-        super().__init__(*args, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
+        super().__init__(*args, formatter_class=Help, **options)
         self._negative_number_matcher = NEGATIVE_NUMBER
 
     def error(self, message: str) -> NoReturn:

@@ -10,18 +10,21 @@ from herglotz.cli.common import check_output_folder, is_run
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
 DESCRIPTION = """\
 Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training. Of DATA: its
-samples. (`herglotz verify RUN --plots` draws the identities of the action.)
+samples. With --theory, of a SCENE or a RUN: the momentum against the generating function and the Hamilton–Jacobi
+residual; of parachute also the paper's two figures. (`herglotz verify RUN --plots` draws the first two as well.)
 
 examples:
   herglotz plot runs/pendulum
   herglotz plot pendulum.csv --out figures --format pdf
+  herglotz plot parachute --theory --out figures
 """
 
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
-    parser = commands.add_parser("plot", help="draw a run or data", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN|DATA", type=Path, help="folder of a run, or a data file")
+    parser = commands.add_parser("plot", help="draw a run, data or the theory of a scene", description=DESCRIPTION)
+    parser.add_argument("source", metavar="RUN|DATA|SCENE", type=Path, help="folder of a run, a data file, or a scene")
+    parser.add_argument("--theory", action="store_true", help="figures of the generating function, of a scene or a run")
     parser.add_argument(
         "--out", type=Path, metavar="FOLDER",
         help="folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
@@ -35,7 +38,11 @@ def run(arguments: argparse.Namespace) -> int:
     source: Path = arguments.source
     folder = arguments.out or (source if is_run(source) else Path())
     check_output_folder(folder)
-    if is_run(source):
+    if arguments.theory:
+        from herglotz.plots import save_theory_figures
+
+        written = save_theory_figures(str(source), folder, form=arguments.format)
+    elif is_run(source):
         from herglotz.training import load_run
 
         result = load_run(source)

@@ -48,6 +48,7 @@ class Source:
     time_unit: str
     box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
     h_range: tuple[float, float] | None  # steps of the fit
+    hold: str = ""  # what the inputs of the fit do between samples
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -167,7 +168,7 @@ def read_source(path: Path, trajectory: int) -> Source:
         start, t0 = run_.last_fitted(trajectory)
         box = Box(run_.box, data.angles, start.q.dtype)
         labels = (data.names, data.units, data.angles, data.time_unit)
-        return Source(run_.stepper, start, t0, run_.h, *labels, box, run_.h_range)
+        return Source(run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.data.hold)
 
     from herglotz.export import load_exported
 
@@ -217,7 +218,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
         return u, even_times(t0, arguments.h or source.h, steps)
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    found = recorded(path, arguments.trajectory, source.time_unit)
+    found = recorded(path, arguments.trajectory, source.time_unit, source.hold)
     if arguments.q0 is not None and arguments.t0 is None:
         t0 = float(found.t[0])
     return driven(found, t0, steps, arguments.h)

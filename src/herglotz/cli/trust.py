@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_folder, finite, print_json, print_table
 
 if TYPE_CHECKING:
-    from herglotz.training import Laplace, Run
+    from herglotz.training.quantities import Quantity
 
 DESCRIPTION = """\
 Measure how far a run can be trusted: standard deviations of its physical parameters, bands on its prediction with the
@@ -21,6 +23,7 @@ examples:
   herglotz trust runs/pendulum --level 0.95 --json
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
+COLUMNS = 80
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 
@@ -41,6 +44,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Measure, draw, report."""
     from herglotz.training import ensemble_bands, laplace, load_run, traded
+    from herglotz.training.quantities import quantities
 
     result = load_run(arguments.source)
     folder = arguments.out or arguments.source
@@ -53,13 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
     bands = ensemble_bands([result, *map(load_run, arguments.others)]) if arguments.others else posterior.bands()
     inside = bands.inside(result.data.unwrapped().q, arguments.level)
     held = ~trained_mask(result)
+    physical = quantities(posterior, result)
     numbers: dict[str, Any] = {
         "level": arguments.level,
         "inside_training": float(inside[~held].double().mean()),
         "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
         "noise": bands.sigma,
         "held_out_over_noise": posterior.inflation,
-        "parameters": _physical(posterior, result),
+        "parameters": _by_name(physical),
         "not_determined": [
             {"reduction": d.reduction, "parts": dict(d.parts)}
             for d in posterior.least_identified()
@@ -74,42 +79,39 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(numbers)
     else:
-        _report(numbers, folder / "bands.png")
-        if str(result.metrics.get("verdict", "")).startswith("does not fit"):
-            print(f"Warning: the run {result.metrics['verdict']}; the numbers above say nothing of the system")
+        _report(numbers, physical, folder / "bands.png")
+    verdict = str(result.metrics.get("verdict", ""))
+    if verdict.startswith("does not fit"):
+        text = "the run does not fit its data: what is said here of its parameters means little; fit it better first"
+        print(f"herglotz: warning: {text}", file=sys.stderr)
     return 0
 
 
-def _physical(posterior: Laplace, result: Run) -> dict[str, list[list[float]]]:
+def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
     """Value and standard deviation of every entry of the parameters that have a meaning of their own."""
-    import torch
-
-    from herglotz.training.identifiability import PHYSICAL
-
-    std = posterior.standard_deviations()
-    return {
-        name: torch.stack([value.detach().reshape(-1).double(), std[name].reshape(-1)], 1).tolist()
-        for name, value in result.model.named_parameters()
-        if name.startswith(PHYSICAL) and value.numel()
-    }
+    numbers: dict[str, list[list[float]]] = {}
+    for x in found:
+        numbers.setdefault(x.name, []).append([x.value, x.std])
+    return numbers
 
 
-def _report(numbers: dict[str, Any], figure: Path) -> None:
+def _report(numbers: dict[str, Any], physical: list[Quantity], figure: Path) -> None:
     percent = f"{100 * numbers['level']:g} % band"
     rows = [(f"{percent}, training", f"{100 * numbers['inside_training']:.1f} % of the samples inside")]
     if numbers["inside_held_out"] is not None:
         rows.append((f"{percent}, held out", f"{100 * numbers['inside_held_out']:.1f} % of the samples inside"))
     worse = f"{numbers['held_out_over_noise']:.2f}"
-    rows.append(("noise of a sample", f"{numbers['noise']:.3g}; held-out blocks of time miss {worse} times as much"))
-    for name, entries in numbers["parameters"].items():
-        rows.append((name, ", ".join(f"{value:.5g} ± {std:.2g}" for value, std in entries)))
+    rows.append(("noise of a sample", f"{numbers['noise']:.3g}; held-out blocks miss {worse} times as much"))
     worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
     rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
     print_table(rows)
+    print("Value ± standard deviation (the first mass is 1):")
+    for x in physical:
+        print(fill(f"{x.words}: {x}", COLUMNS, initial_indent="  ", subsequent_indent="      "))
     if numbers["traded"]:
         print("What these data cannot tell apart (record other motions, or give one of them):")
         for trade in numbers["traded"]:
-            print(f"  {trade['words']}")
+            print(fill(trade["words"], COLUMNS, initial_indent="  ", subsequent_indent="      "))
     else:
         print("Each parameter above is determined on its own: none can be traded for another.")
     print(f"Figure: {figure}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from numbers import Number
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from torch import Tensor
 
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.readers import load
+from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
@@ -46,6 +48,8 @@ def as_trajectories(
         if (h, time, coordinates, inputs, group) != (None,) * 5 or drop:
             raise InputError("trajectories have their columns already; of the options, only angles changes them")
         return _marked(data, angles)
+    if isinstance(data, FunctionType):
+        raise InputError(f"a function is no recording; {OF_AN_L_D}")
     names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
     if isinstance(data, (str, Path)):
         return _marked(load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}), angles)

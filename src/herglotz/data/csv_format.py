@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
@@ -14,6 +16,8 @@ from herglotz.data.rows import number, quote
 from herglotz.data.table import from_table, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
+
+HOLD = r"#\s*hold:\s*(\w+)"  # the comment that says what inputs do between samples
 
 
 def read_csv(
@@ -32,7 +36,8 @@ def read_csv(
     `trial`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`, `force`, `F`, `torque`,
     `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs; velocities (`v`, `velocity`,
     `*_dot`) are left aside; every other column is a coordinate. Times may be dates in ISO 8601: they become seconds
-    since the first row. Lines that start with # and blank lines are skipped. A coordinate in rad is taken for an angle.
+    since the first row. Lines that start with # and blank lines are skipped, but for `# hold: zero` (or `first`,
+    `smooth`), which says what the inputs do between samples. A coordinate in rad is taken for an angle.
 
     Returns
     -------
@@ -54,6 +59,8 @@ def read_csv(
         raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
     columns = assign(_cells(header), f"{Path(path)}, row {at}", Wanted(time, coordinates, inputs, drop, group))
     found = from_table(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]))
+    said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
+    found = replace(found, hold=said[0]) if said else found
     return found if angles is None else found.with_angles(angles)
 
 
@@ -81,6 +88,7 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     _check_header(Path(path), header, trajectories)
     table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1).tolist()
     names = trajectories.trajectory.tolist()
+    comments = [*comments, f"hold: {trajectories.hold}"] if trajectories.hold else comments
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
     lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table, strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -27,8 +28,10 @@ def even_times(t0: float, h: float, steps: int) -> Tensor:
     return clean(t0 + float(f"{h:.12g}") * torch.arange(steps + 1, dtype=torch.float64))
 
 
-def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str) -> Trajectories:
+def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str, hold: str = "") -> Trajectories:
     """The recording whose inputs drive the model: the trajectory of that number, or the only one.
+
+    Between samples its inputs do what it says itself or, where it says nothing, `hold`.
 
     Raises
     ------
@@ -37,6 +40,7 @@ def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str) -
     """
     found = path if isinstance(path, Trajectories) else load(path)
     path = found.source or "recording"
+    found = replace(found, hold=found.hold or hold)
     if found.u is None:
         raise InputError(f"inputs {path}: holds no inputs; name their columns u, u_*, force or torque")
     if found.time_unit != time_unit:
@@ -51,14 +55,14 @@ def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str) -
 def driven(found: Trajectories, t0: float, steps: int, h: float | None) -> tuple[Tensor, Tensor]:
     """Inputs (K, m) and times (K + 1,) of K steps from t0: the recording's own steps, or steps of h.
 
-    An input is held from its sample to the next; a step of h takes the mean over its time.
+    The recording's own steps take the inputs that its hold makes; a step of h takes their mean over its time.
 
     Raises
     ------
     InputError
         If the recording does not cover these steps, or has no sample at t0 where its own steps are taken.
     """
-    t, u = found.t.double(), found.u
+    t, u = found.t.double(), found.inputs_of_steps()
     assert u is not None  # `recorded` has refused others
     where, spans = f"inputs {found.source}", f"the recording spans {float(t[0]):g} to {float(t[-1]):g}"
     if h is None:

@@ -18,7 +18,7 @@ from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-LABELS = ("names", "units", "angles", "time_unit", "source")
+LABELS = ("names", "units", "angles", "time_unit", "source", "hold")
 # Exceptions that numpy and zipfile raise on a damaged archive.
 DAMAGE = (
     *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
@@ -30,7 +30,8 @@ def read_npz(path: PathLike) -> Trajectories:
     """Read trajectories from a .npz archive.
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and
-    `metadata` (a JSON object with names, units, angles, time_unit, source) may follow. Integer arrays become float64.
+    `metadata` (a JSON object with names, units, angles, time_unit, source, hold) may follow. Integer arrays become
+    float64.
 
     Raises
     ------

@@ -44,6 +44,12 @@ class Scene(Protocol):
         ...
 
 
+OF_AN_L_D = (
+    "motions of an L_d are stepped: out = hz.Stepper(L_d).rollout(q, p, s, h=0.1, steps=100); "
+    "data of one of them: hz.Trajectories.of(0.1 * torch.arange(101), out.q[0])"
+)
+
+
 def simulate(
     scene: Scene,
     *,
@@ -70,6 +76,8 @@ def simulate(
     InputError
         If an argument is out of range, or the motion leaves the finite numbers.
     """
+    if not hasattr(scene, "dof"):
+        raise InputError(f"simulate takes a scene, got a {type(scene).__name__}; {OF_AN_L_D}")
     _check_counts(trajectories, steps, gaps, seed)
     check_positive("h", h)
     if not 0.0 <= noise < float("inf"):
@@ -98,7 +106,7 @@ def simulate(
         source=f"simulate({scene.name}, h={h:g}, seed={seed})",
     )
     if u is not None:
-        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]))
+        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]), hold="zero")
     return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
 
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
+from herglotz.data.holds import HOLDS, held
 from herglotz.data.splits import time_split, trajectory_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
@@ -46,10 +47,14 @@ class Trajectories:
     u: Tensor | None = None  # (N, m) control input (a motor's torque), where measured
     time_unit: str = "s"
     source: str = ""  # file or scene of origin, for messages
+    hold: str = ""  # what u does between samples (`herglotz.data.holds`); "": not said
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
+        if self.hold not in ("", *HOLDS):
+            where = self.source or "trajectories"
+            raise InputError(f"{where}: unknown hold {self.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
         check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
 
     @classmethod
@@ -67,6 +72,7 @@ class Trajectories:
         u: Tensor | np.ndarray | None = None,
         time_unit: str = "s",
         source: str = "",
+        hold: str = "",
         columns: tuple[tuple[str, str, str], ...] = (),
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
@@ -91,6 +97,7 @@ class Trajectories:
             u=None if u is None else _column(_tensor("u", u)),
             time_unit=time_unit,
             source=source,
+            hold=hold,
             columns=columns,
         )
 
@@ -133,6 +140,21 @@ class Trajectories:
     def steps(self) -> Steps:
         """Return all N - B steps, with their trajectory and the row they start from."""
         return steps(self.t, self.trajectory)
+
+    def inputs_of_steps(self, row: Tensor | None = None, part: Tensor | None = None) -> Tensor | None:
+        """Return the input of each step as `hold` has it between samples; None without inputs.
+
+        Parameters
+        ----------
+        row, part
+            (...) sample at which a recorded step starts and where in the step, from 0 to 1; default the middle of the
+            step at every sample, (N, m). At the last sample of a trajectory it is u itself, which acts on no step.
+        """
+        if self.u is None:
+            return None
+        row = torch.arange(self.samples, device=self.t.device) if row is None else row
+        part = torch.full_like(row, 0.5, dtype=self.t.dtype) if part is None else part
+        return held(self.hold, self.t, self.u, self.lengths, row, part)
 
     def triples(self, max_step: float | None = None) -> Triples:
         """Return all three-sample windows; those with a step longer than `max_step` are left out.
@@ -183,13 +205,15 @@ class Trajectories:
         """Return these samples alone, (N,) bool; steps become longer where samples between them are left out.
 
         A longer step takes the mean of the inputs in it, weighted by their time. The first sample of every trajectory
-        must be kept.
+        must be kept. Inputs are those of steps from then on: their hold, if one is known, is "zero".
         """
+        if bool(kept.all()):
+            return self
         columns = self._map(lambda x: x[kept])
-        if self.u is not None:
-            columns["u"] = inputs_of_kept(self.t, self.u, self.lengths, kept)
+        if (u := self.inputs_of_steps()) is not None:
+            columns["u"] = inputs_of_kept(self.t, u, self.lengths, kept)
         lengths = tuple(int(own.sum()) for own in kept.split(list(self.lengths)))
-        return replace(self, **columns, lengths=lengths)
+        return replace(self, **columns, lengths=lengths, hold="zero" if self.hold else "")
 
     def select(self, indices: Iterable[int] | Tensor) -> Trajectories:
         """Return these trajectories, in this order; an index may come twice."""
@@ -245,6 +269,7 @@ class Trajectories:
         """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
+        labels += [self.hold] if self.hold else []
         shapes = {name: list(x.shape) for name, x in arrays.items()}
         sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
         for x in arrays.values():
@@ -306,7 +331,7 @@ def _check_alike(sets: Sequence[Trajectories]) -> None:
     if not sets:
         raise InputError("cat needs at least one set of trajectories, got none")
     for other in sets[1:]:
-        for what in ("names", "units", "angles", "time_unit"):
+        for what in ("names", "units", "angles", "time_unit", "hold"):
             one, two = getattr(sets[0], what), getattr(other, what)
             if one != two:
                 raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")

@@ -164,7 +164,7 @@ class Equations:
     def jacobian(self) -> Graph:
         """`StepJacobian`."""
         q, p, s, h, *u = example(self.model, 0.1)
-        return traced(StepJacobian(self.model), (q, p, s, h, 0.1 * p, *u), derivatives=True)
+        return traced(StepJacobian(self.model), (q, p, s, h, 0.1 * p, *u))
 
     def _traced(self, module: nn.Module) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)

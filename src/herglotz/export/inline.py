@@ -66,6 +66,7 @@ def _inline(outer: fx.Graph, call: fx.Node, graph: Graph) -> None:
     example = next(x.meta["val"] for x in arguments if x.meta["val"].ndim)
     batch, mode = example.shape[0], example.fake_mode
     new: dict[fx.Node, Any] = {}
+    values: dict[Any, Any] = {}  # torch takes a millisecond to describe a tensor, and many nodes have equal ones
     places = iter(arguments)
     with outer.inserting_before(call):
         for node in graph.code.graph.nodes:
@@ -73,7 +74,11 @@ def _inline(outer: fx.Graph, call: fx.Node, graph: Graph) -> None:
                 new[node] = next(places)
             elif node.op == "call_function":
                 new[node] = outer.node_copy(node, lambda x: new[x])
-                new[node].meta = {"val": _value(node.meta["example"], graph, batch, mode)}
+                known = node.meta["example"]
+                key = repr(known)
+                if key not in values:
+                    values[key] = _value(known, graph, batch, mode)
+                new[node].meta = {"val": values[key]}
     results = [new[x] for x in _results(graph)]
     for user in [x for x in call.users if not x.users]:
         outer.erase_node(user)

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
+from torch.utils._python_dispatch import TorchDispatchMode
 
 aten = torch.ops.aten
 PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)
@@ -77,34 +78,26 @@ def example_batch(sizes: set[int]) -> int:
     return next(prime for prime in PRIMES if all(size % prime for size in sizes if size))
 
 
-def traced(module: nn.Module, arguments: tuple[Tensor, ...], derivatives: bool = False) -> Graph:
+def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
     """The module as a graph without classes, repetitions and constant parts, for any batch size.
 
     Parameters
     ----------
     module
-        Takes and returns tensors whose batch is axis 0; not changed.
+        Takes and returns tensors whose batch is axis 0; may differentiate by `torch.func`; not changed.
     arguments
         Examples, with a batch from `example_batch`.
-    derivatives
-        Whether the module differentiates by `torch.func`: its operations are then recorded below those transforms, as
-        smaller ones (`mm` and `addmm` for `linear`).
     """
-    from torch._guards import TracingContext, tracing
-    from torch._subclasses import FakeTensorMode
-    from torch.fx.experimental.proxy_tensor import make_fx
-
+    recorder = Recorder(arguments)
     with torch.no_grad():
         module(*arguments)  # fills index caches outside the trace
-        # A mode of our own: without one, torch makes a new one for the description of every value, half of the time.
-        with tracing(TracingContext(FakeTensorMode(allow_fallback_kernels=True))):
-            found = make_fx(module, pre_dispatch=not derivatives)(*arguments)
-        values = _values(found, arguments)
-        lean = _lean(found, values, next(len(x) for x in arguments if x.ndim))
-        values = _values(lean.code, (*arguments, *lean.constants))
-    for node in lean.code.graph.nodes:
+        with recorder:
+            outputs = module(*arguments)
+        graph = recorder.graph_of(outputs if isinstance(outputs, tuple) else (outputs,))
+        values = _values(graph.code, (*arguments, *graph.constants))
+    for node in graph.code.graph.nodes:
         node.meta["example"] = map_aggregate(values[node.name], _described)
-    return lean
+    return graph
 
 
 class Example(NamedTuple):
@@ -123,119 +116,164 @@ def _values(graph_module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> dict
     """What every node gives for the examples."""
     values: dict[str, Any] = {}
 
-    class Recorder(fx.Interpreter):
+    class Values(fx.Interpreter):
         def run_node(self, n: fx.Node) -> Any:
             values[n.name] = super().run_node(n)
             return values[n.name]
 
-    Recorder(graph_module).run(*arguments)
+    Values(graph_module).run(*arguments)
     return values
 
 
-def _lean(found: fx.GraphModule, values: dict[str, Any], batch: int) -> Graph:
-    """Copy node by node: what no input reaches becomes a constant, what changes nothing is left out."""
-    from torch._functorch.compile_utils import fx_graph_cse
+class Recorder(TorchDispatchMode):
+    """Writes down what torch computes from the inputs, operation by operation, as a graph.
 
-    graph = fx.Graph()
-    new: dict[fx.Node, Any] = {}
-    fixed: set[fx.Node] = set()  # nodes that no input reaches
-    constants: dict[Any, tuple[fx.Node, Tensor]] = {}
-    places = [node for node in found.graph.nodes if node.op == "placeholder"]
-    for node in places:
-        new[node] = graph.placeholder(node.name)
-    axis = next(node for node in places if values[node.name].ndim)
-    size: list[fx.Node] = []
+    It listens below autograd and `torch.func`, where derivatives are operations like any other. `make_fx` of torch
+    records the same at four times the cost: it describes every value a second time.
 
-    def symbol(value: int) -> Any:
-        """A multiple of the batch, as the graph computes it."""
-        if not size:
-            size.append(graph.call_function(aten.sym_size.int, (new[axis], 0)))
-        return size[0] if value == batch else graph.call_function(operator.mul, (size[0], value // batch))
+    An operation on numbers that no input and no batch size decides is not written down; its result becomes a constant
+    where an operation that is written down reads it. What changes nothing is left out.
 
-    def moved(node: fx.Node) -> Any:
-        """The node in the new graph; a constant on its first use."""
-        if node not in fixed:
-            return new[node]
-        value = values[node.name]
-        if not isinstance(value, Tensor):
-            return value
-        if value.is_meta:  # the derivative of a constant, which torch.func keeps without numbers
+    Parameters
+    ----------
+    inputs
+        The tensors that become the inputs of the graph.
+    """
+
+    def __init__(self, inputs: Sequence[Tensor]):
+        super().__init__()
+        self.graph = fx.Graph()
+        self.nodes: dict[int, fx.Node] = {}  # by the identity of the tensor, which `alive` keeps
+        self.alive: list[Any] = []
+        self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # the operations left out, by their result
+        self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
+        self.size: fx.Node | None = None
+        self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
+        for x, place in zip(inputs, self.places, strict=True):
+            self._name(x, place)
+        axis = next(i for i, x in enumerate(inputs) if x.ndim)
+        self.batch, self.axis = len(inputs[axis]), self.places[axis]
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run one operation, and write it down."""
+        kwargs = kwargs or {}
+        result = func(*args, **kwargs)
+        self.alive += [args, result]
+        if self._is_fixed((args, kwargs)):
+            return result
+        if _changes_nothing(func, args, result):
+            self.unchanged[id(result)] = (func, args, kwargs)
+            self._name(result, self._moved(args[0]))
+        elif func == aten.copy_.default:  # into zeros that nothing else reads
+            shape = self._with_batch(list(result.shape))
+            self._name(result, self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape)))
+        else:
+            self._name(result, self._written(func, args, kwargs))
+        return result
+
+    def graph_of(self, outputs: Sequence[Tensor]) -> Graph:
+        """The graph that ends in these tensors; each is a tensor of its own."""
+        from torch._functorch.compile_utils import fx_graph_cse
+
+        left_out = [self.unchanged.get(id(x)) for x in outputs]
+        ends = zip(outputs, left_out, strict=True)
+        self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
+        graph = fx_graph_cse(self.graph)
+        graph.eliminate_dead_code()
+        order = [node for node in graph.nodes if node.op == "placeholder"]
+        kept = {place.name: value for place, value in self.constants.values()}
+        _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
+        return Graph(*without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
+
+    def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
+        if func._schema.is_mutable and func not in INSTEAD:
+            raise NotImplementedError(f"{func} writes in place, which a traced function cannot do")
+        arguments, options = (self._with_batch(_map(self._moved, x)) for x in (args, kwargs))
+        new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
+        return new or self.graph.call_function(INSTEAD.get(func, func), arguments, options)
+
+    def _is_fixed(self, arguments: Any) -> bool:
+        """Whether neither an input nor the batch size decides the arguments."""
+        found: list[Any] = []
+        _map(lambda x: found.append(x) if id(x) in self.nodes else None, arguments)
+        return not found and not _mentions(arguments, self.batch)
+
+    def _name(self, result: Any, node: Any) -> None:
+        """The node of a result; results in a tuple are its items."""
+        if isinstance(result, Tensor):
+            self.nodes[id(result)] = node
+            self.alive.append(result)
+        elif isinstance(result, (list, tuple)):
+            for i, x in enumerate(result):
+                self._name(x, self.graph.call_function(operator.getitem, (node, i)))
+
+    def _moved(self, value: Tensor) -> fx.Node:
+        """The node of a tensor; that of a constant on its first use."""
+        if id(value) in self.nodes:
+            return self.nodes[id(value)]
+        if value.is_meta or value._is_zerotensor():  # torch.func keeps the derivative of a constant without numbers
             value = torch.zeros(value.shape, dtype=value.dtype)
         key = (value.dtype, tuple(value.shape), value.detach().cpu().contiguous().numpy().tobytes())
-        if key not in constants:
-            with graph.inserting_before(new[places[0]]):
-                place = graph.placeholder(f"constant_{len(constants)}")
-            constants[key] = (place, value.detach().clone(memory_format=torch.contiguous_format))
-        return constants[key][0]
+        if key not in self.constants:
+            with self.graph.inserting_before(self.places[0]):
+                place = self.graph.placeholder(f"constant_{len(self.constants)}")
+            self.constants[key] = (place, value.detach().clone(memory_format=torch.contiguous_format))
+        return self.constants[key][0]
 
-    for node in found.graph.nodes:
-        if node.op == "placeholder":
-            continue
-        if node.op == "get_attr" or (node.op == "call_function" and _unreached(node, fixed, batch)):
-            fixed.add(node)
-            continue
-        if node.op == "output":
-            found_out: Any = node.args[0]
-            graph.output(tuple(moved(x) for x in (found_out if isinstance(found_out, (tuple, list)) else [found_out])))
-            continue
-        if _changes_nothing(node, values):
-            new[node] = moved(node.args[0])
-            continue
-        if node.target == aten.copy_.default:  # into zeros that nothing else reads
-            shape = _with_batch(list(values[node.name].shape), batch, symbol)
-            new[node] = graph.call_function(aten.expand.default, (moved(node.args[1]), shape))
-            continue
-        arguments = fx.map_arg(node.args, moved)
-        arguments, options = (_with_batch(x, batch, symbol) for x in (arguments, node.kwargs))
-        new[node] = _gathered(graph, node, values, arguments) or graph.create_node(
-            "call_function", INSTEAD.get(node.target, node.target), arguments, fx.map_arg(options, moved), node.name
-        )
-    graph = fx_graph_cse(graph)
-    graph.eliminate_dead_code()
-    order = [node for node in graph.nodes if node.op == "placeholder"]
-    kept = {place.name: value for place, value in constants.values()}
-    _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
-    return Graph(*without_unused(graph, [kept[x.name] for x in order if x.name in kept]), batch)
+    def _with_batch(self, x: Any) -> Any:
+        """The arguments with every multiple of the example's batch replaced by the size that the graph computes."""
+        if isinstance(x, (list, tuple)):
+            return [self._with_batch(y) for y in x] if isinstance(x, list) else tuple(self._with_batch(y) for y in x)
+        if isinstance(x, dict):
+            return {key: self._with_batch(y) for key, y in x.items()}
+        if not _mentions(x, self.batch):
+            return x
+        if self.size is None:
+            self.size = self.graph.call_function(aten.sym_size.int, (self.axis, 0))
+        return self.size if x == self.batch else self.graph.call_function(operator.mul, (self.size, x // self.batch))
 
 
-def _unreached(node: fx.Node, fixed: set[fx.Node], batch: int) -> bool:
-    """Whether neither an input nor the batch size decides the value."""
-    sized: list[int] = []
-    _with_batch((node.args, node.kwargs), batch, lambda value: sized.append(value))
-    return not sized and all(x in fixed for x in node.all_input_nodes)
-
-
-def _changes_nothing(node: fx.Node, values: dict[str, Any]) -> bool:
-    if node.target not in SAME or any(user.op == "output" for user in node.users):
-        return False
-    (x, *_), y = node.all_input_nodes, values[node.name]
-    before = values[x.name]
-    if node.target == aten.movedim.intlist:
-        _, source, target = node.args
-        return bool(source == target)
-    return before.shape == y.shape and before.dtype == y.dtype
-
-
-def _with_batch(x: Any, batch: int, symbol: Any) -> Any:
-    """The arguments with every multiple of the example's batch replaced."""
+def _map(change: Callable[[Tensor], Any], x: Any) -> Any:
+    """The arguments with every tensor changed."""
+    if isinstance(x, Tensor):
+        return change(x)
     if isinstance(x, (list, tuple)):
-        return type(x)(_with_batch(y, batch, symbol) for y in x) if type(x) in (list, tuple) else [
-            _with_batch(y, batch, symbol) for y in x
-        ]  # fmt: skip
+        return [_map(change, y) for y in x] if isinstance(x, list) else tuple(_map(change, y) for y in x)
+    return {key: _map(change, y) for key, y in x.items()} if isinstance(x, dict) else x
+
+
+def _mentions(x: Any, batch: int) -> bool:
+    """Whether a multiple of the batch is among the arguments."""
+    if isinstance(x, (list, tuple)):
+        return any(_mentions(y, batch) for y in x)
     if isinstance(x, dict):
-        return {key: _with_batch(y, batch, symbol) for key, y in x.items()}
-    if isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * batch and x % batch == 0:
-        return symbol(x)
-    return x
+        return any(_mentions(y, batch) for y in x.values())
+    return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * batch and x % batch == 0
 
 
-def _gathered(graph: fx.Graph, node: fx.Node, values: dict[str, Any], arguments: Any) -> fx.Node | None:
-    """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
-    places: Any = node.args[1] if len(node.args) > 1 else ()
-    if node.target != aten.index.Tensor or len(places) != 1:
+def _changes_nothing(func: Any, args: Any, result: Any) -> bool:
+    if func not in SAME:
+        return False
+    if func == aten.movedim.intlist:
+        return bool(args[1] == args[2])
+    return args[0].shape == result.shape and args[0].dtype == result.dtype
+
+
+def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:
+    """(x = x) · (|x| ≠ ∞), which is what torch makes of isfinite, as one operation again."""
+    if func != aten.mul.Tensor or not all(isinstance(x, fx.Node) for x in arguments):
         return None
-    index = places[0]
-    shape = list(values[index.name].shape)
+    same, below = arguments
+    if (same.target, below.target) != (aten.eq.Tensor, aten.ne.Scalar) or same.args[0] is not same.args[1]:
+        return None
+    return graph.call_function(aten.isfinite.default, same.args[:1])
+
+
+def _gathered(graph: fx.Graph, func: Any, values: Any, arguments: Any) -> fx.Node | None:
+    """x[index] along the first axis as `index_select`: ONNX runs the general form at a tenth of the speed."""
+    if func != aten.index.Tensor or len(values[1]) != 1:
+        return None
+    shape = list(values[1][0].shape)
     x, (place,) = arguments
     flat = place if len(shape) == 1 else graph.call_function(aten.reshape.default, (place, [-1]))
     new = graph.call_function(aten.index_select.default, (x, 0, flat))

@@ -14,6 +14,8 @@ from typing import Any, Protocol, cast, runtime_checkable
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
+
 
 class DiscreteLagrangian(Protocol):
     """L_d(q0, q1, s0, h): the increment of the action variable s over one step."""
@@ -133,13 +135,62 @@ def partials(
     ------
     ValueError
         If `order` is neither 1 nor 2.
+    InputError
+        If an argument is no tensor of positions or actions, or L_d returns no number a sample.
     """
     if order not in (1, 2):
         raise ValueError(f"order must be 1 or 2, got {order}")
+    check_arguments(q0, q1, s0)
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     if isinstance(L_d, ClosedForm):
         return L_d.partials(q0, q1, s0, h, order)
     return autograd_partials(L_d, q0, q1, s0, h, order)
+
+
+def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
+    """L_d(q0, q1, s0, h), shape (...), with the checks of `partials` and no derivatives."""
+    check_arguments(q0, q1, s0)
+    h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
+    return checked(L_d, L_d(q0, q1, s0, h), torch.empty(shape, device="meta"))
+
+
+def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
+    """Refuse what is no tensor, and positions without a last axis for the coordinates.
+
+    Raises
+    ------
+    InputError
+        With a remedy.
+    """
+    for name, x in zip(names, (q0, q1, s0), strict=True):
+        if not isinstance(x, Tensor):
+            raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {REMEDY}")
+    if q0.ndim == 0 or q1.ndim == 0:
+        raise InputError(f"{names[0]} and {names[1]} need shape (..., n), got (); {REMEDY}")
+
+
+REMEDY = (
+    "one coordinate is q = torch.tensor([1.0], dtype=torch.float64), with s = torch.tensor(0.0, dtype=torch.float64)"
+)
+
+
+def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
+    """L, if L_d returned a number a sample: a shape that only broadcasts would step to a wrong number in silence.
+
+    Raises
+    ------
+    InputError
+        If L is no tensor or has not the shape (...) of `like`.
+    """
+    if isinstance(L, Tensor) and L.shape == like.shape:
+        return L
+    name = getattr(L_d, "__name__", type(L_d).__name__).replace("<lambda>", "the function")
+    got = f"shape {tuple(L.shape)}" if isinstance(L, Tensor) else f"a {type(L).__name__}"
+    raise InputError(
+        f"{name} returned {got} where {tuple(like.shape)}, a number a sample, belongs; "
+        "sum over coordinates with .sum(-1), and add 0 * s0 where nothing depends on a sample"
+    )
 
 
 def autograd_partials(
@@ -150,14 +201,14 @@ def autograd_partials(
     Batched by the batch-sum trick: samples do not interact, so the gradient of the sum is the batch of gradients.
     """
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
+    q0, q1, s0, _ = torch.broadcast_tensors(q0, q1, s0[..., None], h[..., None])
+    s0 = s0[..., 0]
     keep_graph = torch.is_grad_enabled() and _differentiable(L_d, q0, q1, s0, h)
     with torch.enable_grad():
-        q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
-        s0 = s0[..., 0]
         q0, q1, s0 = (x if x.requires_grad else x.detach().requires_grad_() for x in (q0, q1, s0))
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1
-        L = L_d(a, b, s, h)
+        L = checked(L_d, L_d(a, b, s, h), s)
         forces = L_d.forces(a, b, s, h) if isinstance(L_d, Forced) else None
         force = None if forces is None else _autograd_forces(forces, (a, b, s), order, keep_graph)
         D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)
@@ -200,7 +251,9 @@ def _autograd_forces(
 
 def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
     """Whether a result should carry a graph: an argument wants a gradient, or a parameter inside L_d does."""
-    return q0.requires_grad or q1.requires_grad or s0.requires_grad or L_d(q0, q1, s0, h).requires_grad
+    if q0.requires_grad or q1.requires_grad or s0.requires_grad:
+        return True
+    return checked(L_d, L_d(q0, q1, s0, h), s0).requires_grad
 
 
 def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = False) -> tuple[Tensor, ...]:

@@ -3,5 +3,8 @@
 from herglotz.models.capabilities import Capabilities, capabilities
 from herglotz.models.config import LEVELS, ModelConfig
 from herglotz.models.model import ContactLagrangian, DrivenLagrangian
+from herglotz.models.term import TERMS, Term
 
-__all__ = ["LEVELS", "Capabilities", "ContactLagrangian", "DrivenLagrangian", "ModelConfig", "capabilities"]
+__all__ = [
+    "LEVELS", "TERMS", "Capabilities", "ContactLagrangian", "DrivenLagrangian", "ModelConfig", "Term", "capabilities",
+]  # fmt: skip

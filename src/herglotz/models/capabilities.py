@@ -21,9 +21,9 @@ class Capabilities:
     action_flow: bool  # the full level: the map of s is nonlinear
     position_features: bool  # named features in the potential
     friction: bool  # forces F⁻, F⁺ of friction and inputs
-    dry_friction: bool
+    nonlinear_force: bool  # dry friction, or a term's force that is not linear in v
     sticking: bool  # dry friction is set-valued
-    coupling: bool  # friction between joints
+    coupling: bool  # a force that depends on the velocities of other joints
     drag: bool  # named friction forces
     inputs: int  # m
 
@@ -35,8 +35,8 @@ class Capabilities:
     @property
     def linear_in_q1(self) -> bool:
         """Whether the step equation is linear in q1, so that one Newton step solves it (forces may be part of it)."""
-        bent = self.correction or self.dry_friction or self.drag
-        return self.order == 2 and self.constant_c and self.constant_mass and not bent
+        linear = not (self.correction or self.nonlinear_force or self.drag)
+        return self.order == 2 and self.constant_c and self.constant_mass and linear
 
     @property
     def by_terms(self) -> bool:

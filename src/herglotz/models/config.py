@@ -9,6 +9,7 @@ from herglotz.errors import InputError
 from herglotz.models.drag import parse_drag
 from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
+from herglotz.models.term import check_terms
 from herglotz.settings import from_plain
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
@@ -29,6 +30,7 @@ class ModelConfig:
     its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds, and `drag`
     names friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds what the rule lacks of the exact
     L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
+    `terms` are further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
     Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
     baseline is needed (trap 2).
     """
@@ -63,12 +65,14 @@ class ModelConfig:
     coupled: bool = False
     drag: tuple[str, ...] = ()
     order: int = 2
+    terms: tuple[str, ...] = ()
 
     def __post_init__(self):
         self._check_sizes()
         self._check_forces()
         self._check_structure()
         self._check_features()
+        check_terms(self)
 
     def _check_sizes(self) -> None:
         if self.level not in LEVELS:

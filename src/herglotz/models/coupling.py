@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor, nn
 
-from herglotz.mechanics import Forces
+from herglotz.models.config import ModelConfig
 from herglotz.models.jet import pairs
+from herglotz.models.term import Term
 
 
-class CoupledFriction(nn.Module):
+class CoupledFriction(Term):
     """f_i = −Σ_{j≠i} b_ij v_j with b symmetric, beside the b_ii of `Friction`: F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
 
     Two links with angles from the vertical and viscous hinges b have b₁₁ = 2b, b₂₂ = b and b₁₂ = −b, which one number a
@@ -19,10 +18,9 @@ class CoupledFriction(nn.Module):
     say so, not by construction.
     """
 
-    def __init__(self, dof: int):
-        super().__init__()
-        self.dof = dof
-        self.viscous = nn.Parameter(torch.zeros(dof * (dof - 1) // 2, dtype=torch.float64))
+    def __init__(self, config: ModelConfig):
+        super().__init__(config)
+        self.viscous = nn.Parameter(torch.zeros(self.dof * (self.dof - 1) // 2, dtype=torch.float64))
 
     def matrix(self) -> Tensor:
         """Return the matrix b without its diagonal, (n, n)."""
@@ -32,18 +30,7 @@ class CoupledFriction(nn.Module):
         upper = b.new_zeros(self.dof, self.dof).index_put((i[off], j[off]), b)
         return upper + upper.T
 
-    def forward(self, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
-        """Return `own` plus these forces at the velocity v (..., n), with derivatives if `own` has them."""
+    def force(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return f = −b v and −b."""
         b = self.matrix()
-        f = -v @ b
-        minus, plus = own.minus + (c * h / 2)[..., None] * f, own.plus + (h / 2)[..., None] * f
-        if own.minus_2 is None:
-            return replace(own, minus=minus, plus=plus)
-        assert own.minus_1 is not None
-        assert own.plus_1 is not None
-        assert own.plus_2 is not None
-        before, after = (c / 2)[..., None, None] * b, b / 2
-        return replace(
-            own, minus=minus, plus=plus, minus_1=own.minus_1 + before, minus_2=own.minus_2 - before,
-            plus_1=own.plus_1 + after, plus_2=own.plus_2 - after,
-        )  # fmt: skip
+        return -v @ b, -b

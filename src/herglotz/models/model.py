@@ -22,6 +22,7 @@ from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
+from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
 
@@ -90,8 +91,21 @@ class ContactLagrangian(nn.Module):
             self.kinetic = FeatureKinetic(self.kinetic, moving, known_moving, c.dof)
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
-        self.coupling = CoupledFriction(c.dof) if c.coupled and c.dof > 1 else None
+        self.coupling = CoupledFriction(c) if c.coupled and c.dof > 1 else None
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
+        self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
+        self.potential.more = tuple(self.named_terms)
+
+    @property
+    def named_terms(self) -> list[Term]:
+        """The terms that the configuration names."""
+        return [term for term in self.more if isinstance(term, Term)]
+
+    @property
+    def forces_between(self) -> list[Term]:
+        """The terms whose force may depend on every velocity."""
+        known = [] if self.coupling is None else [self.coupling]
+        return known + [term for term in self.named_terms if term.has_force()]
 
     @property
     def dof(self) -> int:
@@ -126,9 +140,10 @@ class ContactLagrangian(nn.Module):
             action_flow=self.action is not None,
             position_features=self.potential.features is not None,
             friction=self.friction is not None,
-            dry_friction=self.friction is not None and not self.friction.linear,
+            nonlinear_force=(self.friction is not None and not self.friction.linear)
+            or not all(term.linear for term in self.forces_between),
             sticking=self.friction is not None and self.friction.sticking,
-            coupling=self.coupling is not None,
+            coupling=bool(self.forces_between),
             drag=self.drag is not None,
             inputs=self.inputs,
         )
@@ -263,7 +278,8 @@ class ContactLagrangian(nn.Module):
         v = (q1 - q0 if delta is None else delta) / h[..., None]
         c = self.damping(q0, q1, h, order).exp()
         forces = self.friction(v, c, h, order, u)
-        forces = forces if self.coupling is None else self.coupling(v, c, h, forces)
+        for term in self.forces_between:
+            forces = with_force(forces, term, v, c, h)
         return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
 
 

@@ -15,6 +15,7 @@ from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.jet import Jet, coordinates, pairs
 from herglotz.models.network import Network, feature_count, position_features
 from herglotz.models.phase import Phase
+from herglotz.models.term import Term
 
 
 class Kinetic(nn.Module):
@@ -98,6 +99,7 @@ class Potential(nn.Module):
         self.stiffness: Tensor
         self.tilt: Tensor
         self.features = features
+        self.more: tuple[Term, ...] = ()  # the model's terms by name, which it holds itself
         self.network: Network | None = None
         if width:
             self.network = Network(feature_count(angles), width, depth, 1.0, generator, activation=activation)
@@ -123,6 +125,8 @@ class Potential(nn.Module):
         V = self.baseline(x)
         departure = self.departure(x)
         V = V if departure is None else V + departure
+        for own in (term.potential(x) for term in self.more):
+            V = V if own is None else V + own
         return V if self.features is None else V + self.features(q, order)
 
 

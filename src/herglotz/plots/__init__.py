@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
@@ -15,10 +15,12 @@ from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_m
 from herglotz.plots.learned import plot_learned
 from herglotz.plots.motion import plot_data, plot_trajectory
 from herglotz.plots.parachute import plot_fall, plot_printed_map
+from herglotz.plots.parachute_motion import physical_fall, printed_map
 from herglotz.plots.phase import plot_phase_portrait
 from herglotz.plots.selection import plot_selection
 from herglotz.plots.style import save_figure
 from herglotz.plots.training import plot_training
+from herglotz.verify.subject import named
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -36,6 +38,41 @@ IDENTITIES = {
 }
 
 
+def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None, form: str = "png") -> list[Path]:
+    """Draw the figures of S^k and of the discrete Hamilton–Jacobi equation into `folder`, made if it is missing.
+
+    Parameters
+    ----------
+    source
+        Anything that `verify` takes and that has an L_d: a scene or its name, a run or its folder, an L_d with h, a
+        pair (L_d, states) with h. The scene "parachute" adds the paper's two figures: the printed map, and a fall.
+    folder
+        Where the files go.
+    h
+        Step; default that of the source.
+    form
+        png, svg or pdf.
+
+    Raises
+    ------
+    InputError
+        If the source is none of these or has forces, whose map has no S^k; or the folder cannot be made.
+    """
+    source = named(source)
+    L_d = getattr(source, "model", getattr(source, "L_d", source))
+    if getattr(L_d, "friction", None) is not None or getattr(source, "external", None) is not None:
+        raise InputError("with friction or other forces a step is no contact map: there is no S^k to draw")
+    drawn = {name: plot(source, h=h) for name, plot in IDENTITIES.items()}
+    if getattr(source, "name", "") == "parachute":
+        drawn["parachute_map"] = plot_printed_map(printed_map()[1])
+        drawn["parachute_fall"] = plot_fall(physical_fall()[1])
+    folder = _made(folder)
+    files = [folder / f"{name}.{form}" for name in drawn]
+    for file, figure in zip(files, drawn.values(), strict=True):
+        save_figure(figure, file)
+    return files
+
+
 def save_figures(
     run: Run, folder: PathLike, figures: Mapping[str, Callable[[Run], Figure]] = FIGURES, form: str = "png"
 ) -> list[Path]:
@@ -51,15 +88,20 @@ def save_figures(
     InputError
         If the folder cannot be made or written to.
     """
-    folder = Path(folder)
     drawn = {f"{name}.{form}": plot(run) for name, plot in figures.items()}
+    folder = _made(folder)
+    for name, figure in drawn.items():
+        save_figure(figure, folder / name)
+    return [folder / name for name in drawn]
+
+
+def _made(folder: PathLike) -> Path:
+    folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
-    for name, figure in drawn.items():
-        save_figure(figure, folder / name)
-    return [folder / name for name in drawn]
+    return folder
 
 
 __all__ = [
@@ -78,4 +120,5 @@ __all__ = [
     "plot_trajectory",
     "save_figure",
     "save_figures",
+    "save_theory_figures",
 ]

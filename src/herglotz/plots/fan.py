@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
@@ -13,6 +13,7 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.theory import GeneratingFunction, generating_function
+from herglotz.verify.subject import subject
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -48,10 +49,15 @@ def regular(S: GeneratingFunction) -> Tensor:
     return finite & (spread > CAUSTIC * typical)
 
 
-def spread_fan(source: Run | ContactLagrangian, size: int, h: float | None = None) -> Fan:
-    """Return `size` solutions that start all over the data (a run) or the model's typical box (a model alone)."""
+def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
+    """Return `size` solutions that start all over the data (a run), the typical box (a model), or drawn states."""
     if isinstance(source, ContactLagrangian):
         return _box_fan(source, size, h)
+    if not _is_run(source):
+        known = subject(source, h, size, 0)
+        if known.L_d is None:
+            raise InputError(f"{known.name} holds no L_d; the figures of S^k need one: give the run, or the L_d")
+        return Fan(known.L_d, known.states, known.h)
     states = source.states
     rows = torch.linspace(0, len(states.s) - 1, min(size, len(states.s))).round().long()
     start = State(states.q[rows].detach(), states.p[rows].detach(), states.s[rows].detach())
@@ -62,9 +68,17 @@ def spread_fan(source: Run | ContactLagrangian, size: int, h: float | None = Non
     return Fan(source.model, start, source.h if h is None else h, *units(source))
 
 
-def point_fan(run: Run, size: int) -> Fan:
-    """Return `size` solutions that leave one point (q̂0, ŝ0) of the data with different p̂0 along one direction."""
-    states = run.states
+def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
+    """Return `size` solutions that leave one point (q̂0, ŝ0) with different p̂0 along one direction.
+
+    The point is one of the data of a run, or of the states that `spread_fan` starts from.
+    """
+    L_d, h, names = (source.model, source.h, units(source)) if _is_run(source) else (None, h, ("", ""))
+    if L_d is None:
+        fan = spread_fan(source, 64, h)
+        L_d, h, states = fan.L_d, fan.h, fan.start
+    else:
+        states = source.states
     finite = torch.isfinite(states.p).all(-1) & torch.isfinite(states.q).all(-1) & torch.isfinite(states.s)
     if not bool(finite.any()):
         raise InputError("the run has no finite state to start from; fit it again")
@@ -74,7 +88,13 @@ def point_fan(run: Run, size: int) -> Fan:
     steps = torch.linspace(-1.0, 1.0, size, dtype=p.dtype, device=p.device)
     momenta = p.median(0).values + steps[:, None] * reach.clamp_min(1e-6)
     start = State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone())
-    return Fan(run.model, start, run.h, *units(run))
+    assert h is not None
+    return Fan(L_d, start, h, *names)
+
+
+def _is_run(source: Any) -> bool:
+    """Whether the source has states fitted to data; hand-made runs of tests have, too."""
+    return hasattr(source, "states") and hasattr(source, "model")
 
 
 def units(run: Run) -> tuple[str, str]:

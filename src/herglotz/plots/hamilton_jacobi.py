@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,14 +11,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
-from herglotz.models import ContactLagrangian
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
 from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
-
-if TYPE_CHECKING:
-    from herglotz.training import Run
 
 STEPS, SIZE = 8, 31
 NULL_STEPS = (1, 4, 8)
@@ -27,7 +23,7 @@ ANCHOR = 7  # index of the distance through which the reference line of slope 2 
 BELOW = 1 / 200  # rounding errors at which a difference of exactly 0 is drawn
 
 
-def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: float | None = None) -> Figure:
+def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None) -> Figure:
     """Draw D2 S^k(q_k) against the momentum p_k that the stepper carries, for k = 1…8 from states all over the data.
 
     S^k is the action accumulated along the discrete solution, differentiated with respect to its end point; that the
@@ -36,7 +32,8 @@ def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: 
     Parameters
     ----------
     source
-        A run, or a model alone (then from states drawn at random from its typical box).
+        A run, a model alone (then from states drawn at random from its typical box), or what `verify` takes: a scene,
+        an L_d with h, a pair (L_d, states) with h.
     h
         Step; left out, the run's typical model step (or a tenth of the model's typical time).
     """
@@ -72,15 +69,20 @@ def plot_momentum_vs_generating_function(source: Run | ContactLagrangian, *, h: 
     return figure
 
 
-def plot_hamilton_jacobi_residual(run: Run) -> Figure:
+def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Figure:
     """Draw the residual of the discrete Hamilton–Jacobi equation on the flow, and off it as the null experiment.
 
     Left: |S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k)| over its terms' sizes, for
     a fan of solutions through one point. Right: the same with q_{k+1} moved to a neighbouring solution of the fan. Off
     the flow the equation is not an identity (erratum E7): the residual must grow with the square of the distance, and a
     check that stayed small there would check nothing.
+
+    Parameters
+    ----------
+    source, h
+        As for `plot_momentum_vs_generating_function`.
     """
-    fan = point_fan(run, SIZE)
+    fan = point_fan(source, SIZE, h)
     S = [fan.generating_function(k) for k in range(1, STEPS + 2)]
     rows = [_residual(fan, S[k], S[k + 1], S[k + 1]) for k in range(STEPS)]
     table = torch.stack(rows).double().cpu().numpy()
@@ -88,7 +90,7 @@ def plot_hamilton_jacobi_residual(run: Run) -> Figure:
     worst = float(np.nanmax(table)) if np.isfinite(table).any() else float("nan")
     floor = BELOW * torch.finfo(fan.start.q.dtype).eps
     with styled():
-        title = f"The learned action solves the discrete Hamilton–Jacobi equation: relative residual ≤ {worst:.0e}"
+        title = f"The action solves the discrete Hamilton–Jacobi equation: relative residual ≤ {worst:.0e}"
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, np.maximum(table, floor))
@@ -97,7 +99,7 @@ def plot_hamilton_jacobi_residual(run: Run) -> Figure:
             distance,
             off_flow,
             max(worst, floor),
-            with_unit(r"distance of $q_{k+1}$ from the flow", _length(run)),
+            with_unit(r"distance of $q_{k+1}$ from the flow", _length(source)),
         )
     return figure
 
@@ -189,5 +191,6 @@ def _caustics(table: np.ndarray) -> str:
     return ", grey: at a caustic" if not np.isfinite(table).all() else ""
 
 
-def _length(run: Run) -> str:
-    return run.data.units[0] if len(set(run.data.units)) == 1 else ""
+def _length(source: Any) -> str:
+    units = source.data.units if hasattr(source, "data") else ("", "")
+    return units[0] if len(set(units)) == 1 else ""

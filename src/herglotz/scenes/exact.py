@@ -21,8 +21,9 @@ from herglotz.scenes.reference import integrate
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import jacobian
+from herglotz.theory.jacobi import split
 
-PIECES = 2  # of the step; conjugate points are looked for at the end of each
+PIECES = 2  # of the step; conjugate points are looked for at the end of each, and between two
 MISS = 1e-11  # of q1, relative to the positions, that Newton may leave: a Taylor step in q1 takes the rest
 
 
@@ -70,10 +71,10 @@ class NumericallyExact:
         D22 = P_p Y_p⁻¹,  D23 = P_s − D22 Y_s,  D12 = −c Y_p⁻¹ − p0 ⊗ D23,
         D33 = ∂c/∂s0 − D23·Y_s,  D13 = c Y_p⁻¹ Y_s − p0 D33,  D11 = c Y_p⁻¹ Y_q − p0 ⊗ D13.
 
-    Always computed in float64. NaN where there is no such motion or more than one branch; `shoot` says which. A
-    conjugate point is looked for in the middle and at the end of the step (an eigenvalue of ∂q/∂p0 that has left the
-    right half-plane), so a step of many periods is not safe. L_d can be differentiated twice and its first partials
-    once; a further derivative raises, and so does one with respect to h.
+    Always computed in float64. NaN where there is no such motion or more than one branch; `shoot` says which. There is
+    no conjugate point inside the step where its halves have none and the action is a minimum in the position between
+    them; in a half it is looked for at the end alone, so a step of many periods is not safe. L_d can be differentiated
+    twice and its first partials once; a further derivative raises, and so does one with respect to h.
 
     Source: section 1 of `docs/mathematics.md` (FL⁻, FL⁺ and Φ̃*η = cη along the flow).
     """
@@ -137,13 +138,17 @@ class NumericallyExact:
         D = torch.eye(2 * n + 1, dtype=x.dtype, device=x.device)
         log_c, gradient = torch.zeros_like(s0), x.new_zeros(1, 2 * n + 1)
         error, opened = torch.zeros_like(s0), torch.ones_like(s0, dtype=torch.bool)
-        for piece in range(1, PIECES + 1):
+        Y_p, to_y = None, change
+        for _ in range(PIECES):
             found, J, more = self._sensitivities(x, h / PIECES)
+            own = (J[..., :-1, :] @ to_y)[..., q, n : 2 * n]  # ∂q/∂p of this piece alone
             x, log_c = found[..., :-1], log_c + found[..., -1]
             D, gradient = J[..., :-1, :] @ D, gradient + J[..., -1:, :] @ D
-            error = torch.maximum(error, more)
-            Y_p = (D @ change)[..., q, n : 2 * n]
-            opened = opened & _opened(Y_p / (h * piece / PIECES)[..., None, None])
+            error, before, Y_p = torch.maximum(error, more), Y_p, (D @ change)[..., q, n : 2 * n]
+            opened = opened & _opened(own)
+            if before is not None:
+                opened = opened & _minimal(before, own, Y_p)
+            to_y = torch.linalg.inv_ex(state_change(self.motion, *split(x)))[0]
         q1, y1, s1 = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
         return _End(
             q1,
@@ -220,9 +225,22 @@ def _second(end: _End, s0: Tensor) -> Partials:
 
 
 def _opened(Y: Tensor) -> Tensor:
-    """Whether all eigenvalues of Y = ∂q/∂p0 / t have a positive real part, as they have at t → 0."""
+    """Whether all eigenvalues of Y = ∂q/∂p of one piece have a positive real part, as they have at t → 0."""
     finite = torch.isfinite(Y).all(-1).all(-1)
     return finite & (torch.linalg.eigvals(torch.where(finite[..., None, None], Y, 0.0)).real > 0).all(-1)
+
+
+def _minimal(before: Tensor, own: Tensor, now: Tensor) -> Tensor:
+    """Whether the action is a minimum in the position q where the piece `own` is joined to those before.
+
+    Its second derivative there is W = c own⁻¹ now before⁻¹, with `before` and `now` = ∂q/∂p0 at the ends of the piece.
+    W > 0 exactly where the symmetric beforeᵀ own⁻¹ now is. The eigenvalues of `now` would not do: gyroscopic terms turn
+    it, and two of them may change sign together.
+    """
+    W = before.mT @ torch.linalg.solve_ex(own, now)[0]
+    finite = torch.isfinite(W).all(-1).all(-1)
+    W = torch.where(finite[..., None, None], 0.5 * (W + W.mT), 0.0)
+    return finite & (torch.linalg.eigvalsh(W) > 0).all(-1)
 
 
 def _moved(P: Partials, e: Tensor) -> Partials:

@@ -6,6 +6,7 @@ its own adjoint skips the odd orders. Every stage is a contact map, so the compo
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
 
@@ -37,6 +38,7 @@ class Substeps(Protocol):
 
 Method = DiscreteLagrangian | Substeps
 MAX_ITERATIONS = 30
+ADJOINT = 2 / 3  # power of eps that a step forth and back may miss: Newton's rounding leaves 1e-15 to 1e-13
 
 
 class Composition(OneStepMethod):
@@ -49,6 +51,8 @@ class Composition(OneStepMethod):
         `Stepper` steps it, or has a `substep`, as `ContactSplitting` has. Fractions may be negative.
     throw
         Raise `StepError` at the first sample that fails, instead of reporting its status.
+    self_adjoint
+        Warn at the first step if the first method is not its own adjoint, Φ_{−h}∘Φ_h ≠ 1: the order counts on that.
 
     Raises
     ------
@@ -56,7 +60,7 @@ class Composition(OneStepMethod):
         If the fractions do not sum to 1.
     """
 
-    def __init__(self, stages: Sequence[tuple[Method, float]], *, throw: bool = False):
+    def __init__(self, stages: Sequence[tuple[Method, float]], *, throw: bool = False, self_adjoint: bool = False):
         total = sum(fraction for _, fraction in stages)
         if not abs(total - 1.0) < 1e-12:
             raise InputError(f"the fractions of a composition must sum to 1, got {total:.15g}")
@@ -65,6 +69,7 @@ class Composition(OneStepMethod):
             if not isinstance(method, Substeps):
                 single_steps[id(method)] = SingleStep(method, None, MAX_ITERATIONS, False)
         self.stages, self.throw, self._single_steps = tuple(stages), throw, single_steps
+        self._to_check = self_adjoint
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
         """One step of h > 0, scalar or (...): all stages. The status is that of the first stage that failed.
@@ -75,7 +80,11 @@ class Composition(OneStepMethod):
             If shapes or dtypes do not fit or h is not positive.
         """
         state = check_state(state)
-        out = self.substep(state, check_h(h, state.q))
+        h = check_h(h, state.q)
+        if self._to_check and not torch.compiler.is_compiling():
+            self._to_check = False
+            self._warn_unless_self_adjoint(state, h)
+        out = self.substep(state, h)
         if self.throw:
             throw_failure(out.status, out.residual)
         return out
@@ -92,6 +101,21 @@ class Composition(OneStepMethod):
             residual = torch.where(first, torch.maximum(residual, part.residual), residual)
             status = torch.where(first, part.status, status)
         return Step(state, c, status, residual, iterations)
+
+    def _warn_unless_self_adjoint(self, state: State, h: Tensor) -> None:
+        """Step forth and back by the first method; the state must come back."""
+        method = self.stages[0][0]
+        with torch.no_grad():
+            back = self._part(method, self._part(method, state, h).state, -h).state
+            off = max(
+                float(((a - b).abs() / (1 + b.abs())).nan_to_num(0.0).max()) for a, b in zip(back, state, strict=True)
+            )
+        if off > torch.finfo(state.q.dtype).eps ** ADJOINT:
+            warnings.warn(
+                f"the method under this composition is not its own adjoint: a step forth and back misses by {off:.1g}; "
+                "its order falls short, compose adjoint_pair(method, adjoint) instead",
+                stacklevel=3,
+            )
 
     def _part(self, method: Method, state: State, h: Tensor) -> Step:
         if isinstance(method, Substeps):
@@ -122,7 +146,9 @@ def suzuki(method: Method, order: int = 4, *, throw: bool = False) -> Compositio
     part = 1 / (4 - root)
     base = method if order == 4 else suzuki(method, 4)
     middle = 1 - 4 * part
-    return Composition([(base, part), (base, part), (base, middle), (base, part), (base, part)], throw=throw)
+    return Composition(
+        [(base, part), (base, part), (base, middle), (base, part), (base, part)], throw=throw, self_adjoint=True
+    )
 
 
 def kahan_li(method: Method, order: int = 6, *, throw: bool = False) -> Composition:
@@ -145,4 +171,4 @@ def _symmetric(method: Method, outer: dict[int, tuple[float, ...]], order: int, 
         raise InputError(f"{name} has order {' or '.join(map(str, outer))}, got {order}")
     half = outer[order]
     middle = 1.0 - 2.0 * sum(half)
-    return Composition([(method, w) for w in (*half, middle, *reversed(half))], throw=throw)
+    return Composition([(method, w) for w in (*half, middle, *reversed(half))], throw=throw, self_adjoint=True)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from herglotz.models.sweep import Sweep, numbers, trigonometry
+from herglotz.models.term import value_and_slope
 from herglotz.models.terms import Potential
 
 
@@ -28,7 +29,7 @@ class FieldOf:
         self.stiffness, self.tilt = potential.stiffness, potential.tilt
         self.angles, self.all_angles = potential.angles, all(potential.angles)
         network = potential.network
-        self.features = potential.features
+        self.features, self.more = potential.features, potential.more
         self.sweep = None
         if network is not None:
             self.sweep = Sweep(network, potential.angles, potential.scale, None, potential.energy)
@@ -44,6 +45,9 @@ class FieldOf:
         slope = torch.addcmul(x.s * k, x.ds, b)
         if self.features is not None:
             more, bend = self.features.value_and_slope(q)
+            V, slope = V + more, slope + bend
+        if self.more:
+            more, bend = value_and_slope(self.more, q)
             V, slope = V + more, slope + bend
         if self.sweep is None:
             return Field(V, slope)

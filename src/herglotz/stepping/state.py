@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.newton import Root
+from herglotz.mechanics.partials import check_arguments
 
 
 class Status(IntEnum):
@@ -106,6 +107,7 @@ def check_state(state: State, L_d: DiscreteLagrangian | None = None) -> State:
         If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any.
     """
     q, p, s = state
+    check_arguments(q, p, s, ("q", "p", "s"))
     if q.dtype not in (torch.float32, torch.float64):  # linear solves know no others, and 8 bits no increments
         raise InputError(f"q must be floating point of 32 or 64 bits, got {q.dtype}; convert it with .double()")
     if p.shape != q.shape or s.shape != q.shape[:-1]:

@@ -2,8 +2,10 @@
 
 from herglotz.theory.action import Action, curve_action, herglotz_action
 from herglotz.theory.boundary import Curve, boundary_value, initial_value
+from herglotz.theory.check import TheoremCheck, check
 from herglotz.theory.constrained import ConstrainedStepper
 from herglotz.theory.continuous import contact_vector_field, derivatives, evolution_vector_field, herglotz_acceleration
+from herglotz.theory.continuous_equation import ContinuousEquation, FractionalStepper, inverse_step
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
 from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
 from herglotz.theory.evolution import EvolutionStepper
@@ -75,6 +77,14 @@ from herglotz.theory.noether import (
 from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
 from herglotz.theory.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
 from herglotz.theory.splitting import ContactSplitting, linear_damping
+from herglotz.theory.tulczyjew import (
+    TulczyjewTriple,
+    left_leg,
+    left_leg_states,
+    right_leg,
+    right_leg_states,
+    tulczyjew_triple,
+)
 
 __all__ = [
     "Action",
@@ -82,8 +92,10 @@ __all__ = [
     "BodyState",
     "ConstrainedStepper",
     "ContactSplitting",
+    "ContinuousEquation",
     "Curve",
     "EvolutionStepper",
+    "FractionalStepper",
     "Function",
     "FunctionGerm",
     "GeneratingFunction",
@@ -98,9 +110,12 @@ __all__ = [
     "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
+    "TheoremCheck",
+    "TulczyjewTriple",
     "bivector",
     "boundary_value",
     "cayley",
+    "check",
     "commutation_defect",
     "contact_complement",
     "contact_curvature",
@@ -131,6 +146,7 @@ __all__ = [
     "initial_value",
     "invariance_defect",
     "inverse_cayley",
+    "inverse_step",
     "jacobi_bracket",
     "joined_action",
     "left_equations",
@@ -138,6 +154,8 @@ __all__ = [
     "left_hamilton_jacobi_residual",
     "left_hamiltonian",
     "left_hamiltonian_on_flow",
+    "left_leg",
+    "left_leg_states",
     "left_momenta",
     "left_step",
     "legendre_dual",
@@ -161,6 +179,8 @@ __all__ = [
     "right_equations",
     "right_hamiltonian",
     "right_hamiltonian_on_flow",
+    "right_leg",
+    "right_leg_states",
     "right_step",
     "section_asymmetry",
     "section_hamilton_jacobi_residual",
@@ -169,5 +189,6 @@ __all__ = [
     "sharp_bivector",
     "solve_right_position",
     "transport_section",
+    "tulczyjew_triple",
     "vee",
 ]

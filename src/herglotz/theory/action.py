@@ -9,7 +9,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics.legendre import momentum_residual
-from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.theory.left import unforced
 
 
@@ -52,7 +52,7 @@ def curve_action(
     sizes = curve_steps(q, h)
     s = [s0.expand(q.shape[:-2])]
     for k in range(q.shape[-2] - 1):
-        s.append(s[-1] + L_d(q[..., k, :], q[..., k + 1, :], s[-1], sizes[..., k]))
+        s.append(s[-1] + value(L_d, q[..., k, :], q[..., k + 1, :], s[-1], sizes[..., k]))
     return torch.stack(s, -1)
 
 

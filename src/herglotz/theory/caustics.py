@@ -1,4 +1,13 @@
-"""Caustics of a family of discrete solutions: where the positions stop depending on the parameter one to one."""
+"""Caustics of a family of discrete solutions: where the positions stop depending on the parameter one to one.
+
+A family with S^k on Q is continued by S^{k+1}(y) = ext_x [S^k(x) + L_d(x, y, S^k(x))]. With p = dS^k(x),
+
+    W_k = D11 + p ⊗ D13 + D13 ⊗ p + D33 p ⊗ p + c d²S^k,    d²S^{k+1} = D22 − Jᵀ W_k⁻¹ J,    J = D12 + p ⊗ D23.
+
+The extremum is lost where the symmetric pivot W_k is singular, whether J is regular or not. A family has passed a
+caustic inside step k where W_k has another number of negative eigenvalues than the kinetic term alone gives it. With a
+regular J, ∂q_{k+1}/∂q_k = −J⁻¹ W_k; its eigenvalues may be complex: with gyroscopic terms they decide nothing.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +16,18 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import Partials, step_derivative
+from herglotz.mechanics import Partials, momentum_jacobian, step_derivative
+from herglotz.mechanics.regularity import scaled_margin
 
 
 @dataclass(frozen=True)
 class Opening:
     """How a family of solutions with n parameters has opened after N steps."""
 
-    final: Tensor  # (...) smallest singular value of Y_N over the largest norm of any Y_k; 0 at a caustic
-    crossed: Tensor  # (...) first step k on which ∂q_{k+1}/∂q_k has a real negative eigenvalue; −1: none
-    tangent: Tensor  # (..., 2n+1, n) derivative of (q_N, p_N, s_N) by the parameters
+    final: Tensor  # (...) 0 at a caustic: smallest singular value of Y_N over the largest norm of any Y_k; where some
+    # J is singular, the smallest margin of any W_k
+    crossed: Tensor  # (...) first step k inside which the family passes a caustic; −1: none
+    slope: Tensor  # (..., n, n) ∂p_N/∂q_N, which is d²S^N
 
 
 def opening(
@@ -24,33 +35,62 @@ def opening(
     p: Tensor,  # (..., N, n) p_0 … p_{N−1}
     tangent: Tensor,  # (..., 2n+1, n) derivative of (q_0, p_0, s_0) by the parameters
 ) -> Opening:
-    """Carry the tangent vectors of a family along its solution: Y_k = ∂q_k.
+    """Carry the tangent vectors Y_k = ∂q_k of a family along its solution, and the pivots W_k.
 
     With p_0 as the parameter Y_0 = 0 and a caustic is a conjugate point; with q_0 as the parameter (p_0 = dS(q_0))
-    Y_0 = 1 and a caustic is where A + cα of the Riccati recursion is singular.
+    Y_0 = 1 and a caustic is where W_k, which is A + cα of the Riccati recursion, is singular.
     """
-    n = p.shape[-1]
-    D = step_derivative(P, p)
-    Y, current = [tangent[..., :n, :]], tangent
+    n, point = p.shape[-1], not bool((tangent[..., : p.shape[-1], :] != 0).any())
+    J, D = momentum_jacobian(P, p), step_derivative(P, p)
+    A, kinetic = _bent(P, p), _negative_kinetic(J)
+    regular = (scaled_margin(J, J, P.D11, P.D22) > 1e3 * torch.finfo(p.dtype).eps).all(-1)
+    start = tangent[..., n : 2 * n, :]
+    slope = P.D22[..., 0, :, :] if point else start  # a point source has S¹ = L_d
+    Y, current, margins = [tangent[..., :n, :]], tangent, []
+    crossed = first = torch.full_like(P.L[..., 0], -1, dtype=torch.long)
     for k in range(p.shape[-2]):
         current = D[..., k, :, :] @ current
         Y.append(current[..., :n, :])
+        if k == 0 and point:
+            continue
+        bend = P.c[..., k, None, None] * slope
+        W = A[..., k, :, :] + bend
+        margins.append(scaled_margin(W, W, A[..., k, :, :], bend).nan_to_num(0.0))
+        count = _negative(W)
+        first = count if len(margins) == 1 else first
+        passed = count != torch.where(regular, kinetic[..., k], first)  # a singular J does not tell its kinetic term
+        crossed = torch.where(passed & (crossed < 0), k, crossed)
+        slope = P.D22[..., k, :, :] - J[..., k, :, :].mT @ torch.linalg.solve_ex(W, J[..., k, :, :])[0]
     largest = torch.stack([torch.linalg.matrix_norm(y, ord="fro") for y in Y], -1).amax(-1)
-    final = _singular_values(Y[-1])[..., -1] / largest
-    crossed = torch.full_like(final, -1, dtype=torch.long)
-    first = 0 if bool((tangent[..., :n, :] != 0).any()) else 1
-    for k in reversed(range(first, p.shape[-2])):
-        ratio = torch.linalg.solve_ex(Y[k].mT, Y[k + 1].mT)[0].mT  # ∂q_{k+1}/∂q_k along the family
-        crossed = torch.where(_turns_over(ratio), k, crossed)
-    return Opening(torch.nan_to_num(final, nan=0.0), crossed, current)
+    final = torch.nan_to_num(_singular_values(Y[-1])[..., -1] / largest, nan=0.0)
+    carried = torch.linalg.solve_ex(current[..., :n, :].mT, current[..., n : 2 * n, :].mT)[0]
+    slope = torch.where(regular[..., None, None], carried, slope)
+    if margins:
+        final = torch.where(regular, final, torch.stack(margins, -1).amin(-1))
+    return Opening(final, crossed, 0.5 * (slope + slope.mT))
 
 
-def _turns_over(ratio: Tensor) -> Tensor:
-    """Whether a real eigenvalue is negative; complex pairs are no caustic."""
-    finite = torch.isfinite(ratio).all(-1).all(-1)
-    values = torch.linalg.eigvals(torch.where(finite[..., None, None], ratio, 0.0))
-    real = values.imag.abs() <= torch.finfo(ratio.dtype).eps ** 0.5 * values.abs()
-    return finite & (real & (values.real < 0)).any(-1)
+def _bent(P: Partials, p: Tensor) -> Tensor:
+    """W without c d²S: the second derivative of L_d(x, y, s + p·(x − q_k)) in x."""
+    cross = p[..., :, None] * P.D13[..., None, :]
+    return P.D11 + cross + cross.mT + P.D33[..., None, None] * p[..., :, None] * p[..., None, :]
+
+
+def _negative_kinetic(J: Tensor) -> Tensor:
+    """Number of negative eigenvalues of the kinetic term, from −J = m/h + …; 0 where J is mostly a rotation.
+
+    A strong magnetic field turns −J; its symmetric part then says nothing, and a positive kinetic term is assumed.
+    """
+    symmetric, skew = 0.5 * (J + J.mT), 0.5 * (J - J.mT)
+    turned = torch.linalg.matrix_norm(skew) > torch.linalg.matrix_norm(symmetric)
+    return torch.where(turned, 0, _negative(-symmetric))
+
+
+def _negative(W: Tensor) -> Tensor:
+    """Number of negative eigenvalues of a symmetric matrix; −1 where it is not finite, as after a caustic at a node."""
+    finite = torch.isfinite(W).all(-1).all(-1)
+    W = torch.where(finite[..., None, None], 0.5 * (W + W.mT), 0.0)
+    return torch.where(finite, (torch.linalg.eigvalsh(W) < 0).sum(-1), -1)
 
 
 def _singular_values(Y: Tensor) -> Tensor:

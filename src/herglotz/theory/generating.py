@@ -107,7 +107,8 @@ def hamilton_jacobi_residual(
 ) -> Tensor:
     """S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k), shape (...).
 
-    Zero on an open set of q_k when q_{k+1} = Φ̃^γ(q_k), and only there (erratum E7).
+    Zero on an open set of q_k when q_{k+1} = Φ̃^γ(q_k), and only there (erratum E7). Zero there does not yet make S a
+    solution: the left equation must hold, too (erratum E10); `check` measures both.
 
     Source: right discrete contact Hamilton–Jacobi equation of the paper.
     """

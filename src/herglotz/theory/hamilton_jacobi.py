@@ -12,7 +12,7 @@ from torch import Tensor
 
 from herglotz.mechanics.contact import Flow
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.jacobi import join
 
@@ -47,7 +47,7 @@ class PointSource:
 
     def __call__(self, y: Tensor) -> Tensor:
         """S¹(y), shape (...)."""
-        return self.s + self.L_d(self.q, y, self.s, torch.as_tensor(self.h, dtype=y.dtype, device=y.device))
+        return self.s + value(self.L_d, self.q, y, self.s, self.h)
 
     def germ(self, y: Tensor) -> FunctionGerm:
         """Value and derivatives."""

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from herglotz.mechanics.legendre import mixed_hessian
 from herglotz.mechanics.newton import find_root
-from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
+from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.mechanics.regularity import scaled_margin
 from herglotz.theory.left import LeftLagrangian, unforced
 
@@ -61,7 +61,7 @@ class RightHamiltonian:
     def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
         """H⁺, shape (...); once differentiable (q1 is stationary, so its own derivative does not enter)."""
         q1 = self.position(q0, p1, s0, h)
-        return right_hamiltonian_on_flow(q1, p1, self.L_d(q0, q1, s0, torch.as_tensor(h, dtype=q0.dtype)))
+        return right_hamiltonian_on_flow(q1, p1, value(self.L_d, q0, q1, s0, h))
 
     def partials(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float, order: int = 1) -> Partials:
         """H⁺ and its derivatives with respect to (q0, p1, s0): a Legendre transform in the second argument."""

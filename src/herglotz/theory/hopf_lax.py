@@ -41,6 +41,10 @@ def hopf_lax(
     Stationary in x: D1L_d + c dS^k(x) = 0. All N extremals are sought together, as one discrete curve that ends in y
     and starts with p_0 = dS(x), s_0 = S(x). By the envelope theorem dS^{k+N}(y) = p_N; d2S is the slope of the family.
 
+    M may be singular: the extremum needs the pivot W = ∂²/∂x² [S + L_d] only. For a degenerate L_d, whose step is a
+    relation and no map, this is the implicit Hamilton–Jacobi equation. A crossing of a caustic is seen where M is
+    regular, or where W changes its inertia from step to step.
+
     Parameters
     ----------
     L_d
@@ -61,7 +65,8 @@ def hopf_lax(
     Returns
     -------
     HopfLax
-        Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S) or was crossed.
+        Status SINGULAR where the second derivative in x is singular (A + cα = 0 for a quadratic S) or where a caustic
+        was passed, which the inertia of W tells (`theory.caustics`).
 
     Source: erratum E7.
     """
@@ -70,13 +75,8 @@ def hopf_lax(
     y = y.detach().expand(*torch.broadcast_shapes(y.shape[:-1], sizes.shape[:-1]), y.shape[-1])
     points = y[..., None, :].expand(*y.shape[:-1], sizes.shape[-1], y.shape[-1]) if guess is None else guess
     curve = family_value(L_d, S, y, sizes, points, beyond, throw)
-    n = y.shape[-1]
-    tangent = curve.opening.tangent
-    slope = torch.linalg.solve_ex(tangent[..., :n, :].mT, tangent[..., n : 2 * n, :].mT)[0]
-    slope = torch.where((curve.status == Status.CONVERGED)[..., None, None], slope, torch.nan)
-    return HopfLax(
-        curve.s[..., -1], curve.p[..., -1, :], 0.5 * (slope + slope.mT), curve.q[..., 0, :], curve.status, curve
-    )
+    slope = torch.where((curve.status == Status.CONVERGED)[..., None, None], curve.opening.slope, torch.nan)
+    return HopfLax(curve.s[..., -1], curve.p[..., -1, :], slope, curve.q[..., 0, :], curve.status, curve)
 
 
 @dataclass(frozen=True)

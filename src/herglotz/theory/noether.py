@@ -16,7 +16,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.partials import DiscreteLagrangian
+from herglotz.mechanics.partials import DiscreteLagrangian, value
 from herglotz.theory.continuous import Hamiltonian, ScalarField, gradient, jacobian
 from herglotz.theory.jacobi import Triple, jacobi_bracket
 
@@ -62,7 +62,8 @@ def invariance_defect(
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     e = torch.as_tensor(epsilon, dtype=q0.dtype, device=q0.device).expand(s0.shape)
     chi0, chi1 = (torch.zeros_like(s0) if shift is None else shift(e, q) for q in (q0, q1))
-    return L_d(action(e, q0), action(e, q1), s0 + chi0, h) + chi0 - chi1 - L_d(q0, q1, s0, h)
+    moved = value(L_d, action(e, q0), action(e, q1), s0 + chi0, h)
+    return moved + chi0 - chi1 - value(L_d, q0, q1, s0, h)
 
 
 def noether_defect(

@@ -60,7 +60,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     InputError
         If nothing moves.
     """
-    max_step, t, v, a, columns = _differences(data, drag)
+    max_step, t, v, a, columns = differences(data, drag)
     n = data.dof
     m = 0 if data.u is None else data.u.shape[1]
     q = data.q
@@ -106,7 +106,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     All needed: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a period),
     and least squares miss their bulk, by more than rounding, three times as far as Student's t does.
     """
-    _, t, v, a, columns = _differences(data, drag)
+    _, t, v, a, columns = differences(data, drag)
     size = float(a.square().mean().sqrt())
     jumps = float((a * (t.h0 + t.h1)[:, None] / 2).square().mean().sqrt()) > float(v.square().mean().sqrt())
     if not jumps:
@@ -117,7 +117,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     return plain > max(PULLED * robust, NEGLIGIBLE * size)
 
 
-def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:
+def differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:
     """Return longest step, triples (T), velocities (T, n), accelerations (T, n), and their columns (T, n, k)."""
     max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
     t = data.triples(max_step)
@@ -126,15 +126,15 @@ def _differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor
     h0, h1 = t.h0[:, None], t.h1[:, None]
     v = (t.q2 - t.q0) / (h0 + h1)
     a = 2 * ((t.q2 - t.q1) / h1 - (t.q1 - t.q0) / h0) / (h0 + h1)
-    n = data.dof
-    m = 0 if data.u is None else data.u.shape[1]
+    n, u = data.dof, data.inputs_of_steps()
+    m = 0 if u is None else u.shape[1]
     columns = a.new_zeros(len(t), n, 2 * n + 1 + n * m)
     for i, angle in enumerate(data.angles):
         columns[:, i, 2 * i] = -(t.q1[:, i].sin() if angle else t.q1[:, i])
         columns[:, i, 2 * i + 1] = -(t.q1[:, i].cos() if angle else torch.ones_like(t.q1[:, i]))
         columns[:, i, 2 * n] = -v[:, i]
-        if data.u is not None:
-            columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (data.u[t.index] + data.u[t.index + 1]) / 2
+        if u is not None:
+            columns[:, i, 2 * n + 1 + i * m : 2 * n + 1 + (i + 1) * m] = (u[t.index] + u[t.index + 1]) / 2
     if drag:
         half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
         columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)

@@ -33,7 +33,7 @@ def _named(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 
 
 def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
-    return "a joint that stands still says nothing about its forces in one step" if config.sticking else None
+    return "a joint that stands still says nothing about its forces in one step" if seen.settings.sticking else None
 
 
 def _terms(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
@@ -97,9 +97,9 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     sigma = seen.found.sigma if named and seen.found is not None else sigma
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
-        level=c.level, objective=objective, network=network, order=c.order, features=c.features,
+        level=c.level, objective=objective, network=network, order=c.order, features=c.features, hold=seen.data.hold,
         drag=c.drag, substeps=c.substeps,
-        forces={"coulomb": c.coulomb, "sticking": c.sticking, "coupled": c.coupled, "diagonal": c.diagonal,
+        forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, restarts=restarts, departures=c.departures,
@@ -109,9 +109,10 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "network": why_network,
             "order": _structure_reason(seen, c.order == user_settings.order),
             "features": _structure_reason(seen, c.features == user_settings.features),
+            "hold": seen.hold,
             "drag": _structure_reason(seen, c.drag == user_settings.drag),
             "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
-            "forces": _structure_reason(seen, seen.structure is None),
+            "forces": seen.friction if seen.structure is None else seen.structure,
             "start": "least squares on finite differences" if not base.start else "one linear problem",
             "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",

@@ -12,6 +12,7 @@ from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
+from herglotz.models.term import TERMS
 from herglotz.settings import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
@@ -73,8 +74,9 @@ class FitConfig:
     coulomb
         Dry friction beside the viscous one at the forced level.
     sticking
-        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`): for axes without a
-        spring. Whole trajectories are fitted, from a start with smooth friction; PyTorch alone steps the model.
+        Dry friction is set-valued, so that a joint can stand still (`herglotz.stepping.stick_slip`). Whole trajectories
+        are fitted, from a start with smooth friction. None: where nothing is said of level, objective and friction, and
+        driven data show dry friction (`herglotz.training.dry_friction`).
     robust
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
@@ -103,6 +105,8 @@ class FitConfig:
     drag
         Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
         (forced level). See `herglotz.models.drag`.
+    terms
+        Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
@@ -129,7 +133,7 @@ class FitConfig:
     mass_width: int = 0
     action_width: int = 4
     coulomb: bool = False
-    sticking: bool = False
+    sticking: bool | None = None
     robust: str = "auto"
     supervision: str = "q"
     restarts: int | None = None
@@ -141,6 +145,7 @@ class FitConfig:
     diagonal: bool = False
     coupled: bool = False
     drag: tuple[str, ...] = ()
+    terms: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
 
@@ -216,8 +221,7 @@ class FitConfig:
         where, driven = data.source or "data", self.use_inputs and data.u is not None
         config = self
         if self.level == "auto":
-            forced = driven or self.coulomb or self.coupled or self.sticking or self.drag
-            level = "forced" if forced else "linear"
+            level = "forced" if driven or self.has_forces() or self.drag else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if self.sticking:
             config = replace(config, coulomb=True)
@@ -232,6 +236,11 @@ class FitConfig:
                 f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {len(self.input_map)}"
             )
         return config
+
+    def has_forces(self) -> bool:
+        """Whether the user asked for forces, which the forced level alone has."""
+        named = any(TERMS[name].has_force() for name in self.terms if name in TERMS)
+        return self.coulomb or self.coupled or self.sticking or named
 
     def changed(self, settings: dict[str, Any]) -> FitConfig:
         """These settings with some of them replaced; a single text or number counts as a list of one where one is due.

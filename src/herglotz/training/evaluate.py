@@ -76,7 +76,7 @@ def _states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
     """Return states at every sample: fitted ones on the training part, then a free run from the last of them."""
-    known, n, u = fitted.states, data.dof, step_inputs(fitted.model, data)
+    known, n, driven = fitted.states, data.dof, step_inputs(fitted.model, data) is not None
     out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
     stepper, status, done = Stepper(fitted.model), "ok", 0
     for first, length, trained in zip(data.offsets, data.lengths, train_lengths, strict=True):
@@ -84,9 +84,9 @@ def _states_everywhere(
         done += trained
         if trained == length:
             continue
-        h, stops, row = _fine_steps(data.t[first + trained - 1 : first + length], max_step)
+        h, stops, row, part = _fine_steps(data.t[first + trained - 1 : first + length], max_step)
         start = out[first + trained - 1]
-        inputs = None if u is None else u[first + trained - 1 + row]
+        inputs = data.inputs_of_steps(first + trained - 1 + row, part) if driven else None
         with torch.no_grad():
             run = stepper.rollout(start[:n], start[n : 2 * n], start[2 * n], h=h, inputs=inputs)
         after = torch.cat([run.q, run.p, run.s[:, None]], -1)[stops]
@@ -96,11 +96,16 @@ def _states_everywhere(
     return State(out[:, :n], out[:, n : 2 * n], out[:, 2 * n]), status
 
 
-def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor]:
-    """Model steps that cover the recorded times, the node that reaches each of them, the row each step starts in."""
+def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Model steps that cover the recorded times; the node that reaches each of them; each step's row, and its middle.
+
+    The middle is a number from 0 to 1, of the recorded step that starts at the row.
+    """
     counts = torch.tensor([substeps(h, max_step) for h in t.diff().tolist()], device=t.device)
     row = torch.arange(len(counts), device=t.device).repeat_interleave(counts)
-    return (t.diff() / counts).repeat_interleave(counts), counts.cumsum(0), row
+    ends = counts.cumsum(0)
+    part = (torch.arange(len(row), device=t.device) - (ends - counts)[row] + 0.5) / counts[row]
+    return (t.diff() / counts).repeat_interleave(counts), ends, row, part.to(t.dtype)
 
 
 def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State) -> dict[str, Any]:

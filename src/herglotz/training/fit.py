@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
@@ -37,7 +37,7 @@ def fit(
     *,
     plan: Plan | None = None,
     out: str | Path | None = None,
-    progress: bool | None = None,
+    progress: bool | Literal["lines"] | None = None,
     resume: bool = False,
     **settings: Any,
 ) -> Run:
@@ -58,7 +58,7 @@ def fit(
     out
         Folder for the checkpoint (`checkpoint.pt`); nothing is written without it. Use `save_run` for the result.
     progress
-        Show progress bars; None: on a terminal only.
+        Show progress bars; None: on a terminal only; "lines": one line on stderr after every stage.
     resume
         Go on from the checkpoint in `out`, if there is one.
     **settings

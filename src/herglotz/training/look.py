@@ -15,6 +15,8 @@ from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
+from herglotz.training.dry_friction import friction_holds
+from herglotz.training.hold import with_hold
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.smoothing_fit import SMOOTHED
@@ -61,6 +63,8 @@ class Look:
     kept: Trajectories  # of the first part all but single spikes
     spikes: Tensor  # (N_train,) bool
     outliers: bool  # more than single spikes are suspected
+    hold: str  # why the inputs do between samples what they do
+    friction: str  # why friction is set-valued or not
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
@@ -84,6 +88,8 @@ def look(
     if not settings.use_inputs:
         data = replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
+    seen = data if settings.train_fraction == 1 else data.split_time(settings.train_fraction)[0]
+    data, why_hold = with_hold(data, "" if plan is None else plan.hold, seen)
     train, unseen = (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -91,6 +97,7 @@ def look(
     outliers = settings.robust == "on" or bool(dropped.any())
     outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
     settings = settings if plan is None else plan.applied(settings)
+    settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
     structure, found = None, None
     if plan is not None:
@@ -117,9 +124,24 @@ def look(
     wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
-        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, noise=roughness(kept),
-        settings=settings, base=base, structure=structure, found=found, baseline_motion=motion, probe=probe,
+        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
+        friction=why_friction, noise=roughness(kept), settings=settings, base=base, structure=structure,
+        found=found, baseline_motion=motion, probe=probe,
     )  # fmt: skip
+
+
+def _with_friction(
+    kept: Trajectories, settings: FitConfig, user_settings: FitConfig, plan: Plan | None
+) -> tuple[FitConfig, str]:
+    """The settings with friction that is set-valued or not, and why; driven data are asked where nothing is said."""
+    c = user_settings
+    plain = (c.level, c.objective, c.supervision, c.optimiser) == ("auto", "auto", "q", "lm") and not c.coulomb
+    if plan is not None or settings.sticking is not None:
+        return settings, "as set"
+    if kept.u is None or not plain:
+        return replace(settings, sticking=False), "asked of driven data with nothing said of level, friction, objective"
+    sticking, why = friction_holds(kept)
+    return replace(settings, sticking=sticking), why
 
 
 def _fine(base: Baseline) -> bool:
@@ -130,8 +152,8 @@ def _fine(base: Baseline) -> bool:
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
     """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
     c = task.config
-    other = c.features or c.known or c.alike or c.mass_width or c.supervision != "q" or task.data.u is not None
-    if c.objective not in ("auto", "residual") or other:
+    more = c.features or c.known or c.terms or c.alike or c.mass_width
+    if c.objective not in ("auto", "residual") or more or c.supervision != "q" or task.data.u is not None:
         return None
     model = task.build("correction")
     if model.correction is None or model.s_enters_motion:

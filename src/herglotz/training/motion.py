@@ -99,7 +99,7 @@ def _inputs(
     """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
     (time, steps, h), (trajectory, from_first) = span, recording
     if isinstance(inputs, (str, Path, Trajectories)):
-        found = recorded(inputs, trajectory, run.data.time_unit)
+        found = recorded(inputs, trajectory, run.data.time_unit, run.data.hold)
         return driven(found, float(found.t[0]) if from_first else time, steps, h)
     times = even_times(time, h or run.h, steps)
     if inputs is None:

@@ -28,6 +28,7 @@ class Plan:
     features: tuple[str, ...]  # what L may hold beside its terms
     drag: tuple[str, ...]  # friction forces beside the viscous one
     substeps: int  # model steps in a recorded one
+    hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
     forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
     start: dict[str, tuple[float, ...]]  # starting values of parameters by name
     outliers: bool  # the first one-step fit takes Student's t
@@ -86,4 +87,4 @@ def show(value: Any) -> str:
         return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
     if value is None:
         return "to be measured"
-    return f"{value:.3g}" if isinstance(value, float) else str(value)
+    return f"{value:.3g}" if isinstance(value, float) else str(value) or "none"

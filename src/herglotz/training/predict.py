@@ -13,7 +13,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
-from herglotz.training.inputs import step_inputs
+from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
@@ -202,6 +202,7 @@ def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     p = None if data.p is None else data.p[:, at]
     return replace(
         data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+        hold=wanted.hold if u is not None and not data.hold else data.hold,
     )  # fmt: skip
 
 
@@ -252,11 +253,11 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     known = torch.isfinite(start).all(-1).nonzero()[:, 0]
     if not len(known):
         return grid
-    u = step_inputs(stepper.L_d, rest)  # type: ignore[arg-type]
+    u = grid_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
     with torch.no_grad():
         out = stepper.rollout(
             start[known, :n], start[known, n : 2 * n], start[known, 2 * n], h=grid.h[known],
-            inputs=None if u is None else u[grid.row[known]],
+            inputs=None if u is None else u[known],
         )  # fmt: skip
     nodes = states.new_full((len(spans), grid.longest + 1, 2 * n + 1), torch.nan)
     nodes[known] = torch.cat([out.q, out.p, out.s[..., None]], -1)

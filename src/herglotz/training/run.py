@@ -17,8 +17,11 @@ from herglotz.data.anything import split_options
 from herglotz.data.files import write_atomically
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
+from herglotz.mechanics import Driven
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
+from herglotz.stepping.method import OneStepMethod
+from herglotz.theory import ContinuousEquation, FractionalStepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
@@ -85,6 +88,48 @@ class Run:
         """The learned equation of motion; with standard deviations where the model is made of named terms alone."""
         stored = self.metrics.get("equation")
         return Equation.from_dict(stored) if stored else equation_of(self)
+
+    @property
+    def continuous(self) -> ContinuousEquation:
+        """The continuous equation of the model at its typical step: field, energy H̃, modified Lagrangian L̃."""
+        if isinstance(self.model, Driven) and self.data.u is not None:
+            raise InputError("the model takes inputs: give them, ContinuousEquation(run.model.at(u), run.h)")
+        return ContinuousEquation(self.model, self.h)
+
+    def at_step(self, h: float) -> OneStepMethod:
+        """The model's motion at any step h > 0: a stepper, exact for the motion that the model has at its own step.
+
+        Inside `h_range` it is `stepper`. Elsewhere a step is whole steps of the typical step and a part of one
+        (`theory.FractionalStepper`), with status UNRESOLVED where the recorded step is too long for the motion.
+
+        Raises
+        ------
+        InputError
+            If h is not positive, or the model takes inputs.
+        """
+        if not h > 0:
+            raise InputError(f"h must be > 0, got {h:g}")
+        low, high = self.h_range
+        if low <= h <= high:
+            return self.stepper
+        single = self.states.q.dtype == torch.float32
+        return FractionalStepper(self.continuous, tolerance=1e-3 if single else 1e-6)
+
+    def energy(self, state: State) -> Tensor:
+        """The energy H̃(q, p, s) of the model at states, (...), in units of p q̇ ("mass 1"); dH̃/dt = −(∂H̃/∂s) H̃.
+
+        With friction or other forces H̃ changes by their power, too.
+
+        Raises
+        ------
+        InputError
+            If the neighbours of a state cannot be stepped to.
+        """
+        H = self.continuous.hamiltonian(*state)
+        lost = (~torch.isfinite(H)).nonzero()
+        if len(lost):
+            raise InputError(f"no energy at sample {tuple(lost[0].tolist())}: a step beside it fails; leave it out")
+        return H
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
         """State, with shapes (n,), (n,), (), and time at the last training sample of a trajectory.

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
+import time
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -29,7 +31,7 @@ class Stages:
     Parameters
     ----------
     progress
-        Show progress bars; None shows them on a terminal only.
+        Show progress bars; None shows them on a terminal only; "lines" prints one line on stderr after every stage.
     checkpoint
         File to write, or None.
     key
@@ -38,8 +40,9 @@ class Stages:
         Read the checkpoint if there is one.
     """
 
-    def __init__(self, progress: bool | None, checkpoint: Path | None, key: str, resume: bool):
-        self.disable = (None if progress is None else not progress) if is_first() else True
+    def __init__(self, progress: bool | Literal["lines"] | None, checkpoint: Path | None, key: str, resume: bool):
+        self.lines = progress == "lines" and is_first()
+        self.disable = (None if progress is None else self.lines or not progress) if is_first() else True
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
@@ -70,14 +73,21 @@ class Stages:
             result = OptimiserResult(x, stored["cost"], stored["reason"], stored["iterations"], stored["history"])
         else:
             with tqdm(total=total, desc=name, disable=self.disable, leave=False) as bar:
+                start: float | None = None
 
                 def callback(iteration: int, cost: float, best: Tensor) -> None:
+                    nonlocal start
                     bar.update(1)
-                    bar.set_postfix_str(f"cost {cost:.4g}", refresh=False)
+                    start = cost if start is None else start
+                    bar.set_postfix_str(f"cost {cost / start:.3g} of its start" if start else "", refresh=False)
                     if iteration % EVERY == 0:
                         self._store(name, OptimiserResult(best, cost, "interrupted", iteration), done=False)
 
+                began = time.monotonic()
                 result = optimise(x, callback)
+            if self.lines:
+                took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
+                print(f"{name}: {took}", file=sys.stderr, flush=True)
             self._store(name, result, done=True)
         start = len(self.history)
         self.history += [{"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)]

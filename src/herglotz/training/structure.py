@@ -76,7 +76,9 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def _nothing_named(c: FitConfig) -> bool:
-    named = c.features or c.known or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking or c.drag
+    named = (
+        c.features or c.known or c.terms or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking or c.drag
+    )
     plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm" and not c.coupled
     return c.level == "auto" and not named and plain
 
@@ -172,7 +174,7 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     model's: shared or known coefficients, a mass network, inputs, s in L, features that the baseline has too.
     """
     names = tuple(expand(config.features, data.angles))
-    other = config.known or config.alike or config.mass_width or config.coulomb or data.u is not None
+    other = config.known or config.terms or config.alike or config.mass_width or config.coulomb or data.u is not None
     other = other or config.objective == "raw"  # a network alone
     own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):

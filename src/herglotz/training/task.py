@@ -44,7 +44,8 @@ class Task:
 
 def drag_starts_the_fit(config: FitConfig) -> bool:
     """Whether drag and a constant potential start the fit: where s d·q̇ is in L and the user does not say what else."""
-    settings = config.features or config.known or config.alike or config.objective == "raw" or config.supervision != "q"
+    other = config.known or config.terms or config.alike or config.objective == "raw" or config.supervision != "q"
+    settings = config.features or other
     return config.level == "affine" and not settings
 
 
@@ -86,6 +87,7 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
             coupled=config.coupled,
             drag=config.drag,
             order=config.order,
+            terms=() if alone else config.terms,
         )
     )
     if model.inputs and not config.input_map:

@@ -22,7 +22,7 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
 from herglotz.data.spikes import without
 from herglotz.stepping import Stepper
-from herglotz.training.inputs import step_inputs
+from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import segment_grid
@@ -42,11 +42,10 @@ STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a w
 def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories) -> Tensor:
     """Errors of free runs over windows of 20 recorded steps from states (N, 2n+1) at the samples, (N', n)."""
     grid, n = segment_grid(data, FIRST_SEGMENT, task.base.model_step), data.dof
-    u = step_inputs(fitted.model, data)
     x = states[grid.start_sample]
     with torch.no_grad():
         out = Stepper(fitted.model).rollout(
-            x[:, :n], x[:, n : 2 * n], x[:, 2 * n], h=grid.h, inputs=None if u is None else u[grid.row]
+            x[:, :n], x[:, n : 2 * n], x[:, 2 * n], h=grid.h, inputs=grid_inputs(fitted.model, data, grid)
         )
     return out.q.flatten(0, 1)[grid.node] - data.q[grid.sample]
 

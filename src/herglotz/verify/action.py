@@ -76,7 +76,7 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
     return Fan(start, S, sigma, keep, failed)
 
 
-def derivatives(f: Fan, bound: float) -> list[Check]:
+def derivatives(f: Fan, bound: float, bound_of_c: float) -> list[Check]:
     """Check D2S^k = p_k, D1S^k = −σ_k p̂0 and 1 + D3S^k = σ_k, relative to the largest momentum and to σ_k."""
     size = max([worst(f.start.p.abs())] + [worst(g.p[f.keep[k]].abs()) for k, g in f.S.items() if f.keep[k].any()])
 
@@ -90,7 +90,7 @@ def derivatives(f: Fan, bound: float) -> list[Check]:
     return [
         Check.at_most("D2S", "generating function: D2 S^k = p_k", D2, bound, note),
         Check.at_most("D1S", "generating function: D1 S^k = −σ_k p0", D1, bound, note),
-        Check.at_most("D3S", "conformal product: 1 + D3 S^k = σ_k", D3, bound, note),
+        Check.at_most("D3S", "conformal product: 1 + D3 S^k = σ_k", D3, bound_of_c, note),
     ]
 
 

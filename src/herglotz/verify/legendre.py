@@ -18,6 +18,33 @@ from herglotz.verify.subject import Subject
 MARGIN = 1e-3
 
 
+RIGHT, LEFT = "discrete Hamilton–Jacobi equation on a fan", "left discrete Hamilton–Jacobi equation"
+NO_H_PLUS = Check.without_object("hamilton_jacobi", RIGHT, "H⁺ does not exist: det D2D2 L_d = 0 at every step (E4)")
+NO_H_MINUS = [
+    Check.without_object(name, claim, "H⁻ does not exist: det D1D1 L⁻ = 0 at every step (E4)")
+    for name, claim in (
+        ("left_equations", "left Hamilton equations give back q0, p1, s0"),
+        ("left_hamilton_jacobi", LEFT),
+    )
+]
+
+
+def hamiltonians_exist(subject: Subject, w: SampledRollout) -> tuple[bool, bool]:
+    """Return whether H⁺, and whether H⁻, exists at any step; True where there is no L_d or no step to tell.
+
+    Stepping needs neither (erratum E4): L_d = −q0·q1/h has D11 = D22 = 0 and is regular.
+    """
+    if subject.L_d is None or not bool(w.ok.any()):
+        return True, True
+    q0, q1, s0 = w.q[:, :-1][w.ok], w.q[:, 1:][w.ok], w.s[:, :-1][w.ok]
+    with torch.no_grad():
+        P = partials(subject.L_d, q0, q1, s0, subject.h, 2)
+        M = mixed_hessian(P)
+        margins = (scaled_margin(X, M, P.D11, P.D22) for X in (P.D22, left_hessian(P)))
+    right, left = (bool((margin > MARGIN).any()) for margin in margins)
+    return right, left
+
+
 def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Check:
     """Check that FL⁺ of one step is FL⁻ of the next: the residual J⁻¹R, relative to the size of positions.
 

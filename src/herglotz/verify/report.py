@@ -19,6 +19,7 @@ class Check:
     passed: bool
     note: str = ""
     relation: str = "<="  # that value and bound must satisfy
+    applies: bool = True  # False: the claim is about an object that this target does not have; the note says which
 
     @classmethod
     def at_most(cls, name: str, statement: str, value: float, bound: float, note: str = "") -> Check:
@@ -32,16 +33,22 @@ class Check:
         """Return a check that passes when value > bound and `also` holds."""
         return cls(name, statement, value, bound, also and value > bound, note, ">")
 
+    @classmethod
+    def without_object(cls, name: str, statement: str, note: str) -> Check:
+        """Return a check of an object that does not exist for this target: it neither passes nor fails."""
+        return cls(name, statement, math.nan, math.nan, True, note, applies=False)
+
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON; a value that is not finite becomes None."""
-        value = self.value if math.isfinite(self.value) else None
+        value, bound = (x if math.isfinite(x) else None for x in (self.value, self.bound))
         return {
             "name": self.name,
             "statement": self.statement,
             "value": value,
             "relation": self.relation,
-            "bound": self.bound,
+            "bound": bound,
             "passed": self.passed,
+            "applies": self.applies,
             "note": self.note,
         }
 
@@ -74,7 +81,8 @@ class Report:
             mark = f" [{notes.index(check.note) + 1}]" if check.note else ""
             sign = "≤" if check.relation == "<=" else check.relation
             verdict = "ok" if check.passed else "FAIL"
-            rows.append((check.statement + mark, f"{check.value:.3g}", f"{sign} {check.bound:.3g}", verdict))
+            row = (check.statement + mark, f"{check.value:.3g}", f"{sign} {check.bound:.3g}", verdict)
+            rows.append(row if check.applies else (check.statement + mark, "–", "", "n/a"))
         widths = [max(_width(row[i]) for row in rows) for i in range(3)]
         lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
         lines += [
@@ -82,6 +90,7 @@ class Report:
             for claim, value, bound, verdict in rows
         ]
         lines += [f"  [{i}] {note}" for i, note in enumerate(notes, 1)]
+        lines += [f"  Not judged: {self.details['not_judged']}"] if "not_judged" in self.details else []
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:

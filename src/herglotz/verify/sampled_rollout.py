@@ -62,6 +62,25 @@ def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     return SampledRollout(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
 
 
+ROUNDINGS = 8.0  # of q in one step; the oscillator moved to q = 1e5 leaves a third of one, D2S^k half of one
+BLIND = 1e-4  # no bound is raised beyond this: null models exceed 1e-3
+
+
+def rounded(bound: float, w: SampledRollout) -> float:
+    """Return the bound, or what the rounding of q alone leaves in p where that is more.
+
+    q is known to eps |q| and p follows with the slope |c (∂q1/∂p0)⁻¹|: far from the origin of q, with p of
+    size 1, no stepper keeps an identity of p to 1e-11.
+    """
+    if not bool(w.ok.any()):
+        return bound
+    n, D = w.q.shape[-1], w.derivative[w.ok]
+    slope = torch.linalg.inv_ex(D[:, :n, n : 2 * n])[0] * w.c[w.ok][:, None, None]
+    p = w.p[:, :-1][w.ok].abs().max()
+    size = torch.finfo(w.q.dtype).eps * w.q.abs().max() * slope.abs().max() / torch.where(p > 0, p, 1.0)
+    return max(bound, min(ROUNDINGS * float(size), BLIND)) if bool(torch.isfinite(size)) else bound
+
+
 def worst(values: Tensor) -> float:
     """Return the largest entry; NaN, which fails every bound, where `values` is empty or has a NaN."""
     return float(values.max()) if values.numel() else float("nan")

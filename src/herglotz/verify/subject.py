@@ -19,6 +19,7 @@ from herglotz.mechanics.contact import Flow
 from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import State, Step, Stepper
 from herglotz.training import Run, load_run
+from herglotz.verify.draw import drawn_states
 
 # Bounds on identities whose derivatives are central differences of order 8 (`DifferencedStepper`). A step has a
 # rounding error of 10–100 eps and an offset is 0.01 (float32: 0.1) of 1 + |x|, so a derivative has a rounding error of
@@ -64,7 +65,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     """Turn anything that `verify` takes into a `Subject`.
 
     States are drawn from the `q_range` and `v_range` of a scene with s in [−1, 1], from the fitted states of a run, or
-    from the box of a file. A pair (L_d or stepper, states) brings its own states.
+    from the box of a file; for an L_d alone by `drawn_states`. A pair (L_d or stepper, states) brings its own states.
 
     Raises
     ------
@@ -74,8 +75,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     if samples < 1:
         raise InputError(f"samples must be >= 1, got {samples}")
     make = torch.Generator().manual_seed(seed)
-    if isinstance(target, str | os.PathLike):
-        target = _open(target)
+    target = named(target)
     if isinstance(target, Scene):
         L_d = target.L_d
         states = _scene_states(target, samples, make)
@@ -101,10 +101,22 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
         return Subject(target.path, kind, smooth.step, states, size, forced=forced, differenced=closed)
     if isinstance(target, tuple) and len(target) == 2:
         return _pair(*target, h)
+    if hasattr(target, "step"):
+        raise InputError("a stepper alone has no states; give a pair (stepper, (q, p, s)) and h")
+    if callable(target):
+        if h is None:
+            raise InputError("h must be given with an L_d, e.g. h=0.1")
+        L_d: Any = target
+        return _pair(L_d, drawn_states(L_d, _step_size(h, h), samples, make), h)
     raise InputError(
         f"cannot verify a {type(target).__name__}; "
-        "give a scene, a run, an exported file or a pair (L_d or stepper, states)"
+        "give a scene, a run, an exported file, an L_d or a pair (L_d or stepper, states)"
     )
+
+
+def named(target: Any) -> Any:
+    """Return what a name or a path stands for, a scene, a run or a file; anything else comes back."""
+    return _open(target) if isinstance(target, str | os.PathLike) else target
 
 
 def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper | CompiledStepper:

@@ -1,6 +1,8 @@
 """Each subcommand end to end on tiny data."""
 
 import json
+import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -12,12 +14,16 @@ import herglotz
 import herglotz.cli
 import herglotz.cli.fit
 import herglotz.cli.flags
+import herglotz.cli.plot
 import herglotz.cli.simulate
 from herglotz.cli import main
+from herglotz.cli.parser import build_parser
 from herglotz.data import load
+from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
+from herglotz.plots.style import FORMATS
 from herglotz.scenes import scene_names
-from herglotz.training import load_run
+from herglotz.training import FitConfig, load_run
 from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 
 
@@ -62,7 +68,10 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
     fit, flags = herglotz.cli.fit, herglotz.cli.flags
     assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION) == (fit.ROBUST, fit.SUPERVISION)
+    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
+    assert FitConfig().departures == fit.DEPARTURES
+    assert build_parser().parse_args(["fit", "a", "--out", "b"]).iterations == FitConfig().iterations
+    assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
 
@@ -88,7 +97,8 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "extrapolation RMS" in out
     assert f"Next: herglotz verify {folder}" in out
     assert err.startswith("tiny.csv:\n  column")
-    assert "\r" not in err  # no bar where there is no terminal
+    assert "\r" not in err  # no bar where there is no terminal, but a line a stage
+    assert re.search(r"^segments of 20: \d+ iterations, [\d.]+ s$", err, re.M)
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
     assert len(list(folder.glob("*.png"))) == 4
     run = load_run(folder)
@@ -110,9 +120,9 @@ def test_fit_says_what_it_found(tmp_path, capsys):
 def test_fit_json_options_and_resume(tiny_csv, tmp_path, capsys):  # fails if an option is dropped, or resume fits again
     folder = tmp_path / "run"
     arguments = ["fit", tiny_csv, "--out", folder, "--no-plots", "--dtype", "float32", "--angles", "none"]
-    arguments += ["--objective", "trajectory", "--level", "affine"]
+    arguments += ["--objective", "trajectory", "--level", "conservative"]  # the cheapest that is no default
     code, found = run_json(capsys, *arguments)
-    assert (found["level"], found["objective"]) == ("affine", "trajectory")
+    assert (found["level"], found["objective"]) == ("conservative", "trajectory")
     assert code == (3 if found["verdict"].startswith("does not fit") else 0)  # rounding decides, in float32
     run = load_run(folder)
     assert next(run.model.parameters()).dtype == torch.float32
@@ -254,5 +264,17 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
     assert found["traded"] == []
     assert 1 < found["effective_parameters"] < found["all_parameters"]
     assert main(["trust", str(tiny_run), "--out", str(tmp_path)]) == 0
-    assert "each parameter above is determined on its own" in capsys.readouterr().out.lower()
+    out, err = capsys.readouterr()
+    assert "each parameter above is determined on its own" in out.lower()
+    assert re.search(r"^  the damping rate γ: [\d.e-]+ ± [\d.e-]+ 1/s$", out, re.M)  # fails if names are the program's
+    assert max(len(line) for line in out.splitlines() if not line.startswith("Figure")) <= 80
+    assert "warning" not in err
     assert (tmp_path / "bands.png").stat().st_size > 10_000
+
+
+def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # fails if such numbers pass for results
+    shutil.copytree(tiny_run, tmp_path / "run")
+    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
+    (tmp_path / "run" / "metrics.json").write_text(json.dumps({**metrics, "verdict": "does not fit: it misses 1"}))
+    assert main(["trust", str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
+    assert "warning: the run does not fit its data" in capsys.readouterr().err

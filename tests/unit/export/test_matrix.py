@@ -1,5 +1,6 @@
 """Every format beside the eager stepper on every kind of model: steps, rollouts, starts, inputs and derivatives."""
 
+import functools
 from typing import Any
 
 import pytest
@@ -16,8 +17,8 @@ from herglotz.stepping import State
 WRITE = {"pt2": export_pt2, "onnx": export_onnx, "aoti": export_aoti}
 SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
 EVERY = [*LEVELS, *TERMS]
-# Always tested; the others are slow tests.
-ALWAYS = {"pt2": ("affine",), "onnx": (*LEVELS, "order 4", "sticking"), "aoti": ()}
+# Always tested; the others are slow tests. test_pt2.py has Newton's iteration in a .pt2 file, at the affine level.
+ALWAYS = {"pt2": ("forced",), "onnx": (*LEVELS, "order 4", "sticking"), "aoti": ()}
 MATRIX = [
     pytest.param(form, name, marks=[] if name in ALWAYS[form] else pytest.mark.slow)
     for form in WRITE
@@ -32,7 +33,13 @@ def model_named(name, dtype=torch.float64) -> Any:
     return model.to(dtype)
 
 
-def written(form, name, folder, dtype=torch.float64) -> tuple[Any, Any]:
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A function of (form, name, dtype) that exports a model, once for all tests."""
+    return functools.cache(lambda *case: exported_to(tmp_path_factory.mktemp("matrix"), *case))
+
+
+def exported_to(folder, form, name, dtype=torch.float64) -> tuple[Any, Any]:
     if form == "onnx":
         pytest.importorskip("onnx")
         pytest.importorskip("onnxruntime")
@@ -57,12 +64,12 @@ def close(a, b, tol=1e-12):
 
 
 @pytest.mark.parametrize(("form", "name"), MATRIX)
-def test_a_file_does_what_the_eager_stepper_does(form, name, tmp_path):
+def test_a_file_does_what_the_eager_stepper_does(form, name, written):
     # fails if an operation or a term is lowered wrongly (onnxruntime makes a factor of float64 one of 32 bits: 5e-12),
     # the guess assumes equal steps, the loop reads another row of h or u than its own, leading dimensions are lost, a
     # single step differs from the loop, init gives the momentum of FL⁻ or s0 for s1, or a column of the Jacobian is
     # another's
-    model, exported = written(form, name, tmp_path)
+    model, exported = written(form, name)
     assert exported.kind == form
     eager = beside(model)
     q, p, s = (x.reshape(2, 3, *x.shape[1:]) for x in starts(model, 6))
@@ -92,10 +99,10 @@ def test_a_file_does_what_the_eager_stepper_does(form, name, tmp_path):
 
 
 @pytest.mark.parametrize("form", ["pt2", "onnx", pytest.param("aoti", marks=pytest.mark.slow)])
-def test_inputs_reach_their_own_step(form, tmp_path):
+def test_inputs_reach_their_own_step(form, written):
     # fails if u is lost in the file, or reaches another sample or step than its own, or 0 stands for no input: the zero
     # of a sensor is another number
-    model, exported = written(form, "forced", tmp_path)
+    model, exported = written(form, "forced")
     q, p, s = states_of(1, 3)
     u = inputs_of(model, 3, 4)
     assert u is not None
@@ -113,10 +120,10 @@ def test_inputs_reach_their_own_step(form, tmp_path):
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 @pytest.mark.parametrize("name", [*LEVELS, "order 4", "sticking"])
 @pytest.mark.parametrize("form", ["pt2", "onnx"])
-def test_a_thousand_steps_at_every_batch_size(form, name, dtype, tmp_path):
+def test_a_thousand_steps_at_every_batch_size(form, name, dtype, written):
     # fails if a graph is specialised to a batch or mixes samples, a float64 constant turns a float32 graph into a mixed
     # one, or a rounding adds up
-    model, exported = written(form, name, tmp_path, dtype)
+    model, exported = written(form, name, dtype)
     batches = (1, 7) if name in ("full", "order 4") else (1, 1009, 4096)
     found = compare(exported, beside(model), batches=batches, steps=1000)
     assert max(found[key] for key in "qpsc") <= (1e-12 if dtype == torch.float64 else 1e-5), found
@@ -126,9 +133,9 @@ def test_a_thousand_steps_at_every_batch_size(form, name, dtype, tmp_path):
 @pytest.mark.slow  # a compiler run of 20–60 s for each
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
 @pytest.mark.parametrize("name", ["affine", "forced"])
-def test_compiled_code_over_a_thousand_steps(name, dtype, tmp_path):
+def test_compiled_code_over_a_thousand_steps(name, dtype, written):
     # fails if the code is specialised to a batch, loses an input u, or a loop inside it is miscompiled
-    model, exported = written("aoti", name, tmp_path, dtype)
+    model, exported = written("aoti", name, dtype)
     found = compare(exported, beside(model), batches=(1, 7, 1009, 4096), steps=1000)
     assert max(found[key] for key in "qpsc") <= (1e-12 if dtype == torch.float64 else 1e-5), found
     assert found["status"] == found["failed"] == 0

@@ -11,9 +11,11 @@ from herglotz.scenes import (
     Reason,
     exact_discrete_lagrangian,
     hamiltonian_motion,
+    herglotz_motion,
     scene,
     scene_names,
 )
+from herglotz.scenes.motion import constant_rate
 
 NUMERICAL = [scene(name) for name in scene_names() if scene(name).numerical]
 BLOCKS = ("L", "D1", "D2", "D3", "D11", "D12", "D22", "D13", "D23", "D33")
@@ -141,6 +143,29 @@ def test_beyond_a_conjugate_point_is_nan_with_a_reason():
     assert shot.P.L.isnan().tolist() == shot.P.D12.isnan()[:, 0, 0].tolist() == [False, True, True, True]
     assert shot.p0.isnan()[:, 0].tolist() == [False, True, True, True]
     torch.testing.assert_close(shot.P.L[0], system.L_d(q, q + 0.3, f64(0.0), h)[0])
+
+
+def test_a_turning_motion_has_its_conjugate_point_where_it_is():
+    # fails if complex eigenvalues of ∂q/∂p0 judge: v²/2 + ¾(q₁v₂ − q₂v₁) − q²/2 turns by 0.75 t, so that they leave the
+    # right half-plane at t = 2.09 and are back in it beyond the first conjugate point, π/1.25 = 2.513
+    def A(q):
+        return 0.75 * torch.stack([-q[..., 1], q[..., 0]], -1)
+
+    motion = herglotz_motion(
+        lambda q, v, s: 0.5 * (v * v).sum(-1) + (A(q) * v).sum(-1) - 0.5 * (q * q).sum(-1) + 0 * s,
+        lambda q, v, s: v + A(q) + 0 * s[..., None],
+        lambda q, p, s: p - A(q) + 0 * s[..., None],
+        lambda q, v, s: -A(v) - q + 0 * s[..., None],
+        constant_rate(0.0),
+    )
+    q, h = torch.zeros(4, 2).double() + 0.5, f64(2.2, 2.45, 2.6, 4.0)
+    shot = exact_discrete_lagrangian(motion).shoot(q, q + 0.3, torch.zeros(4).double(), h)
+    assert shot.reason.tolist() == [Reason.NONE, Reason.NONE, Reason.CONJUGATE, Reason.CONJUGATE]
+    # in the frame that turns with it, the motion is an oscillator of frequency 1.25
+    w, z0, z1 = 1.25, torch.complex(f64(0.5), f64(0.5)), torch.complex(f64(0.8), f64(0.8))
+    z1 = z1 * torch.polar(torch.ones_like(h), 0.75 * h)
+    L = w / (2 * torch.sin(w * h)) * ((0.5 + 1.28) * torch.cos(w * h) - 2 * (z0.conj() * z1).real)
+    torch.testing.assert_close(shot.P.L[:2], L[:2], rtol=1e-11, atol=0)
 
 
 def test_other_failures_have_their_reason():

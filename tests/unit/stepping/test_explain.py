@@ -155,6 +155,17 @@ def test_regularity_is_det_M_and_not_D2D2():
         regularity(sum_of_squares, q, q, s, 0.1).require()
 
 
+def test_either_hamiltonian_may_be_lost_alone():
+    # fails if H⁺ is judged by D11 or H⁻ by D22
+    def bent(a, b):
+        return lambda q0, q1, s0, h: (a * q0**2 + b * q1**2 - q0 * q1).sum(-1) / h - 0.1 * h * s0
+
+    q = states()[0]
+    s = torch.zeros_like(q[:, 0])
+    assert lost(regularity(bent(0.5, 0.0), q, q + 0.1, s, 0.1)) == {"H_plus"}
+    assert lost(regularity(bent(0.0, 0.5), q, q + 0.1, s, 0.1)) == {"H_minus"}
+
+
 def test_the_parachute_pole():
     # fails if a motion that escapes before h has a status without a reason: λ v0 sinh(ωh)/ω = cosh(ωh)
     parachute, h = scene("parachute"), 0.1

@@ -170,6 +170,40 @@ def test_a_caustic_between_two_steps_is_not_stepped_over():
     torch.testing.assert_close(beyond.S, alpha(y), rtol=1e-11, atol=1e-12)
 
 
+def larmor(q0, q1, s0, h):
+    """v²/2 + ¾(q₁v₂ − q₂v₁) − q²/2 by the midpoint rule: rotation at 0.75, caustics at multiples of π/1.25."""
+    v, m = (q1 - q0) / h[..., None], 0.5 * (q0 + q1)
+    turn = m[..., 0] * v[..., 1] - m[..., 1] * v[..., 0]
+    return h * (0.5 * (v * v).sum(-1) + 0.75 * turn - 0.5 * (m * m).sum(-1)) + 0 * s0
+
+
+def test_a_double_caustic_of_a_turning_family_is_seen():
+    # fails if complex eigenvalues of ∂q_{k+1}/∂q_k are taken for no caustic: from S = β·q all n directions focus
+    # together at t = π/2.5 = 1.257, and the gyroscopic term has turned them by 54° there
+    S = Quadratic(torch.zeros(2, 2).double(), tensor([0.1, 0.2]), tensor(0.0))
+    before, after = (hopf_lax(larmor, S, tensor([0.3, 0.4]), h=0.1, steps=N) for N in (12, 13))
+    assert int(before.status) == Status.CONVERGED
+    assert int(after.status) == Status.SINGULAR
+    assert int(after.curve.opening.crossed) == 12
+    # a point source opens a step later than it starts, and focuses at π/1.25 = 2.513 (midpoint rule: 2.52)
+    source = PointSource(larmor, tensor([0.3, 0.4]), tensor(0.0), 0.1)
+    before, after = (hopf_lax(larmor, source, tensor([0.3, 0.5]), h=0.1, steps=N) for N in (24, 25))
+    assert (int(before.status), int(after.status)) == (Status.CONVERGED, Status.SINGULAR)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_sign_of_the_kinetic_term_is_not_a_caustic(sign):
+    # fails if a negative mass counts as a caustic: −L_d has the same motions, and its S is −S
+    S = Quadratic(tensor([[0.4]]) * sign, tensor([0.1]), tensor(0.0))
+
+    def L_d(q0, q1, s0, h):
+        return sign * OSCILLATOR.L_d(q0, q1, sign * s0, h)
+
+    out = hopf_lax(L_d, S, tensor([0.3]), h=0.1, steps=5)
+    assert int(out.status) == Status.CONVERGED
+    assert int(hopf_lax(L_d, S, tensor([0.3]), h=0.1, steps=30).status) == Status.SINGULAR
+
+
 def test_float32():
     # fails if float64 gets in
     y = tensor([[0.2, -0.4]]).float()

@@ -14,15 +14,15 @@ from herglotz.verify import verify
 from herglotz.verify.data_checks import data_checks, noise_level
 
 
-def run_of(noise=0.0, h=0.1, stiffness=1.0, prediction=None, **options):
+def run_of(noise=0.0, h=0.1, stiffness=1.0, prediction=None, rate=0.2, **options):
     """A hand-made run on simulated pendulum data, with the true states and the model of that stiffness."""
     options = {"trajectories": 3, "steps": 60, "seed": 3, "q_range": (-1.0, 1.0), **options}
-    clean = simulate(scene("damped_pendulum"), h=h, keep_state=True, **options)
+    clean = simulate(scene("damped_pendulum", gamma=rate), h=h, keep_state=True, **options)
     assert clean.p is not None
     data = replace(clean, p=None, s=None)
     make = torch.Generator().manual_seed(0)
     data = replace(data, q=data.q + noise * torch.randn(data.q.shape, generator=make, dtype=torch.float64))
-    model = ContactLagrangian(ModelConfig(rate=0.2, stiffness=(stiffness,), potential_width=0))
+    model = ContactLagrangian(ModelConfig(rate=rate, stiffness=(stiffness,), potential_width=0))
     q = clean.q if prediction is None else prediction(clean.q)
     states = State(q, clean.p, torch.zeros_like(clean.t))
     train = tuple(40 for _ in data.lengths)
@@ -57,6 +57,29 @@ def test_a_collapsed_model_fails():
     run = run_of(stiffness=4 / 0.1**2)
     checks, _ = named(run)
     assert not checks["one_step"].passed
+
+
+@pytest.mark.parametrize("factor", [-1.0, 2.0, -2.0, 0.3])
+def test_a_wrong_dissipation_fails(factor):
+    # fails if a bound of 0.1 of the spread decides alone: weak damping of either sign stays below it (γ = 0.01: 0.013)
+    run = run_of(rate=0.01)
+    checks, numbers = named(run)
+    assert checks["dissipation"].passed
+    assert checks["dissipation"].value < 0.3  # 0.16: the rule of order 2 leaves 8e-4 of the spread
+    assert numbers["precision"] < 1e-4
+    assert run.model.damping is not None
+    with torch.no_grad():
+        run.model.damping.rate.mul_(factor)
+    checks, _ = named(run)
+    assert checks["follow"].passed
+    assert not checks["dissipation"].passed
+
+
+def test_a_dissipation_that_noise_hides_is_not_judged_and_said_so():
+    # fails if noise alone decides about γ
+    checks, _ = named(run_of(rate=1e-4, noise=0.02))
+    assert "dissipation" not in checks
+    assert "dissipation is not judged" in checks["follow"].note
 
 
 @pytest.mark.parametrize(

@@ -51,9 +51,9 @@ def test_an_exported_file(tmp_path, dtype):
     assert report.passed, report.table()
     assert report.details["h"] == 0.2
     assert "no L_d in the file: H⁺ rebuilt" in report["hamilton_jacobi"].note
-    exported = load_pt2(path)
-    assert verify(exported, samples=8, steps=4).checks == report.checks
     if dtype == torch.float64:  # what is rebuilt from the map agrees with L_d itself
+        exported = load_pt2(path)
+        assert verify(exported, samples=8, steps=4).checks == report.checks
         states = State(*(torch.full((3, *x), 0.3, dtype=dtype) for x in ((1,), (1,), ())))
         by_map = verify((_MapOnly(exported), states), h=0.2, steps=3)
         by_L_d = verify((model, states), h=0.2, steps=3)

@@ -96,14 +96,12 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.tanh_backward.default: lambda g, t: c.multiply(g, c.subtract(1.0, c.multiply(t, t))),
         aten.sigmoid_backward.default: lambda g, s: c.multiply(g, c.multiply(s, c.subtract(1.0, s))),
         aten.gt.Tensor: c.greater, aten.gt.Scalar: c.greater, **dict.fromkeys(WHERE, c.choose),
-        aten.log_sigmoid.default: lambda x: c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0),
         aten.log_sigmoid_forward.default: lambda x: (
             c.multiply(c.function("softplus", c.multiply(x, -1.0)), -1.0), None,
         ),
         aten.log_sigmoid_backward.default: lambda g, x, _: c.multiply(g, c.function("sigmoid", c.multiply(x, -1.0))),
-        aten.linear.default: lambda x, w, b=None: c.product(x, w.T, b),
         aten.addmm.default: lambda b, x, w: c.add(c.product(x, w), b) if b.ndim > 1 else c.product(x, w, b),
-        aten.mm.default: c.product, aten.bmm.default: c.product, aten.matmul.default: c.product,
+        aten.mm.default: c.product, aten.bmm.default: c.product,
         aten.mv.default: c.product, aten.dot.default: c.product,
         aten.sum.dim_IntList: c.sum,
         aten.linalg_inv_ex.default: lambda x, *_, **__: (c.inverse(x), None),
@@ -114,19 +112,15 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.slice.Tensor: lambda x, dim=0, a=None, b=None, step=1: x[
             (slice(None),) * (dim % x.ndim) + (slice(a, b, step),)
         ],
-        aten.movedim.int: np.moveaxis, aten.movedim.intlist: np.moveaxis, aten.transpose.int: np.swapaxes,
-        aten.t.default: transposed, aten.numpy_T.default: np.transpose, aten.permute.default: np.transpose,
-        aten.expand.default: _expand, aten.expand_as.default: lambda x, y: np.broadcast_to(x, y.shape),
+        aten.transpose.int: np.swapaxes,
+        aten.t.default: transposed, aten.permute.default: np.transpose,
+        aten.expand.default: _expand,
         aten.reshape.default: lambda x, shape: x.reshape(shape),
         aten.repeat.default: np.tile,
-        aten.flatten.using_ints: lambda x, a=0, b=-1: x.reshape(
-            *x.shape[: a % x.ndim], -1, *x.shape[b % x.ndim + 1 :]
-        ),
         aten.unflatten.int: lambda x, dim, shape: x.reshape(*x.shape[: dim % x.ndim], *shape, *x.shape[dim % x.ndim + 1 :]),  # noqa: E501
         aten.unbind.int: lambda x, dim=0: [np.take(x, i, axis=dim) for i in range(x.shape[dim])],
         aten.split_with_sizes.default: lambda x, sizes, dim=0: np.split(x, np.cumsum(sizes)[:-1], axis=dim),
         aten.split.Tensor: lambda x, size, dim=0: np.split(x, range(size, x.shape[dim], size), axis=dim),
-        aten.broadcast_tensors.default: lambda xs: np.broadcast_arrays(*xs),
         aten.index.Tensor: lambda x, places: x[tuple(slice(None) if p is None else p for p in places)],
         aten.index_select.default: lambda x, dim, i: np.take(x, i, axis=dim),
         aten.sign.default: lambda x: c.choose(c.greater(x, 0.0), 1.0, c.choose(c.greater(0.0, x), -1.0, 0.0)),
@@ -141,10 +135,7 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.new_ones.default: lambda _, shape: _full(shape, 1),
         aten.sym_size.int: lambda x, dim: x.shape[dim], operator.getitem: lambda x, i: x[i], operator.mul: operator.mul,
     }  # fmt: skip
-    table |= dict.fromkeys(
-        (aten.clone.default, aten._to_copy.default, aten.contiguous.default, aten.detach.default, aten.alias.default,
-         aten.to.dtype, aten.to.device, aten.to.dtype_layout), same,
-    )  # fmt: skip
+    table |= dict.fromkeys((aten.clone.default, aten._to_copy.default, aten.detach.default, aten.alias.default), same)
     for name in ("sin", "cos", "exp", "expm1", "sqrt", "atanh", "tanh", "sigmoid"):
         table[getattr(aten, name).default] = lambda x, name=name: c.function(name, x)
     table[aten.abs.default] = lambda x: c.function("fabs", x)

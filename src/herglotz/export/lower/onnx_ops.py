@@ -65,12 +65,9 @@ def write_item(w: Writer, node: Any) -> str:
     if source.target == aten.linalg_inv_ex.default:
         assert index == 0
         return write_inverse(w, source.args[0])
-    assert source.target == aten.broadcast_tensors.default
-    x, others = source.args[0][index], source.args[0]
-    if described(x).shape == described(node).shape:
-        return w.name(x)
-    whole = next(y for y in others if described(y).shape == described(node).shape)
-    return w.emit("Expand", w.name(x), w.emit("Shape", w.name(whole)))
+    assert source.target == aten.log_sigmoid_forward.default
+    assert index == 0
+    return write_log_sigmoid(w, source.args[0])
 
 
 def write_inverse(w: Writer, x: Any) -> str:
@@ -96,21 +93,6 @@ def write_transposed(w: Writer, node: Any) -> str:
     return w.emit("Transpose", w.name(x), perm=perm)
 
 
-def write_flattened(w: Writer, node: Any) -> str:
-    """The axes from the first to the last named one in one."""
-    x, first, last = (*node.args, -1)[:3]
-    tail = described(x).shape[axis_of(last, x) + 1 :]
-    return w.emit("Reshape", w.name(x), w.integers(*[0] * axis_of(first, x), -1, *tail))
-
-
-def write_moved(w: Writer, node: Any) -> str:
-    """Axes in another order."""
-    x, source, target = node.args
-    dims = len(described(x).shape)
-    order = torch.empty(list(range(1, dims + 1)), device="meta").movedim(source, target).shape
-    return w.emit("Transpose", w.name(x), perm=[size - 1 for size in order])
-
-
 def write_unflatten(w: Writer, node: Any) -> str:
     """The first axis as several."""
     x, axis, shape = node.args
@@ -133,21 +115,6 @@ def write_matmul(w: Writer, node: Any) -> str:
         last = w.integers(1)
         return w.emit("Squeeze", w.emit("Gemm", w.name(a), w.emit("Unsqueeze", w.name(b), last)), last)
     return write_product(w, w.name(a), w.name(b), 2 if ranks == (2, 2) else 0)
-
-
-def write_linear(w: Writer, node: Any) -> str:
-    """X Wᵀ + b."""
-    x, weight, *bias = node.args
-    known = w.known(weight)
-    turned = (
-        w.emit("Transpose", w.name(weight), perm=[1, 0]) if known is None
-        else w.constant(known.detach().t().contiguous().numpy(), NUMPY[known.dtype])
-    )  # fmt: skip
-    added = w.name(bias[0]) if bias and bias[0] is not None else None
-    if len(described(x).shape) == 2 and added is not None:
-        return w.emit("Gemm", w.name(x), turned, added)
-    product = write_product(w, w.name(x), turned, len(described(x).shape))
-    return product if added is None else w.emit("Add", product, added)
 
 
 def write_addcmul(w: Writer, node: Any) -> str:
@@ -247,9 +214,22 @@ def write_atanh(w: Writer, node: Any) -> str:
 
 def write_log_sigmoid(w: Writer, node: Any) -> str:
     """Log σ(x) = min(x, 0) − log(1 + e^{−|x|})."""
-    x, dtype = w.name(node.args[0]), described(node).dtype
+    x, dtype = w.name(node), described(node).dtype
     decay = w.emit("Exp", w.emit("Neg", w.emit("Abs", x)))
     return w.emit("Sub", w.emit("Min", x, w.name(0.0, dtype)), write_log1p(w, decay, dtype))
+
+
+def write_log_sigmoid_backward(w: Writer, node: Any) -> str:
+    """G σ(−x)."""
+    g, x, _ = node.args
+    return w.emit("Mul", w.name(g), w.emit("Sigmoid", w.emit("Neg", w.name(x))))
+
+
+def write_sigmoid_backward(w: Writer, node: Any) -> str:
+    """G σ (1 − σ)."""
+    g, value = (w.name(x) for x in node.args)
+    slope = w.emit("Mul", value, w.emit("Sub", w.name(1.0, described(node).dtype), value))
+    return w.emit("Mul", g, slope)
 
 
 def write_nan_to_num(w: Writer, node: Any) -> str:
@@ -270,12 +250,6 @@ def write_diagonal(w: Writer, node: Any) -> str:
     x: Any = node.args[0]
     eye = w.constant(np.eye(described(x).shape[-1]), NUMPY[described(x).dtype])
     return w.emit("Mul", w.emit("Unsqueeze", w.name(x), w.integers(-1)), eye)
-
-
-def write_different(w: Writer, node: Any) -> str:
-    """A ≠ b."""
-    a, b = node.args
-    return w.emit("Not", w.emit("Equal", w.name(a), w.name(b, common_dtype(node))))
 
 
 def write_diagonal_of(w: Writer, node: Any) -> str:

@@ -22,6 +22,7 @@ SIMPLE = {
     aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul", aten.bmm.default: "MatMul",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
     aten.maximum.default: "Max", aten.minimum.default: "Min",
+    aten.bitwise_and.Tensor: "And", aten.bitwise_or.Tensor: "Or",
     aten.__and__.Tensor: "And", aten.__or__.Tensor: "Or", aten.eq.Scalar: "Equal", aten.eq.Tensor: "Equal",
     aten.le.Tensor: "LessOrEqual", aten.le.Scalar: "LessOrEqual", aten.lt.Tensor: "Less", aten.lt.Scalar: "Less",
     aten.ge.Tensor: "GreaterOrEqual", aten.ge.Scalar: "GreaterOrEqual", aten.gt.Tensor: "Greater",
@@ -32,7 +33,7 @@ SIMPLE = {
 SAME = (aten.clone.default, aten.detach.default, aten.alias.default)
 # Written where one of their outputs is taken; zeros nowhere, see `_is_zero`.
 LATER = (
-    aten.unbind.int, aten.broadcast_tensors.default, aten.split_with_sizes.default, aten.linalg_inv_ex.default,
+    aten.unbind.int, aten.log_sigmoid_forward.default, aten.split_with_sizes.default, aten.linalg_inv_ex.default,
     aten.zeros.default,
 )  # fmt: skip
 
@@ -130,18 +131,13 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.index.Tensor: ops.write_index,
     aten.cat.default: ops.write_cat,
     aten.stack.default: ops.write_stack,
-    aten.linear.default: ops.write_linear,
-    aten.matmul.default: ops.write_matmul,
     aten.mm.default: ops.write_matmul,
     aten.mv.default: ops.write_matmul,
     aten.tanh_backward.default: ops.write_tanh_backward,
     aten.permute.default: lambda w, n: w.emit("Transpose", w.name(n.args[0]), perm=n.args[1]),
     aten._to_copy.default: lambda w, n: w.emit("Cast", w.name(n.args[0]), to_=kind_of(described(n).dtype)),
     aten.empty_like.default: lambda w, n: w.like(n, 0),
-    aten.movedim.int: ops.write_moved,
-    aten.movedim.intlist: ops.write_moved,
     aten.unflatten.int: ops.write_unflatten,
-    aten.flatten.using_ints: ops.write_flattened,
     aten.transpose.int: ops.write_transposed,
     aten.reshape.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
     aten.view.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
@@ -172,7 +168,8 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.nan_to_num.default: ops.write_nan_to_num,
     aten.expm1.default: ops.write_expm1,
     aten.atanh.default: ops.write_atanh,
-    aten.log_sigmoid.default: ops.write_log_sigmoid,
+    aten.log_sigmoid_backward.default: ops.write_log_sigmoid_backward,
+    aten.sigmoid_backward.default: ops.write_sigmoid_backward,
     aten.diag_embed.default: ops.write_diagonal,
     aten.diagonal.default: ops.write_diagonal_of,
 }

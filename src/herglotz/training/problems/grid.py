@@ -27,6 +27,7 @@ class SegmentGrid:
     joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
     end: Tensor  # (S,) last node of each segment
     row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
+    part: Tensor  # (S, K) where in this recorded step the middle of the model step is, from 0 to 1
 
     @property
     def segments(self) -> int:
@@ -61,6 +62,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     """
     steps: list[list[float]] = []
     rows: list[list[int]] = []
+    parts: list[list[float]] = []
     nodes: list[list[tuple[int, int]]] = []  # (k, sample) of the observed nodes
     starts: list[int] = []
     joined: list[int] = []
@@ -71,18 +73,21 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         for i, (a, b) in enumerate(pairwise(bounds)):
             joined.append(-1 if i == 0 else len(starts) - 1)
             starts.append(a)
-            line, from_row, seen = [], [], [(0, a)] if i == 0 else []
+            line, from_row, middle, seen = [], [], [], [(0, a)] if i == 0 else []
             for j in range(a, b):
                 m = substeps(times[j + 1] - times[j], max_step)
                 line += [(times[j + 1] - times[j]) / m] * m
                 from_row += [j] * m
+                middle += [(k + 0.5) / m for k in range(m)]
                 seen.append((len(line), j + 1))
             steps.append(line)
             rows.append(from_row)
+            parts.append(middle)
             nodes.append(seen)
     K = max(len(line) for line in steps)
-    padded = [line + [line[-1]] * (K - len(line)) for line in steps]
-    padded_rows = [line + [line[-1]] * (K - len(line)) for line in rows]
+    padded, padded_rows, padded_parts = (
+        [line + [line[-1]] * (K - len(line)) for line in lines] for lines in (steps, rows, parts)
+    )
     device = data.t.device
     return SegmentGrid(
         h=torch.tensor(padded, dtype=data.t.dtype, device=device),
@@ -92,4 +97,5 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         joined_to=torch.tensor(joined, device=device),
         end=torch.tensor([len(line) for line in steps], device=device),
         row=torch.tensor(padded_rows, device=device),
+        part=torch.tensor(padded_parts, dtype=data.t.dtype, device=device),
     )

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
-from herglotz.training.inputs import step_inputs
+from herglotz.training.inputs import grid_inputs, step_inputs
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.prior import Prior
@@ -79,8 +79,7 @@ class StatesProblem(LeastSquares, ABC):
         super().__init__(model, data, **settings)
         self.grid = grid
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
-        if self.u is not None:
-            self.u = self.u[grid.row]  # (S, K, m)
+        self.u = grid_inputs(model, data, grid)  # (S, K, m)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
 

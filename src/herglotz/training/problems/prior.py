@@ -30,6 +30,7 @@ class Prior:
     * The damping rate, the drag coefficients (per unit of position), the rates of the full level's units and viscous
       friction (the first mass is 1) are N(their start, `rate_spread`²); dry friction is N(0, (`rate_spread` speed)²),
       its excess at breakaway N(0, (0.01 F)²) and the logarithms of its widths N(their start, 0.5²).
+    * Terms by name (`herglotz.models.Term`) state their own spread.
     """
 
     def __init__(
@@ -51,6 +52,8 @@ class Prior:
         self.width_index = self._index("friction.log")
         self.force_index = self._index("friction.coulomb")
         self.breakaway_index = self._index("friction.breakaway")
+        own = [(f"more.{i}.", term.spread) for i, term in enumerate(model.named_terms) if term.spread is not None]
+        self.own = [(self._index(name), spread) for name, spread in own]
         self.start, self.rate_spread, self.weight = theta, rate_spread, weight
         unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
         speed = low.new_tensor(model.config.speed)
@@ -68,6 +71,7 @@ class Prior:
             parts.append(moved[self.force_index] / (self.rate_spread * max(self.parameters.model.config.speed)))
             parts.append(moved[self.breakaway_index] / (BREAKAWAY * self.force))
             parts.append(moved[self.width_index] / WIDTH)
+        parts += [moved[index] / spread for index, spread in self.own]
         if self.departure is not None:
             parts += [x / (self.departure * x.numel() ** 0.5) for x in self._departures(theta)]
         return torch.cat(parts)

@@ -1,0 +1,45 @@
+"""What an input does between its samples: how the recorded u_k become the input of a step, or of a part of it.
+
+    zero     u_k from sample k to the next: a controller's output
+    first    straight lines between the samples: the mean over a step is (u_k + u_{k+1})/2
+    smooth   cubics through four samples: a signal without steps that was sampled at the same times as the motion
+
+A model takes one input a step. Where u changes within the step the rule of order 2 wants its value in the middle: this
+is what a hold gives, for the whole recorded step or for each of the equal parts in which the step is crossed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+HOLDS = ("zero", "first", "smooth")
+POINTS = {"zero": 1, "first": 2, "smooth": 4}  # samples that an input in between is made of
+
+
+def held(
+    hold: str,  # one of `HOLDS`; "" (not said) is "zero"
+    t: Tensor,  # (N,) time
+    u: Tensor,  # (N, m)
+    lengths: Sequence[int],  # samples of each trajectory
+    row: Tensor,  # (...) sample at which each recorded step starts
+    part: Tensor,  # (...) where in the step, from 0 to 1
+) -> Tensor:
+    """The input in these steps, (..., m): polynomials through the nearest samples of the same trajectory."""
+    if hold in ("", "zero"):
+        return u[row]
+    ends = torch.tensor(lengths, device=u.device).cumsum(0)
+    own = torch.bucketize(row, ends, right=True)
+    first, last = (ends - torch.tensor(lengths, device=u.device))[own], ends[own] - 1
+    after = torch.minimum(row + 1, last)
+    time = t[row] + part * (t[after] - t[row])
+    count = min(POINTS[hold], min(lengths))
+    start = torch.minimum(torch.maximum(row - (count // 2 - 1), first), last - count + 1)
+    near = start[..., None] + torch.arange(count, device=u.device)  # (..., count)
+    x = t[near] - time[..., None]
+    # Lagrange's polynomials at 0: Π_{j ≠ i} x_j / (x_j − x_i).
+    ratio = x[..., None, :] / (x[..., None, :] - x[..., :, None]).where(~torch.eye(count, dtype=torch.bool), 1.0)
+    weights = ratio.where(~torch.eye(count, dtype=torch.bool), 1.0).prod(-1)
+    return (weights[..., None] * u[near]).sum(-2)

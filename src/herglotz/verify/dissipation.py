@@ -1,0 +1,59 @@
+"""Null models of dissipation: a fit must follow its data better than with γ → −γ, 0, γ/2 and 2γ.
+
+Weak damping changes twenty steps by a few per cent of the spread, which the bound of "follows the data" lets pass. The
+same windows with the dissipation altered say whether the data know it, and whether the model has it right.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from copy import deepcopy
+from dataclasses import replace
+
+import torch
+
+from herglotz.models import ContactLagrangian
+from herglotz.training import Run
+from herglotz.verify.report import Check
+
+FACTORS = (-1.0, 0.0, 0.5, 2.0)
+TOLD = 0.05  # the data tell the dissipation where an altered one changes the error by more than this share
+
+
+def dissipation(run: Run, error: Callable[[Run], float], own: float) -> tuple[Check | None, str]:
+    """Compare the error of the run's windows with those of its null models; None and a note where nothing is told.
+
+    Parameters
+    ----------
+    run
+        The run.
+    error
+        The RMS of free runs over windows, of any run on these data.
+    own
+        That of this run.
+    """
+    if not math.isfinite(own) or not any(bool((x != 0).any()) for x in _rates(run.model)):
+        return None, ""
+    nulls = {factor: error(replace(run, model=_scaled(run.model, factor))) for factor in FACTORS}
+    best = min(nulls.values())
+    if not abs(best - own) > TOLD * own:
+        return None, "; dissipation is not judged: γ → −γ, 0, γ/2 or 2γ changes nothing that the data show"
+    listed = ", ".join(f"{x:g}γ {value:.2g}" for x, value in nulls.items())
+    claim = "dissipation: better than −γ, 0, γ/2, 2γ (ratio)"
+    ratio = own / best if best > 0 else math.inf
+    return Check("dissipation", claim, ratio, 1.0, ratio < 1, f"over spread: γ {own:.2g}, {listed}", "<"), ""
+
+
+def _rates(model: ContactLagrangian) -> list[torch.Tensor]:
+    """The parameters that dissipate: the rate of the contact form, and viscous friction."""
+    found = [getattr(model.damping, "rate", None), getattr(model.friction, "viscous", None)]
+    return [x for x in found if x is not None]
+
+
+def _scaled(model: ContactLagrangian, factor: float) -> ContactLagrangian:
+    model = deepcopy(model)
+    with torch.no_grad():
+        for rate in _rates(model):
+            rate.mul_(factor)
+    return model

@@ -1,0 +1,60 @@
+"""States for an L_d that comes without any: positions and velocities of size 1, momenta by FL⁻."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics import DiscreteLagrangian, momentum_minus, partials
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
+
+MOST = 12  # coordinates that are tried
+
+
+def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Generator) -> State:
+    """Return (q0, p0, s0) with q0 and q̇ standard normal, s0 in [−1, 1], and p0 = −D1 L_d(q0, q0 + h q̇, s0)/c.
+
+    A learned model has its own sizes of q and q̇, and its number of coordinates. Of a function the smallest number is
+    taken that it does not refuse, so a sum over coordinates is verified for one.
+
+    Raises
+    ------
+    InputError
+        If the function takes no number of coordinates up to 12, or gives no finite momentum.
+    """
+    if isinstance(L_d, ContactLagrangian):
+        scale, speed = (torch.tensor(x, dtype=torch.float64) for x in (L_d.config.scale, L_d.config.speed))
+        dtype = next(L_d.parameters()).dtype
+        return _finite(_state(L_d, scale.to(dtype), speed.to(dtype), h, samples, make))
+    refused = ""
+    for n in range(1, MOST + 1):
+        one = torch.ones(n, dtype=torch.float64)
+        try:
+            return _finite(_state(L_d, one, one, h, samples, make))
+        except (IndexError, RuntimeError, ValueError) as error:
+            if isinstance(error, InputError):
+                raise
+            refused = str(error).splitlines()[0]
+    raise InputError(
+        f"no states could be drawn: up to {MOST} coordinates the function fails ({refused}); give (L_d, (q, p, s))"
+    )
+
+
+def _state(
+    L_d: DiscreteLagrangian, scale: Tensor, speed: Tensor, h: float, samples: int, make: torch.Generator
+) -> State:
+    shape = (samples, len(scale))
+    q, v = (torch.randn(shape, generator=make, dtype=torch.float64).to(scale) * size for size in (scale, speed))
+    s = (2 * torch.rand(samples, generator=make, dtype=torch.float64) - 1).to(scale) * (scale * speed).sum()
+    with torch.no_grad():
+        P = partials(L_d, q, q + h * v, s, h)
+    return State(q, momentum_minus(P), s)
+
+
+def _finite(state: State) -> State:
+    good = torch.isfinite(state.p).all(-1)
+    if not bool(good.any()):
+        raise InputError("L_d has no finite momentum at q, q̇ of size 1; give states: (L_d, (q, p, s))")
+    return State(*(x[good] for x in state))

@@ -1,0 +1,77 @@
+"""What inputs do between samples: values, thinning, files, and the hold that explains recorded steps."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, load, save, simulate
+from herglotz.errors import InputError
+from herglotz.scenes import scene
+from herglotz.training.hold import with_hold
+
+
+def recorded(hold="", count=40) -> Any:
+    """Two trajectories at uneven times whose input is a cubic of time."""
+    make = torch.Generator().manual_seed(0)
+    t = torch.rand(2, count, generator=make, dtype=torch.float64).add_(0.2).cumsum(1).flatten() / 5
+    u = torch.stack([t**3 - t, 2 * t], -1)
+    return Trajectories.of(t, torch.sin(t), (count, count), u=u, hold=hold)
+
+
+@pytest.mark.parametrize(("hold", "powers"), [("zero", 1), ("first", 2), ("smooth", 4)])
+def test_a_hold_is_exact_on_its_polynomials(hold, powers):
+    # fails if steps are taken for equal, a stencil reaches into the next trajectory, or a row is off by one
+    data = recorded(hold)
+    inside = torch.arange(80) % 40 != 39
+    row, part = torch.arange(80)[inside], torch.full((78,), 0.3, dtype=torch.float64)
+    time = data.t[row] + 0.3 * (data.t[row + 1] - data.t[row])
+    for k in range(powers):
+        own = data.trajectory * 3.0  # each trajectory has a polynomial of its own
+        found: Any = replace(data, u=(data.t**k + own)[:, None]).inputs_of_steps(row, part)
+        torch.testing.assert_close(found[:, 0], time**k + own[row], rtol=1e-9, atol=1e-12)
+    assert torch.equal(data.inputs_of_steps()[39], data.u[39])
+
+
+def test_thinned_inputs_are_those_of_steps():
+    # fails if the mean over a longer step takes samples for steps, or is held again afterwards
+    data = recorded("first")
+    h = data.t[1:5] - data.t[:4]
+    mean = ((data.u[:4] + data.u[1:5]) / 2 * h[:, None]).sum(0) / h.sum()
+    thinned = data.thinned(4)
+    assert thinned.hold == "zero"
+    torch.testing.assert_close(thinned.inputs_of_steps()[0], mean)
+    assert data.thinned(1).hold == "first"
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_files_say_their_hold(tmp_path, suffix):
+    # fails if a file loses the hold, or one that says nothing gains one
+    for hold in ("", "smooth"):
+        save(tmp_path / f"a.{suffix}", recorded(hold))
+        again = load(tmp_path / f"a.{suffix}")
+        assert again.hold == hold
+        assert again.digest() == recorded(hold).digest()
+
+
+def test_an_unknown_hold_is_refused(tmp_path):
+    # fails if a typing error in a file is taken for "not said"
+    (tmp_path / "a.csv").write_text("# hold: frist\nt,x,u\n0,0,1\n1,1,1\n2,2,1\n")
+    with pytest.raises(InputError, match="unknown hold 'frist' of the inputs; choose one of zero, first, smooth"):
+        load(tmp_path / "a.csv")
+
+
+def test_the_hold_of_a_recording_is_found():
+    # fails if the wrong samples are compared: inputs held over steps, and a smooth input of the exact motion
+    held = replace(simulate(scene("driven_pendulum"), trajectories=2, steps=60, h=0.1, seed=1), hold="")
+    assert with_hold(held, "", held)[0].hold == "zero"
+    t = torch.arange(200, dtype=torch.float64) / 5
+    waves = torch.tensor([0.7, 2.0, 4.1], dtype=torch.float64)
+    phase = waves * t[:, None]
+    c, s = phase.cos(), phase.sin()
+    gain, loss = 1 - waves**2, 0.2 * waves  # of q'' + 0.2 q' + q = u, driven by cosines
+    q = ((gain * c + loss * s) / (gain**2 + loss**2)).sum(1)
+    smooth = Trajectories.of(t, q, u=c.sum(1))
+    assert with_hold(smooth, "", smooth)[0].hold == "smooth"
+    assert with_hold(smooth, "first", smooth)[0].hold == "first"

@@ -1,0 +1,76 @@
+"""The row that compares autograd's DΦ̃ with differences: what hides from autograd passes every other row."""
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.scenes import scene
+from herglotz.stepping import State
+from herglotz.verify import verify
+
+
+def states(n=1, count=32):
+    x = torch.randn(count, 2 * n + 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    return State(x[:, :n], x[:, n : 2 * n], x[:, -1])
+
+
+def kinetic(q0, q1, s0, h):
+    return ((q1 - q0) ** 2).sum(-1) / (2 * h) - 0.02 * s0
+
+
+def detached(q0, q1, s0, h):
+    return kinetic(q0, q1, s0, h) - h / 2 * (torch.cos(q0) + torch.cos(q1)).detach().sum(-1)
+
+
+GRID = np.linspace(-20, 20, 400)
+
+
+def table(q0, q1, s0, h):
+    V = torch.as_tensor(np.interp(q0.detach().numpy(), GRID, np.cos(GRID)))
+    return kinetic(q0, q1, s0, h) - h * V.sum(-1)
+
+
+def jump(q0, q1, s0, h):
+    return kinetic(q0, q1, s0, h) - 0.1 * h * (q0 > 0.3).double().sum(-1)
+
+
+def failed(report):
+    return {check.name for check in report.checks if not check.passed}
+
+
+@pytest.mark.parametrize("hidden", [detached, table, jump])
+def test_what_autograd_does_not_see_fails_this_row_alone(hidden):
+    # fails if DΦ̃ is compared with itself: p, c and DΦ̃ share one autograd, and all other identities hold
+    report = verify((hidden, states()), h=0.1)
+    assert failed(report) == {"derivative"}, report.table()
+    assert report["derivative"].value > 3e-5  # the jump 6e-5, the others 0.1
+
+
+def test_the_scale_of_the_sample_does_not_matter():
+    # fails if offsets are absolute: here q, p and s differ by 1e-6 to 1e4 in size
+    q, p, s = states()
+
+    def scaled(q0, q1, s0, h):
+        return 1e10 * kinetic(q0 * 1e6, q1 * 1e6, s0 / 1e10, h) - 1e10 * h * (1e12 * q0 * q0).sum(-1)
+
+    start = State(q * 1e-6, p * 1e16, s * 1e10)
+    assert verify((scaled, start), h=0.1, steps=2)["derivative"].value < 1e-10
+
+
+@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+def test_sound_maps_pass(dtype):
+    # fails if the bound is below the rounding of differences, or a stencil is not that of order 8
+    start = State(*(x.to(dtype) for x in states(2)))
+    report = verify((scene("double_pendulum").L_d, start), h=0.05, steps=3)
+    assert report["derivative"].value < (1e-9 if dtype == torch.float64 else 1e-3), report.table()
+
+
+def test_a_sample_beside_a_failed_step_is_left_out_and_counted():
+    # fails if a stencil that leaves the domain of L_d counts as an error, or a row with no sample passes
+    def walled(q0, q1, s0, h):
+        return kinetic(q0, q1, s0, h) + h * torch.log(q0).sum(-1)
+
+    q, p, s = states()
+    report = verify((walled, State(q.abs() + 0.01, 0.1 * p, s)), h=0.001, steps=2)
+    assert "left out: a step beside them failed" in report["derivative"].note
+    assert report["derivative"].passed
