@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from unittest import mock
 
 from herglotz.data import load, save, simulate
 from herglotz.errors import InputError
@@ -77,17 +78,12 @@ def watched(count: Count) -> Iterator[None]:
     """Count when the code in a file is reached: a header compiled, torch's reader of graphs called."""
     from torch.export.pt2_archive import _package
 
-    build, unpack = c_stepper.build, _package.load_pt2
-
     def reached(*_: object, **__: object) -> None:
         count.executed += 1
         raise InputError("reached")
 
-    c_stepper.build, _package.load_pt2 = reached, reached
-    try:
+    with mock.patch.object(c_stepper, "build", reached), mock.patch.object(_package, "load_pt2", reached):
         yield
-    finally:
-        c_stepper.build, _package.load_pt2 = build, unpack
 
 
 def try_one(kind: Kind, content: bytes, make: random.Random, count: Count) -> None:

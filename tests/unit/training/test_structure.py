@@ -84,7 +84,7 @@ def test_the_data_decide():
     # fails if the rich structure is taken for pendulums that do not touch, or missed where the mass turns
     told = FitConfig()
     for data, rich in ((double_pendulum(), True), (two_pendulums(0.01), False)):
-        config, base, _ = structured(data, estimate_baseline(data), told.resolved(data))
+        config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
         assert bool(config.features) is rich
         assert bool(base.start) is rich
 
@@ -93,7 +93,7 @@ def test_noise_is_told_from_order():
     # fails if noisy data are fitted step by step, or features of noise are kept
     data, told, make = double_pendulum(), FitConfig(), torch.Generator().manual_seed(0)
     data = replace(data, q=data.q + 1e-3 * torch.randn(data.q.shape, generator=make, dtype=data.q.dtype))
-    config, _, _ = structured(data, estimate_baseline(data), told.resolved(data))
+    config, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert (config.objective, config.order) == ("trajectory", 2)
     assert "cos(1q1 - 1q2) v1 v2" in config.features
     assert len(config.features) < 14
@@ -140,7 +140,7 @@ def bodies(count, *, springs=1.0, masses=None, noise=0.0):
 def test_bodies_find_their_masses_and_springs(noise):
     # fails if masses between bodies take the springs' place, a mass is lost, or noise keeps every feature
     data = bodies(2, masses=[1.0, 2.0], noise=noise)
-    config, base, _ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
+    config, base, *_ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
     model = build_model(base, config, "potential")
     assert config.diagonal
     assert "(q1 - q2)^2" in config.features
@@ -157,7 +157,7 @@ def test_bodies_that_share_nothing_are_left_alone():
     # fails if the scale of each, which nothing fixes, ends a fit, or features of rounding are kept
     data = bodies(2, springs=0.0)
     told = FitConfig(iterations=10, objective="residual")
-    config, base, _ = structured(data, estimate_baseline(data), told.resolved(data))
+    config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert bool(config.features) is bool(base.start)
     assert fit(data, told, progress=False).metrics["extrapolation_rms"] < 1e-2
 
@@ -183,7 +183,7 @@ def test_a_magnetic_field_is_found():
 
     charged = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
     data = simulate(charged, trajectories=8, steps=60, h=0.02, seed=0)
-    config, base, _ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
+    config, base, *_ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
     assert config.features == ("r^-1", "q1 v2 - q2 v1")
     assert base.start[KINETIC][0] == pytest.approx(0.4, rel=1e-4)  # of K: half the field
     assert base.start["potential.features.sum.coefficient"][-1] == pytest.approx(-1.0, rel=1e-4)
@@ -201,7 +201,7 @@ def test_a_dictionary_that_misses_is_not_taken_for_noise():
 
     wells = replace(scene("kepler"), flow=lambda q, p, s, h: reference_flow(slopes, q, p, s, h))
     data, told = simulate(wells, trajectories=6, steps=50, h=0.1, seed=0), FitConfig()
-    config, base, _ = structured(data, estimate_baseline(data), told.resolved(data))
+    config, base, *_ = structured(data, estimate_baseline(data), told.resolved(data))
     assert not config.features
     assert not base.start
 

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import simulate
+from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, stages
@@ -41,11 +42,10 @@ def test_the_same_bits(case, shares, data, tmp_path, monkeypatch):
     # batches, or the path that a shooting problem starts its next solve from
     monkeypatch.setattr(stages, "EVERY", 3)
     written, stop = 0, 10**9
-    write = stages.write_atomically
 
     def counted(path, content):
         nonlocal written
-        write(path, content)
+        write_atomically(path, content)
         written += 1
         if written == stop:
             raise Interrupted

@@ -77,8 +77,9 @@ def adam(
         current.grad = torch.zeros_like(x)
         optimiser.load_state_dict(resumed["optimiser"])
         schedule.load_state_dict(resumed["schedule"])
-        for _ in range(iteration if rounds is not None else 0):
-            next(rounds)
+        if rounds is not None:
+            for _ in range(iteration):
+                next(rounds)
 
     def search() -> dict[str, Any]:
         return {
