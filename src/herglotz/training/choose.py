@@ -112,7 +112,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "drag": _structure_reason(seen, c.drag == user_settings.drag),
             "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
             "hold": seen.hold,
-            "forces": seen.friction if seen.structure is None else seen.structure,
+            "forces": _forces_reason(seen),
             "start": "least squares on finite differences" if not base.start else "one linear problem",
             "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
@@ -170,6 +170,12 @@ def _structure_reason(seen: Look, as_set: bool) -> str:
     if as_set or seen.structure is None:
         return "as set" if seen.structure is None else f"as set; {seen.structure}"
     return seen.structure
+
+
+def _forces_reason(seen: Look) -> str:
+    """Why the model has the friction it has: the terms found, and whether driven data show dry friction."""
+    asked = seen.structure is None or seen.data.u is not None
+    return "; ".join(x for x in (seen.structure, seen.friction if asked else None) if x)
 
 
 def _outlier_reason(seen: Look) -> str:

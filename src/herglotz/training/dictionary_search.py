@@ -206,7 +206,7 @@ class DictionarySearch:
 
     def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
-        stages = self._stages(terms, values, substeps)
+        stages = self._stages(terms, values, substeps, self.config.sticking)
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
         return None if first is None else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))

@@ -113,7 +113,9 @@ def look(
         motion = _baseline_motion(Task(kept, base, settings, stages))
     if plan is None and named and not settings.features and terms_are_free(kept, user_settings):
         if motion is None or _fine(base):
-            plain, first = replace(settings, sticking=user_settings.sticking), base
+            # "not found" by the linear rule leaves it to the search; a user's "no" does not
+            sticks = settings.sticking or user_settings.sticking
+            plain, first = replace(settings, sticking=sticks), base
             found = kept_structure(
                 "terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages
             )
@@ -139,7 +141,9 @@ def _with_friction(
     if plan is not None or settings.sticking is not None:
         return settings, "as set"
     if kept.u is None or not plain:
-        return replace(settings, sticking=False), "asked of driven data with nothing said of level, friction, objective"
+        return replace(
+            settings, sticking=False
+        ), "sticking is looked for in driven data alone, where no setting decides"
     sticking, why = friction_holds(kept)
     return replace(settings, sticking=sticking), why
 

@@ -23,7 +23,7 @@ from herglotz.data.holds import HOLDS
 from herglotz.models import LEVELS
 from herglotz.plots.style import FORMATS
 from herglotz.scenes import scene_names
-from herglotz.training import FitConfig, load_run
+from herglotz.training import FitConfig, load_run, save_run
 from herglotz.training.config import DTYPES, OBJECTIVES, OPTIMISERS, ROBUST, SUPERVISION
 
 
@@ -274,7 +274,8 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
 
 def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # fails if such numbers pass for results
     shutil.copytree(tiny_run, tmp_path / "run")
-    metrics = json.loads((tmp_path / "run" / "metrics.json").read_text())
-    (tmp_path / "run" / "metrics.json").write_text(json.dumps({**metrics, "verdict": "does not fit: it misses 1"}))
+    result = load_run(tmp_path / "run")
+    result.metrics["verdict"] = "does not fit: it misses 1"
+    save_run(result, tmp_path / "run")
     assert main(["trust", str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
     assert "warning: the run does not fit its data" in capsys.readouterr().err

@@ -344,7 +344,7 @@ def test_no_compiler(monkeypatch):
 def test_a_file_that_is_not_ours(tmp_path):
     # fails if any text is taken for a header
     (tmp_path / "other.h").write_text("#define X 1\n")
-    with pytest.raises(InputError, match="no herglotz metadata"):
+    with pytest.raises(InputError, match="does not end with its sha256"):
         compile_c(tmp_path / "other.h")
 
 

@@ -11,6 +11,7 @@ import torch.export.pt2_archive._package
 from export_models import BOX, SMALL, model_of, states_of
 
 import herglotz.export.lower.pt2
+from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compare, export_pt2, load_pt2, weights_digest
 from herglotz.export.metadata import FORMAT
@@ -248,11 +249,11 @@ def test_unreadable_files_are_refused(written, tmp_path):
     with pytest.raises(InputError, match="no such file"):
         load_pt2(tmp_path / "nothing.pt2")
     (tmp_path / "text.pt2").write_text("not an archive")
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="does not end with its sha256"):
         load_pt2(tmp_path / "text.pt2")
     whole = written[1].read_bytes()
     (tmp_path / "half.pt2").write_bytes(whole[: len(whole) // 2])
-    with pytest.raises(InputError, match="not a readable"):
+    with pytest.raises(InputError, match="does not end with its sha256"):
         load_pt2(tmp_path / "half.pt2")
 
 
@@ -264,13 +265,17 @@ def test_files_of_others_are_refused(tmp_path):
 
     program = torch.export.export(Double(), (torch.ones(3),))
     torch.export.save(program, tmp_path / "other.pt2")
-    with pytest.raises(InputError, match="no herglotz metadata"):
+    with pytest.raises(InputError, match="does not end with its sha256"):
         load_pt2(tmp_path / "other.pt2")
+    (tmp_path / "other.pt2").write_bytes(sealed_zip((tmp_path / "other.pt2").read_bytes()))
+    with pytest.raises(InputError, match="no herglotz metadata"):
+        load_pt2(tmp_path / "other.pt2", trust_code=True)
     later = {"format": 99, "dof": 1, "dtype": "float64", "h": 0.1, "box": None}
     later |= {"newton_iterations": 2, "newton_tolerance": 0.0}
     torch.export.save(program, tmp_path / "later.pt2", extra_files={"metadata.json": json.dumps(later)})
+    (tmp_path / "later.pt2").write_bytes(sealed_zip((tmp_path / "later.pt2").read_bytes()))
     with pytest.raises(InputError, match="format 99, this herglotz reads 3"):
-        load_pt2(tmp_path / "later.pt2")
+        load_pt2(tmp_path / "later.pt2", trust_code=True)
 
 
 def test_what_cannot_be_exported_is_refused(tmp_path):
@@ -303,7 +308,9 @@ def test_what_cannot_be_exported_is_refused(tmp_path):
 def test_an_unwritable_path_is_refused(tmp_path, monkeypatch):
     # fails if torch's error reaches the user or a partial file stays behind
     monkeypatch.setattr(herglotz.export.lower.pt2, "programs_of", lambda *_: {})  # what is written does not matter here
-    monkeypatch.setattr(torch.export.pt2_archive._package, "package_pt2", lambda *_, **__: None)
+    monkeypatch.setattr(
+        torch.export.pt2_archive._package, "package_pt2", lambda f, **_: zipfile.ZipFile(f, "w").close()
+    )
     with pytest.raises(InputError, match="cannot be written"):
         export_pt2(model_of(1, "linear"), tmp_path / "nowhere" / "a.pt2", h=0.1)
     assert not list(tmp_path.iterdir())

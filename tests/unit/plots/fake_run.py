@@ -7,6 +7,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
+from herglotz.training.run import box_of
 
 
 def fake_run(
@@ -43,4 +44,5 @@ def fake_run(
     history += [{"stage": "horizon 30", "iteration": 12 + k, "cost": 90 * 0.6**k + 5} for k in range(10)]
     history += [{"stage": "whole trajectory", "iteration": 22 + k, "cost": 40 * 0.3**k + 4} for k in range(8)]
     model, data, states = model.to(dtype), data.to(dtype), State(*(x.to(dtype) for x in states))
-    return Run(model, FitConfig(level=level), {}, data, (count,) * trajectories, states, h, {}, history)
+    box = box_of(*(x.double() for x in states))
+    return Run(model, FitConfig(level=level), {}, data, (count,) * trajectories, states, h, box, history)

@@ -169,7 +169,7 @@ def test_rollout_of_recorded_inputs(exact_run, tmp_path, capsys):
     motion = load(tmp_path / "m.csv")
     torch.testing.assert_close(motion.t, data.t - data.t[0], rtol=0, atol=1e-12)
     assert float((motion.q - data.q).abs().max()) < 0.01
-    assert main([*command, "--inputs", str(tmp_path / "u.csv"), "--u", "1"]) == 2
+    assert main([*command, "--force", "--inputs", str(tmp_path / "u.csv"), "--u", "1"]) == 2
     assert "leave one out" in capsys.readouterr().err
     # from the last fitted state the inputs are those of its time: the rollout is the run's own free run
     first = exact_run.train_lengths[0] - 1

@@ -298,7 +298,7 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
     x, calls = torch.tensor([-1.2, 1.0], dtype=torch.float64), []
 
     def optimise(x, callback):
-        calls.append(x)
+        calls.append(callback.resumed)
         return levenberg_marquardt(Rosenbrock(), x, max_iterations=60, callback=callback)
 
     def broken(x, callback):
@@ -313,8 +313,10 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
     calls.clear()
     assert torch.equal(again.run("one", x, 60, optimise).x, done.x)
     assert calls == []
-    again.run("two", x, 60, optimise)
-    assert not torch.equal(calls[0], x)
+    whole = first.run("three", x, 60, optimise)
+    assert torch.equal(again.run("two", x, 60, optimise).x, whole.x)
+    assert calls[0] is None  # "three" was begun
+    assert calls[1] is not None  # "two" went on from what the search remembered
     assert [h["stage"] for h in again.history] == sorted(h["stage"] for h in again.history)
     with pytest.raises(InputError, match="belongs to other data or settings; leave out --resume"):
         Stages(False, checkpoint, "other", resume=True)

@@ -11,7 +11,7 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, ensemble_bands, fit, laplace
 
 NOISE = 0.01
-SETTINGS = FitConfig(departures=(6e-4, 2e-3))
+SETTINGS = FitConfig(departures=(6e-4, 2e-3), objective="trajectory")  # with networks, not with named terms
 
 
 @pytest.fixture(scope="module")

@@ -24,8 +24,8 @@ WAIT = """
 import sys, time, types
 import herglotz.cli as cli
 def run(arguments):
-    print("ready", flush=True)
     try:
+        print("ready", flush=True)
         time.sleep(600)
     finally:
         print("tidied", flush=True)
