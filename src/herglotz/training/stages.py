@@ -54,8 +54,8 @@ class Stages:
     """Run optimisations one after the other, and record them.
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
-    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
-    bits as one that was not interrupted, on the same machine with as many threads.
+    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives what one
+    that was not interrupted gives: to rounding, for matrix products depend on where their memory lies.
 
     Parameters
     ----------

@@ -174,7 +174,7 @@ def test_rollout_of_recorded_inputs(exact_run, tmp_path, capsys):
     # from the last fitted state the inputs are those of its time: the rollout is the run's own free run
     first = exact_run.train_lengths[0] - 1
     steps = exact_run.data.lengths[0] - 1 - first
-    command[3:] = [str(steps), "--out", str(tmp_path / "m.csv")]
+    command[3:] = [str(steps), "--force", "--out", str(tmp_path / "m.csv")]
     assert main([*command, "--inputs", str(tmp_path / "u.csv")]) == 0
     motion = load(tmp_path / "m.csv")
     torch.testing.assert_close(motion.t, data.t[first:], rtol=0, atol=1e-12)
