@@ -11,6 +11,8 @@ from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
 
+from herglotz.errors import InputError
+
 aten = torch.ops.aten
 PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)
 LARGEST = 4096  # multiples of the batch looked for in shapes: (rows · B, …)
@@ -187,7 +189,7 @@ class Recorder(TorchDispatchMode):
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func._schema.is_mutable and func not in INSTEAD:
-            raise NotImplementedError(f"{func} writes in place, which a traced function cannot do")
+            raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
         arguments, options = (self._with_batch(_map(self._moved, x)) for x in (args, kwargs))
         new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
         return new or self.graph.call_function(INSTEAD.get(func, func), arguments, options)

@@ -49,7 +49,8 @@ class Term(nn.Module):
     def force(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """Return f = −∂R/∂v, (..., n), and ∂f/∂v, (..., n, n)."""
         R = self.dissipation(coordinates(v, 2))
-        assert R is not None  # `has_force`
+        if R is None:
+            raise InputError(f"{type(self).__name__}.dissipation returned None; return a jet, or leave the method out")
         return -R.gradient.movedim(0, -1), -R.hessian().movedim((0, 1), (-2, -1))
 
 

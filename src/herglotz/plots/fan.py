@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -73,12 +73,11 @@ def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
 
     The point is one of the data of a run, or of the states that `spread_fan` starts from.
     """
-    L_d, h, names = (source.model, source.h, units(source)) if _is_run(source) else (None, h, ("", ""))
-    if L_d is None:
-        fan = spread_fan(source, 64, h)
-        L_d, h, states = fan.L_d, fan.h, fan.start
+    if _is_run(source):
+        whole = Fan(source.model, source.states, source.h if h is None else h, *units(source))
     else:
-        states = source.states
+        whole = spread_fan(source, 64, h)
+    states = whole.start
     finite = torch.isfinite(states.p).all(-1) & torch.isfinite(states.q).all(-1) & torch.isfinite(states.s)
     if not bool(finite.any()):
         raise InputError("the run has no finite state to start from; fit it again")
@@ -88,8 +87,7 @@ def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
     steps = torch.linspace(-1.0, 1.0, size, dtype=p.dtype, device=p.device)
     momenta = p.median(0).values + steps[:, None] * reach.clamp_min(1e-6)
     start = State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone())
-    assert h is not None
-    return Fan(L_d, start, h, *names)
+    return replace(whole, start=start)
 
 
 def _is_run(source: Any) -> bool:

@@ -9,7 +9,7 @@ from torch import nn
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.export import compile_c, export_onnx, export_pt2, load_exported
+from herglotz.export import compile_c, export_c, export_onnx, export_pt2, load_exported
 from herglotz.models import TERMS, ContactLagrangian, ModelConfig, Term
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, fit, load_run, save_run
@@ -154,3 +154,24 @@ def test_what_cannot_be_is_refused(change, words):
     # fails if a name is misspelt in silence, or a term is left out where it cannot act
     with pytest.raises(InputError, match=words):
         replace(PLAIN, **{"terms": ("coupling_spring",), **change})
+
+
+def test_a_term_that_cannot_be_stepped_is_named(monkeypatch, tmp_path):
+    # fails if a user's class without a dissipation function, or with an operation in place, ends in a traceback of ours
+    class Silent(Term):
+        def dissipation(self, v):  # noqa: ARG002
+            return None
+
+    class InPlace(Term):
+        def potential(self, q):
+            x = q.select(0)
+            x.value.add_(1.0)
+            return x
+
+    monkeypatch.setitem(TERMS, "silent", Silent)
+    monkeypatch.setitem(TERMS, "in place", InPlace)
+    one = torch.ones(1, 2, dtype=torch.float64)
+    with pytest.raises(InputError, match=r"Silent.dissipation returned None; return a jet"):
+        Stepper(ContactLagrangian(replace(PLAIN, terms=("silent",)))).step(State(one, one, one[:, 0]), 0.1)
+    with pytest.raises(InputError, match="writes in place"):
+        export_c(ContactLagrangian(replace(PLAIN, terms=("in place",))), tmp_path / "a.h", h=0.1)
