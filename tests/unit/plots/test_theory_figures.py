@@ -7,6 +7,7 @@ from fake_run import fake_run
 from herglotz.cli import main
 from herglotz.errors import InputError
 from herglotz.plots import IDENTITIES, save_theory_figures
+from herglotz.plots.fan import point_fan, spread_fan
 from herglotz.scenes import scene
 
 
@@ -54,3 +55,10 @@ def test_what_has_no_figure_says_why(tmp_path, source, options, message):
     with pytest.raises(InputError, match=message):
         save_theory_figures(source, tmp_path / "new", **options)
     assert not (tmp_path / "new").exists()
+
+
+def test_both_fans_of_a_run_take_the_step_that_is_asked_for():
+    # fails if one of them keeps the step of the run
+    run = fake_run(steps=12)
+    for fan in (spread_fan, point_fan):
+        assert (fan(run, 5).h, fan(run, 5, 0.05).h) == (run.h, 0.05)
