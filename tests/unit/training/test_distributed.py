@@ -27,19 +27,19 @@ distributed.LEAST = 8  # there are few rows, and each process shall have some
 found = {}
 with process_group():
     for objective, level, optimiser, iterations in (
-        ("residual", "affine", "lm", 8), ("trajectory", "linear", "lm", 40), ("smoothing", "linear", "lm", 8),
+        ("residual", "affine", "lm", 8), ("trajectory", "linear", "lm", 6), ("smoothing", "linear", "lm", 4),
         ("raw", "linear", "adam", 3)
     ):
         noise = 0.01 if objective in ("trajectory", "smoothing") else 0.0
-        data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, noise=noise, seed=0)
+        data = simulate(scene("damped_pendulum"), trajectories=2, steps=16, h=0.2, noise=noise, seed=0)
         settings = FitConfig(
             objective=objective, level=level, optimiser=optimiser, iterations=iterations, departures=(1e-3,),
-            correction_width=5, damping_width=3,
+            correction_width=5, damping_width=3, potential_width=4,
         )
         run = fit(data, settings, progress=False)
         found[objective] = torch.nn.utils.parameters_to_vector(run.model.parameters()).detach()
         found[objective + " cost"] = torch.tensor([row["cost"] for row in run.history], dtype=torch.float64)
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=16, h=0.2, seed=0)
     base = estimate_baseline(data)
     model = build_model(base, FitConfig(correction_width=5, level="linear"), "correction")
     problem = MatrixFree(ResidualProblem(model, data, sigma=1e-3, prior=prior_of(model, base, None)))
