@@ -56,8 +56,7 @@ def test_samples_far_apart_are_crossed_in_model_steps():
     data = data.select([1, 2])  # the other one turns by more than π between samples
     found = {}
     for m in (1, 4):
-        settings = FitConfig(objective="trajectory", level="linear", order=4, substeps=m, iterations=15)
-        run = fit(data, settings, progress=False)
+        run = fit(data, FitConfig(objective="trajectory", level="linear", order=4, substeps=m), progress=False)
         model: Any = run.model
         weight = float(model.potential.features.sum.coefficient.detach()[0])
         found[m] = abs(weight + 1), run.metrics["extrapolation_rms"]

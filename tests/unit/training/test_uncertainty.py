@@ -11,8 +11,7 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig, ensemble_bands, fit, laplace
 
 NOISE = 0.01
-# With networks, not with named terms; one strength of the prior, for the choice of one is no part of a posterior.
-SETTINGS = FitConfig(departures=(2e-3,), objective="trajectory", level="linear", iterations=20)
+SETTINGS = FitConfig(departures=(6e-4, 2e-3), objective="trajectory")  # with networks, not with named terms
 
 
 @pytest.fixture(scope="module")
