@@ -32,7 +32,7 @@ from herglotz import export
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_c
 from herglotz.export.c_header import c_source, read_metadata
-from herglotz.export.c_stepper import CompiledStepper
+from herglotz.export.c_stepper import compiled
 from herglotz.export.c_wrapper import FLAGS
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
@@ -233,7 +233,7 @@ def eager_rows(quick: bool) -> list[Row]:
         rows.append(row(f"Newton / explicit step, eager, n={n}, B=1", least=4, **timed))
         with tempfile.TemporaryDirectory() as folder:
             text = export_c(model, Path(folder, "a.h"), h=H).read_text()
-        newton = CompiledStepper(c_source(model, read_metadata(text, ""), "a.h", explicit=False))
+        newton = compiled(c_source(model, read_metadata(text, ""), "a.h", explicit=False))
         one, many = State(*(x[0] for x in state)), 5000 if quick else 50000
         explicit, implicit = (rolls(s, one, many) for s in (compile_c(model, h=H), newton))
         timed = alternate(explicit, implicit, 3 if quick else 9, (many, many))

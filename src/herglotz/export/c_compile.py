@@ -8,15 +8,17 @@ from typing import Any
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_stepper import CompiledStepper, compile_c, load_c
+from herglotz.export.c_stepper import compile_c
 from herglotz.export.c_wrapper import compiler
+from herglotz.export.exported import ExportedStepper
+from herglotz.export.load import load_c
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
 
 def compile(
     source: Stepper | ContactLagrangian | PathLike | Any, *, trust_code: bool = False
-) -> CompiledStepper | Stepper:
+) -> ExportedStepper | Stepper:
     """A stepper with the interface of `Stepper` that steps in C, without derivatives.
 
     Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
@@ -31,7 +33,7 @@ def compile(
 
     Returns
     -------
-    CompiledStepper or Stepper
+    ExportedStepper or Stepper
         The second where C cannot be had.
 
     Raises
