@@ -21,12 +21,14 @@ SAME = (  # what leaves its first argument as it is, wherever shape and dtype st
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
     aten.broadcast_to.default, aten.movedim.intlist,
 )  # fmt: skip
-# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value.
+# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value;
+# the sign of a complex number, which is what derivatives of |x| ask for, is that of a real one.
 INSTEAD: dict[Any, Any] = {
     aten.view.default: aten.reshape.default,
     aten._unsafe_view.default: aten.reshape.default,
     aten.sub_.Tensor: aten.sub.Tensor,
     aten.fill_.Scalar: aten.full_like.default,
+    aten.sgn.default: aten.sign.default,
 }
 
 
