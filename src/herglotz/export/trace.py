@@ -68,14 +68,6 @@ class Graph(nn.Module):
         """Evaluate at inputs."""
         return self.call(*inputs, *self.constants)
 
-    def first(self, count: int) -> Graph:
-        """The same graph with its first outputs only, and nothing that the others alone need."""
-        graph = fx.Graph()
-        outputs: Any = graph.graph_copy(self.code.graph, {})
-        graph.output(outputs[:count])
-        graph.eliminate_dead_code()
-        return Graph(*without_unused(graph, self.constants), self.batch)
-
 
 def example_batch(sizes: set[int]) -> int:
     """A prime that divides none of the sizes in the graph: wherever it shows in a shape, it is the batch."""
@@ -187,7 +179,7 @@ class Recorder(TorchDispatchMode):
         order = [node for node in graph.nodes if node.op == "placeholder"]
         kept = {place.name: value for place, value in self.constants.values()}
         _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
-        return Graph(*without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
+        return Graph(*_without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func._schema.is_mutable and func not in INSTEAD:
@@ -293,7 +285,7 @@ def _inputs_first(graph: fx.Graph, inputs: list[fx.Node], constants: list[fx.Nod
             first = node
 
 
-def without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
+def _without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
     """Constants that nobody reads are dropped; they are the last placeholders."""
     places = [node for node in graph.nodes if node.op == "placeholder"]
     places = places[len(places) - len(constants) :]
