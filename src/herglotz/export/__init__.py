@@ -1,8 +1,7 @@
 """Models as files that step on their own: `.pt2`, ONNX, machine code and C; loaded, and compared with eager."""
 
-from herglotz.export.c_compile import compile
+from herglotz.export.c_compile import compile, compile_c
 from herglotz.export.c_header import export_c
-from herglotz.export.c_stepper import compile_c
 from herglotz.export.compare import compare
 from herglotz.export.differences import DifferencedStepper
 from herglotz.export.exported import ExportedStepper

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import ctypes
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -12,10 +11,9 @@ from torch import Tensor
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, c_source, described, read_metadata
+from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata
 from herglotz.export.c_wrapper import build
 from herglotz.export.exported import ExportedStepper
-from herglotz.models import ContactLagrangian
 from herglotz.stepping import Status
 from herglotz.stepping.rollout import Track
 
@@ -115,48 +113,3 @@ def compiled(header: str, path: PathLike = "header", whole: Callable[[], str] | 
     library = CLibrary(header, path, whole)
     programs = {"init": library.init, "linearise": library.linearise}
     return ExportedStepper(programs, library.metadata, str(path), "c", library)
-
-
-def compile_c(
-    source: PathLike | ContactLagrangian,
-    *,
-    h: float = 1.0,
-    box: Mapping[str, Sequence[float]] | None = None,
-    units: Sequence[str] = (),
-    dtype: str | None = None,
-    tolerance: float | None = None,
-    trust_code: bool = False,
-) -> ExportedStepper:
-    """Compile a header that `export_c` wrote, or a model directly, and load it.
-
-    The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
-    processor. The compiler is $CC, or cc, gcc or clang from the PATH.
-
-    Parameters
-    ----------
-    source
-        A header, or a model.
-    h, box, units, dtype, tolerance
-        As in `export_c`, for a model only; dtype defaults to the model's.
-    trust_code
-        As in `load_c`, for a header only.
-
-    Returns
-    -------
-    ExportedStepper
-        A drop-in for `Stepper`.
-
-    Raises
-    ------
-    InputError
-        If there is no compiler, or the source is not usable.
-    """
-    if not isinstance(source, ContactLagrangian):
-        from herglotz.export.load import load_c
-
-        return load_c(source, trust_code=trust_code)
-    dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
-    entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
-    kept = copy.deepcopy(source)  # the model may be trained on
-    header = c_source(kept, entries, "stepper.h", derivatives=False)
-    return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))
