@@ -42,7 +42,7 @@ class Natural:
         """V = H_p, (..., n)."""
         return p / self.m
 
-    def functions(self) -> dict[str, StateFunction]:
+    def functions(self) -> dict[str, Any]:
         """The four fields of `Scene` that these are."""
         return {name: getattr(self, name) for name in ("hamiltonian", "lagrangian", "momentum", "velocity")}
 
