@@ -71,7 +71,8 @@ def test_every_decision_has_a_reason(noise):
 
 
 @pytest.mark.parametrize(
-    ("noise", "settings"), [(0.01, {}), (0.0, {}), (0.0, {"mass_width": 2, "correction_width": 3})]
+    ("noise", "settings"),
+    [(0.01, {}), (0.0, {}), pytest.param(0.0, {"mass_width": 2, "correction_width": 3}, marks=pytest.mark.slow)],
 )
 def test_a_plan_that_is_given_back_repeats_the_fit(noise, settings):
     # fails if a decision is not in the plan, is lost in JSON, or is made again by other means
