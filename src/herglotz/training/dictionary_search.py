@@ -3,13 +3,16 @@
 The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
 trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
-leave. Model steps are halved while that changes the motion by as much as the data miss it.
+leave. That criterion takes residuals for white noise. Where they are none, because a force or the rule's accuracy is
+missing, any term may take over some of it: there terms stay only if held-out blocks of time ask for them as well. Model
+steps are halved while that changes the motion by as much as the data miss it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -20,6 +23,7 @@ from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smooth_
 from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.cross_validation import beaten
 from herglotz.training.linear_start import LinearFit, NamedForces
 from herglotz.training.named_terms import (
     DRAG,
@@ -45,6 +49,7 @@ from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 ROWS = 4000  # triples in the linear problem
+COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
 LOWER = 0.99  # share of the misfit that is left where halved steps are kept
@@ -70,6 +75,20 @@ class Found:
     def rms(self) -> float:
         """Misfit of the data, in units of q."""
         return self.fit.noise
+
+    @cached_property
+    def held_out(self) -> Tensor:
+        """RMS over held-out blocks of time, (FOLDS,)."""
+        return self.fit.held_out_errors()
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the misfit goes on from sample to sample, by its autocorrelation: white noise has 0 ± 1/√N."""
+        problem = self.fit.problem
+        r = problem.misfit(self.fit.path)[problem.grid.sample.argsort()]
+        together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
+        with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
+        return float(with_next) > COLOURED / r.numel() ** 0.5
 
 
 class DictionarySearch:
@@ -111,7 +130,7 @@ class DictionarySearch:
             if name is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
-            if more is None or not more.rms < found.rms:
+            if more is None or not more.rms < found.rms or (found.coloured and not self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
         return self._pruned(found)
@@ -145,7 +164,7 @@ class DictionarySearch:
         A = X.T @ X / size / overlap
         place = self._linear_places(fit, columns)
         free = torch.tensor([i for own in place.values() for i in own])
-        kept, _ = prune(A, x[columns][1:], free, max(3, int(r.numel() / overlap)))
+        kept, _ = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
         stay = set(kept.tolist())
         terms = self.all.only([name for name, own in place.items() if stay & set(own)])
         left = columns.clone()
@@ -239,7 +258,7 @@ class DictionarySearch:
         """The fit with other terms or steps, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps)
         states = found.fit.problem.states_at(found.fit.path, problem.grid.start_sample)
-        fit = stages.optimise(problem, problem.parameters.get(), states, "terms")
+        fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
     def _missing(self, found: Found) -> str | None:
@@ -269,22 +288,40 @@ class DictionarySearch:
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by."""
+        terms = self._needed(found)
+        if terms != found.terms:
+            less = self._refit(found, terms)
+            count = self.data.q.numel()
+            allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
+            if less is not None and less.rms <= allowed * max(found.rms, self.floor):
+                found = less
+        while found.terms.names and found.coloured:  # the criterion keeps too many: held-out blocks decide
+            terms = self._needed(found, one_less=True)
+            less = None if terms == found.terms else self._refit(found, terms)
+            less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
+            if less is None or self._beaten(less, found):
+                break
+            found = less
+        return found
+
+    def _beaten(self, found: Found, other: Found) -> bool:
+        """Whether the other one errs less over held-out blocks, beyond their spread and rounding."""
+        return beaten(found.held_out.clamp_min(self.floor), other.held_out.clamp_min(self.floor))
+
+    def _needed(self, found: Found, *, one_less: bool = False) -> NamedTerms:
+        """The terms that the quadratic model of the fit needs, or all without the one that it needs least."""
         problem = found.fit.problem
         at = places(problem.parameters, found.terms)
         if not at:
-            return found
+            return found.terms
         x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])
         _, A, _ = problem.normal_equations(x)
         A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
         free = torch.tensor([i for own in at.values() for i in own])
-        kept, _ = prune(A, x, free, self.data.q.numel())
-        stay = set(kept.tolist())
-        terms = found.terms.only([name for name, own in at.items() if stay & set(own)])
-        if terms == found.terms:
-            return found
-        less = self._refit(found, terms)
-        allowed = (1 + len(at) * math.log(self.data.q.numel()) / self.data.q.numel()) ** 0.5
-        return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+        count = self.data.q.numel()  # steps half as long lower what the rule misses by 2 to the power of its order
+        worth, least = (4**self.order * count, len(free) - 1) if one_less else (math.log(count), 0)
+        stay = set(prune(A, x, free, worth, least)[0].tolist())
+        return found.terms.only([name for name, own in at.items() if stay & set(own)])
 
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
