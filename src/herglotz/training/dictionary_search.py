@@ -19,20 +19,15 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
-from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smooth_triples, smoothed
-from herglotz.models.jet import pairs
+from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
-from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.linear_terms import LinearTerms
 from herglotz.training.named_terms import (
-    DRAG,
     DRY,
-    MOVING,
-    STILL,
     NamedTerms,
     candidates,
-    own_terms,
     places,
     settings_of,
     started,
@@ -48,7 +43,6 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
-ROWS = 4000  # triples in the linear problem
 COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
@@ -108,7 +102,6 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
-        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
         self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
@@ -117,14 +110,14 @@ class DictionarySearch:
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
         local = local_polynomials(self.data)
-        linear = None if local is None else self._linear(local)
+        linear = None if local is None else LinearTerms(self.data, self.base, self.all).start(local)
         if linear is None or local is None:
             return None
         terms, values = linear
         found = self._grown(terms, values, 1, smoothed(self.data, local))
         if found is None:
             return None
-        found = self._finer(self._held(found))
+        found = self._finer(self._held(self._simpler(found)))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
@@ -133,7 +126,7 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms or (found.coloured and not self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._pruned(found)
+        return self._last_terms(self._pruned(found))
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
@@ -141,72 +134,6 @@ class DictionarySearch:
             return found
         other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
         return found if other is None or not other.rms < found.rms else self._longer(other)
-
-    def _linear(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
-        """Terms and values of the linear problem, pruned."""
-        t, u = smooth_triples(self.data, local)
-        rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
-        if len(t) > ROWS:
-            t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed, u)
-        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
-        columns = self._columns(fit)
-        x = fit.solve(columns)
-        if float(x[0]) == 0:
-            return None
-        x = x / x[0]
-        r = fit.errors(x)
-        if not bool(torch.isfinite(r).all()):
-            return None
-        X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
-        size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
-        overlap = max(1.0, local.width / 2)
-        A = X.T @ X / size / overlap
-        place = self._linear_places(fit, columns)
-        free = torch.tensor([i for own in place.values() for i in own])
-        kept, _ = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
-        stay = set(kept.tolist())
-        terms = self.all.only([name for name, own in place.items() if stay & set(own)])
-        left = columns.clone()
-        at = columns.nonzero()[1:, 0]
-        for name, own in place.items():
-            if name not in terms.names:
-                left[at[own]] = False
-        start = fit.start(fit.solve(left))
-        if start is None:
-            return None
-        values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
-        for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            values |= zip(names, values.pop(parameter, ()), strict=True)
-        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
-        return terms, values
-
-    @property
-    def _still(self) -> list[str]:
-        return [x for x in self.all.features if "v" not in x and x not in self.own]
-
-    @property
-    def _moving(self) -> list[str]:
-        return [x for x in self.all.features if "v" in x]
-
-    def _columns(self, fit: LinearFit) -> Tensor:
-        """All columns for joints; no mass or friction between lengths."""
-        if any(self.data.angles):
-            return torch.ones(len(fit.names), dtype=torch.bool)
-        i, j = pairs(self.data.dof, torch.device("cpu"))
-        diagonal = iter((i == j).tolist())
-        return torch.tensor([next(diagonal) if x == "mass" else x != "coupling.viscous" for x in fit.names])
-
-    def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
-        """Columns of each term among those that are used, the first mass not counted."""
-        names = [x for x, used in zip(fit.names, columns.tolist(), strict=True) if used][1:]
-        at: dict[str, list[int]] = {}
-        for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            own = [i for i, x in enumerate(names) if x == parameter]
-            at |= {term: [i] for term, i in zip(terms, own, strict=True)}
-        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
-        at[DRY] = [i for i, x in enumerate(names) if x == DRY]
-        return at
 
     def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
@@ -287,16 +214,30 @@ class DictionarySearch:
         return next(name for name in names if int(others[best]) in at[name])
 
     def _pruned(self, found: Found) -> Found:
-        """Without the terms that the fit does not lose by."""
-        terms = self._needed(found)
-        if terms != found.terms:
-            less = self._refit(found, terms)
-            count = self.data.q.numel()
-            allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
-            if less is not None and less.rms <= allowed * max(found.rms, self.floor):
-                found = less
-        while found.terms.names and found.coloured:  # the criterion keeps too many: held-out blocks decide
-            terms = self._needed(found, one_less=True)
+        """Without the terms that the fit does not lose by, were residuals white noise."""
+        count = self.data.q.numel()
+        terms = self._needed(found, math.log(count))
+        less = None if terms == found.terms else self._refit(found, terms)
+        allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
+        return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+
+    def _simpler(self, found: Found) -> Found:
+        """Without terms that make up for steps that are too long, where residuals are no noise."""
+        count = self.data.q.numel()
+        for worth in (
+            4**self.order * count,
+            count,
+        ):  # as much as halved steps may bring, then twice the misfit
+            terms = self._needed(found, worth)
+            less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
+            if less is not None and (self._too_long(less) or not self._beaten(less, found)):
+                return less
+        return found
+
+    def _last_terms(self, found: Found) -> Found:
+        """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
+        while found.terms.names and found.coloured:
+            terms = self._needed(found, 4**self.order * self.data.q.numel(), one_less=True)
             less = None if terms == found.terms else self._refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
             if less is None or self._beaten(less, found):
@@ -308,8 +249,8 @@ class DictionarySearch:
         """Whether the other one errs less over held-out blocks, beyond their spread and rounding."""
         return beaten(found.held_out.clamp_min(self.floor), other.held_out.clamp_min(self.floor))
 
-    def _needed(self, found: Found, *, one_less: bool = False) -> NamedTerms:
-        """The terms that the quadratic model of the fit needs, or all without the one that it needs least."""
+    def _needed(self, found: Found, worth: float, *, one_less: bool = False) -> NamedTerms:
+        """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least."""
         problem = found.fit.problem
         at = places(problem.parameters, found.terms)
         if not at:
@@ -318,23 +259,24 @@ class DictionarySearch:
         _, A, _ = problem.normal_equations(x)
         A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
         free = torch.tensor([i for own in at.values() for i in own])
-        count = self.data.q.numel()  # steps half as long lower what the rule misses by 2 to the power of its order
-        worth, least = (4**self.order * count, len(free) - 1) if one_less else (math.log(count), 0)
-        stay = set(prune(A, x, free, worth, least)[0].tolist())
+        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0)[0].tolist())
         return found.terms.only([name for name, own in at.items() if stay & set(own)])
 
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
-        while True:
-            m = found.config.substeps
-            if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
-                return found
-            if self._change(found, 2 * m) <= max(FINER * found.rms, self.floor):
-                return found
-            other = self._refit(found, found.terms, 2 * m)
+        while self._too_long(found):
+            other = self._refit(found, found.terms, 2 * found.config.substeps)
             if other is None or not other.rms < LOWER * found.rms:
-                return found  # other values of the parameters make up for the longer steps
+                break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
+        return found
+
+    def _too_long(self, found: Found) -> bool:
+        """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
+        m = found.config.substeps
+        if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
+            return False
+        return self._change(found, 2 * m) > max(FINER * found.rms, self.floor)
 
     def _change(self, found: Found, substeps: int) -> float:
         """RMS change of the fitted motion by so many model steps in a recorded one."""
