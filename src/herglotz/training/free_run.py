@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.inputs import step_inputs
 from herglotz.training.objectives import Fitted
-from herglotz.training.problems.grid import segment_grid, substeps
+from herglotz.training.problems.grid import SegmentGrid, segment_grid, substeps
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import solve_path
 
@@ -47,19 +48,29 @@ def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_
     u = None if data.u is None else data.u[rows]
     rest = replace(data, t=data.t[rows], q=data.q[rows], u=u, s=None, p=None, lengths=lengths)
     grid = segment_grid(rest, rest.samples, max_step)
-    problem = ShootingProblem(fitted.model, rest, grid, sigma=1.0)
-    problem.u = None if problem.u is None else data.inputs_of_steps(rows[grid.row], grid.part)
-    problem.guess_from_states(states_of_pairs(fitted.model, rest))
-    assert problem.path is not None
-    start, tol = out[rows[grid.start_sample]], 64 * torch.finfo(out.dtype).eps
-    with torch.no_grad():
-        theta = problem.parameters.get()
-        path = solve_path(problem.parameters, theta, start, grid.h, problem.path.x, tol, u=problem.u)
-    if path is None or not bool(torch.isfinite(path.x).all()):
+    inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
+    nodes = near_data(fitted.model, rest, grid, out[rows[grid.start_sample]], inputs)
+    if nodes is None:
         return None
     out = out.clone()
-    out[rows[grid.sample]] = path.x.flatten(0, 1)[grid.node]
+    out[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
     return out
+
+
+def near_data(
+    model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None
+) -> Tensor | None:
+    """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1), all steps solved at once.
+
+    Newton's iteration starts from the recorded positions; None where that does not converge: the runs are elsewhere.
+    """
+    problem = ShootingProblem(model, data, grid, sigma=1.0)
+    with torch.no_grad():
+        problem.guess_from_states(states_of_pairs(model, data))
+        assert problem.path is not None
+        tol = 64 * torch.finfo(start.dtype).eps
+        path = solve_path(problem.parameters, problem.parameters.get(), start, grid.h, problem.path.x, tol, u=u)
+    return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
 
 
 def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> tuple[Tensor, str]:

@@ -44,7 +44,7 @@ def held(monkeypatch):
 
     def winner(named, networks):
         errors.update({"none": named, "potential": networks})
-        return rivals.held_out_winner(data, FitConfig(), Stages(False, None, "", resume=False), seen)
+        return rivals.held_out_winner(data, FitConfig(), Stages(False, None, "", resume=False), seen)  # type: ignore[arg-type]
 
     return SimpleNamespace(winner=winner, looks=looks)
 
