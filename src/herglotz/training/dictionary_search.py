@@ -22,7 +22,7 @@ from herglotz.data.roughness import precision
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.cross_validation import beaten
+from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_terms import LinearTerms
 from herglotz.training.named_terms import (
     DRY,
@@ -153,6 +153,7 @@ class DictionarySearch:
     def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
         stages = self._stages(terms, values, substeps, self.config.sticking)
+        stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
         return None if first is None else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
@@ -230,7 +231,7 @@ class DictionarySearch:
         ):  # as much as halved steps may bring, then twice the misfit
             terms = self._needed(found, worth)
             less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
-            if less is not None and (self._too_long(less) or not self._beaten(less, found)):
+            if less is not None and (self._too_long(less) or self._as_good(less, found)):
                 return less
         return found
 
@@ -240,14 +241,22 @@ class DictionarySearch:
             terms = self._needed(found, 4**self.order * self.data.q.numel(), one_less=True)
             less = None if terms == found.terms else self._refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
-            if less is None or self._beaten(less, found):
+            if less is None or not self._as_good(less, found):
                 break
             found = less
         return found
 
+    def _as_good(self, less: Found, found: Found) -> bool:
+        """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
+        return less.rms <= 2**0.5 * max(found.rms, self.floor) and not self._beaten(less, found)
+
     def _beaten(self, found: Found, other: Found) -> bool:
-        """Whether the other one errs less over held-out blocks, beyond their spread and rounding."""
-        return beaten(found.held_out.clamp_min(self.floor), other.held_out.clamp_min(self.floor))
+        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding.
+
+        Their spread has no say: it is wide where errors grow with time, as on an axis without a spring.
+        """
+        own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
+        return not own <= MARGIN * its
 
     def _needed(self, found: Found, worth: float, *, one_less: bool = False) -> NamedTerms:
         """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least."""

@@ -121,6 +121,7 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
+        self.hurried = False  # stages before the last end where they gain less than 1 %
 
     def fit(
         self,
@@ -157,11 +158,12 @@ class SegmentStages:
         """Minimise from these parameters and segment states, `near` the minimum or not; None where no path is found."""
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
-        total = min(self.task.config.iterations, STAGE)
+        total, last = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
+        rtol, patience = (1e-2, 1) if self.hurried and not last else (1e-4, 3)
         result = self.task.stages.run(
             name + self.label, x, total,
             lambda x, callback: levenberg_marquardt(
-                target, x, max_iterations=total, rtol=1e-4, patience=3, damping=NEAR if near else FAR_OFF,
+                target, x, max_iterations=total, rtol=rtol, patience=patience, damping=NEAR if near else FAR_OFF,
                 callback=callback,
             ),
             problem,
