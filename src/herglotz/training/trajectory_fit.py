@@ -195,11 +195,11 @@ class SegmentStages:
         rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
         return trial if rest is None else rest
 
-    def whole(self, first: TrajectoryFit) -> TrajectoryFit | None:
-        """Whole trajectories at once, from parameters that are known well; None where that misses far more."""
+    def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
+        """Whole trajectories at once, from parameters that are known well; None where that misses far more than σ."""
         used = None if bool(first.problem.used.all()) else first.problem.used
         found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, used)
-        most = LOST * max(first.noise, FLOOR * self.task.size)
+        most = LOST * max(first.noise, sigma, FLOOR * self.task.size)
         return None if found is None or found.noise > most else found
 
     def grow(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit:
@@ -251,9 +251,9 @@ def fit_trajectories(
     departures = stages.task.config.departures
     first = stages.robust_or_not(first, known=known)
     if model.potential.network is None:  # no prior to choose
-        last = stages.whole(first) or stages.grow(first, sigma)
+        last = stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma)
         return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
-    last = (stages.whole(first) if known else None) or stages.grow(first, sigma)
+    last = (stages.whole(first, sigma) if known else None) or stages.grow(first, sigma)
     previous, noise = last, last.noise
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
