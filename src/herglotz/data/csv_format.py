@@ -83,7 +83,7 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
             if line.startswith("#"):
                 said.extend(match[1] for match in [re.fullmatch(HOLD, line.strip())] if match)
             elif not line.isspace():
-                if "_" in line or len(line) > LONG:
+                if len(line) > LONG:
                     raise ValueError(line[:SHOWN])
                 yield line
 
