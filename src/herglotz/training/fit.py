@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
+from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
@@ -83,6 +84,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = as_trajectories(data, **reading)
+    check_sizes(data.source or "data", data.q, data.names)
     with nullcontext() if out is None else locked(out):
         return _fit(data, config, plan, out, progress, resume)
 
