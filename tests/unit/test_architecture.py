@@ -10,8 +10,10 @@ SOURCE = Path(__file__).resolve().parents[2] / "src" / "herglotz"
 # A ← B: B may import A. Rooms between two bars may not import one another; errors, settings and threads serve all.
 ORDER = "mechanics|models|stepping|theory|scenes|data|training|export|tune|verify|plots|report|cli"
 LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.split()}
-RUNTIME = {"torch", "numpy", "matplotlib", "tqdm", "herglotz"} | set(sys.stdlib_module_names)
-# Extras that only some users install, with the files that may import them; but for the regressor, inside functions.
+RUNTIME = {"torch", "numpy", "matplotlib", "PIL", "tqdm", "herglotz"} | set(
+    sys.stdlib_module_names
+)  # PIL comes with matplotlib
+# Extras that only some users install, with the files that may import them: inside functions, but for the regressor.
 EXTRAS = {
     "onnx": ("export/lower/onnx*.py", "export/load.py"),
     "onnxruntime": ("export/lower/onnx*.py", "export/load.py"),
