@@ -9,10 +9,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
 from herglotz.scenes.natural import scene_without_closed_form
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float = 9.81, gamma: float = 0.1) -> Scene:
@@ -36,9 +34,7 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     InputError
         If a mass or the length is not positive.
     """
-    for name, value in (("cart", cart), ("m", m), ("length", length)):
-        if not value > 0:
-            raise InputError(f"cart_pole: {name} must be > 0, got {value}")
+    require_positive("cart_pole", cart=cart, m=m, length=length)
     first, third = cart + m, m * length * length
 
     def second(q: Tensor) -> Tensor:
@@ -61,9 +57,6 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
         determinant = first * third - between * between
         return torch.stack([third * px - between * pt, first * pt - between * px], -1) / determinant[..., None]
 
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * (p * velocity(q, p, s)).sum(-1) + potential(q) + gamma * s
-
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         turn = -m * length * torch.sin(q[..., 1]) * (v[..., 0] * v[..., 1] + g)
         return torch.stack([torch.zeros_like(turn), turn], -1)
@@ -71,18 +64,14 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     return scene_without_closed_form(
         name="cart_pole",
         description="pendulum that hangs from a cart, one length and one angle; reference flow to about 1e-13",
-        dof=2,
         coordinates=("x", "theta"),
         units=("m", "rad"),
-        time_unit="s",
-        angles=(False, True),
         parameters={"cart": cart, "m": m, "length": length, "g": g, "gamma": gamma},
-        hamiltonian=hamiltonian,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
         force=force,
-        rate=constant_rate(-gamma),
+        rate=-gamma,
         q_range=((-0.5, -1.2), (0.5, 1.2)),
         v_range=((-0.5, -2.0), (0.5, 2.0)),
         h=0.05,

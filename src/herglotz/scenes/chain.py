@@ -10,10 +10,8 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
-from herglotz.scenes.natural import Natural, scene_without_closed_form
-from herglotz.scenes.rules import strang
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5, gamma: float = 0.1) -> Scene:
@@ -42,9 +40,7 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
     """
     if masses < 1 or masses != int(masses):
         raise InputError(f"chain: masses must be a whole number >= 1, got {masses}")
-    for name, value in (("mass m", m), ("stiffness k", k)):
-        if not value > 0:
-            raise InputError(f"chain: {name} must be > 0, got {value}")
+    require_positive("chain", mass_m=m, stiffness_k=k)
     if not beta >= 0:
         raise InputError(f"chain: hardening beta must be >= 0, got {beta}")
     n = int(masses)
@@ -58,27 +54,20 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
         d2 = stretches(q) ** 2
         return (d2 * (0.5 * k + 0.25 * beta * d2)).sum(-1)
 
-    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
+    def slope(q: Tensor) -> Tensor:
         d = stretches(q)
-        return torch.diff(d * (k + beta * d * d))
+        return -torch.diff(d * (k + beta * d * d))
 
-    system = Natural(potential, gamma, m)
-    return scene_without_closed_form(
+    return natural_scene(
+        potential,
+        slope,
+        gamma,
+        m,
         name="chain",
         description="masses between two walls, hardening springs, one damping rate; reference flow to about 1e-13",
-        dof=n,
         coordinates=tuple(f"x{i + 1}" for i in range(n)),
         units=("m",) * n,
-        time_unit="s",
-        angles=(False,) * n,
         parameters={"masses": n, "m": m, "k": k, "beta": beta, "gamma": gamma},
-        hamiltonian=system.hamiltonian,
-        lagrangian=system.lagrangian,
-        momentum=system.momentum,
-        velocity=system.velocity,
-        force=force,
-        rate=constant_rate(-gamma),
-        rules={"strang": strang(potential, m, gamma)},
         q_range=(-0.5, 0.5),
         v_range=(-0.5, 0.5),
         h=0.2,

@@ -10,7 +10,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.scenes.motion import constant_rate
 from herglotz.scenes.natural import scene_without_closed_form
 from herglotz.scenes.scene import Scene
 
@@ -45,9 +44,6 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         (p1, p2), C = p.unbind(-1), torch.cos(q[..., 0] - q[..., 1])
         return torch.stack([p1 - C * p2, 2 * p2 - C * p1], -1) / (2 - C * C)[..., None]
 
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * (p * velocity(q, p, s)).sum(-1) + potential(q) + gamma * s
-
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         twist = torch.sin(q[..., 0] - q[..., 1]) * v[..., 0] * v[..., 1]
         weight = g * torch.sin(q)
@@ -56,18 +52,14 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
     return scene_without_closed_form(
         name="double_pendulum",
         description="damped double pendulum, m = ℓ = 1; no closed form, reference flow to about 1e-13",
-        dof=2,
         coordinates=("theta1", "theta2"),
         units=("rad", "rad"),
-        time_unit="s",
-        angles=(True, True),
         parameters={"g": g, "gamma": gamma},
-        hamiltonian=hamiltonian,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
         force=force,
-        rate=constant_rate(-gamma),
+        rate=-gamma,
         q_range=(-1.2, 1.2),
         v_range=(-1.5, 1.5),
         h=0.05,

@@ -16,8 +16,7 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Forced
 from herglotz.scenes.forced import External, ForcedRule
-from herglotz.scenes.motion import constant_rate
-from herglotz.scenes.natural import Natural, scene_without_closed_form
+from herglotz.scenes.natural import Natural, natural_scene
 from herglotz.scenes.rules import RULES, strang
 from herglotz.scenes.scene import Scene, State
 
@@ -101,18 +100,11 @@ def driven_scene(
     rules["strang"] = DrivenRule(lambda u: forced(strang(potential_at(u), m, gamma)), amplitude)
 
     def scene_at(u: Tensor | float) -> Scene:
-        system = system_at(u)
-
-        def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-            return (u[..., None] if isinstance(u, Tensor) else u) - slope(q)
-
-        made = scene_without_closed_form(
-            hamiltonian=system.hamiltonian,
-            lagrangian=system.lagrangian,
-            momentum=system.momentum,
-            velocity=system.velocity,
-            force=force,
-            rate=constant_rate(-gamma),
+        made = natural_scene(
+            potential_at(u),
+            lambda q: slope(q) - (u[..., None] if isinstance(u, Tensor) else u),
+            gamma,
+            m,
             rules=rules,
             at=lambda u: scene_at(u[..., 0]),
             drive=drive,

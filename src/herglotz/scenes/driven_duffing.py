@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.scenes.driven import driven_scene
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def driven_duffing(
@@ -32,8 +31,7 @@ def driven_duffing(
     InputError
         If β ≤ 0.
     """
-    if not beta > 0:
-        raise InputError(f"driven_duffing: cubic stiffness beta must be > 0, got {beta}")
+    require_positive("driven_duffing", cubic_stiffness_beta=beta)
 
     def potential(q: Tensor) -> Tensor:
         x2 = q[..., 0] ** 2
@@ -47,11 +45,8 @@ def driven_duffing(
         frequency,
         name="driven_duffing",
         description="hardening spring under a given force, ẍ = −γẋ − kx − βx³ + u; reference flow to about 1e-13",
-        dof=1,
         coordinates=("x",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={"k": k, "beta": beta, "gamma": gamma, "amplitude": amplitude, "frequency": frequency},
         q_range=(-0.8, 0.8),
         v_range=(-0.8, 0.8),

@@ -8,9 +8,7 @@ from __future__ import annotations
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
-from herglotz.scenes.natural import Natural, scene_without_closed_form
-from herglotz.scenes.rules import strang
+from herglotz.scenes.natural import natural_scene
 from herglotz.scenes.scene import Scene
 
 
@@ -40,26 +38,15 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
         x2 = q[..., 0] ** 2
         return x2 * (0.5 * k + 0.25 * beta * x2)
 
-    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return -q * (k + beta * q * q)
-
-    system = Natural(potential, gamma)
-    return scene_without_closed_form(
+    return natural_scene(
+        potential,
+        lambda q: q * (k + beta * q * q),
+        gamma,
         name="duffing",
         description="oscillator with a hardening spring, ẍ = −γẋ − kx − βx³; reference flow to about 1e-13",
-        dof=1,
         coordinates=("x",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={"k": k, "beta": beta, "gamma": gamma},
-        hamiltonian=system.hamiltonian,
-        lagrangian=system.lagrangian,
-        momentum=system.momentum,
-        velocity=system.velocity,
-        force=force,
-        rate=constant_rate(-gamma),
-        rules={"strang": strang(potential, 1.0, gamma)},
         q_range=(-0.5, 0.5),
         v_range=(-0.4, 0.4),
         h=0.1,

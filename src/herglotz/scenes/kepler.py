@@ -9,11 +9,8 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
-from herglotz.scenes.natural import Natural, scene_without_closed_form
-from herglotz.scenes.rules import strang
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
@@ -33,32 +30,21 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
     InputError
         If m ≤ 0.
     """
-    if not m > 0:
-        raise InputError(f"kepler: mass m must be > 0, got {m}")
+    require_positive("kepler", mass_m=m)
 
     def potential(q: Tensor) -> Tensor:
         return -k / (q * q).sum(-1).sqrt()
 
-    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return -k * q * (q * q).sum(-1, keepdim=True) ** -1.5
-
-    system = Natural(potential, gamma, m)
-    return scene_without_closed_form(
+    return natural_scene(
+        potential,
+        lambda q: k * q * (q * q).sum(-1, keepdim=True) ** -1.5,
+        gamma,
+        m,
         name="kepler",
         description="planar Kepler problem with linear drag; no closed form, reference flow to about 1e-13",
-        dof=2,
         coordinates=("x", "y"),
         units=("m", "m"),
-        time_unit="s",
-        angles=(False, False),
         parameters={"m": m, "k": k, "gamma": gamma},
-        hamiltonian=system.hamiltonian,
-        lagrangian=system.lagrangian,
-        momentum=system.momentum,
-        velocity=system.velocity,
-        force=force,
-        rate=constant_rate(-gamma),
-        rules={"strang": strang(potential, m, gamma)},
         q_range=((0.8, -0.3), (1.2, 0.3)),
         v_range=((-0.2, 0.8), (0.2, 1.2)),
         h=0.1,

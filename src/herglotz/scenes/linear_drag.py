@@ -10,10 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics import Partials
+from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules
-from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, expm1w
 
 
@@ -67,15 +67,9 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
 
     Source: section 3 of `docs/mathematics.md`.
     """
-    if not m > 0:
-        raise InputError(f"linear_drag: mass m must be > 0, got {m}")
+    require_positive("linear_drag", mass_m=m)
     L_d = ExactLinearDrag(m, gamma)
-
-    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return 0.5 * m * (v * v).sum(-1) - gamma * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return (p * p).sum(-1) / (2 * m) + gamma * s
+    system = Natural(lambda q: torch.zeros_like(q[..., 0]), gamma, m)
 
     def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
         """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""
@@ -98,20 +92,14 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
     return Scene(
         name="linear_drag",
         description="linear drag, q̈ = −γq̇, in closed form",
-        dof=1,
         coordinates=("q",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={"m": m, "gamma": gamma},
-        hamiltonian=hamiltonian,
-        lagrangian=lagrangian,
-        momentum=lambda q, v, s: m * v,  # noqa: ARG005
-        velocity=lambda q, p, s: p / m,  # noqa: ARG005
+        **system.functions(),
         flow=flow,
         L_d=L_d,
         exact=True,
-        L_d_rules=all_rules(lagrangian),
+        L_d_rules=all_rules(system.lagrangian),
         q_range=(-1.0, 1.0),
         v_range=(-1.0, 1.0),
         h=0.1,

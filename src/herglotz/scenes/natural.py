@@ -1,4 +1,4 @@
-"""Short forms of a scene: a constant mass with one damping rate, and a scene without a closed form."""
+"""Short forms of a scene: one without a closed form, and of these the one of a constant mass and one damping rate."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from torch import Tensor
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.scenes.exact import exact_discrete_lagrangian
 from herglotz.scenes.forced import External, ForcedRule
-from herglotz.scenes.motion import herglotz_motion
+from herglotz.scenes.motion import constant_rate, herglotz_motion
 from herglotz.scenes.reference import reference_flow
-from herglotz.scenes.rules import all_rules
+from herglotz.scenes.rules import all_rules, strang
 from herglotz.scenes.scene import Scene, StateFunction
 
 
@@ -42,6 +42,10 @@ class Natural:
         """V = H_p, (..., n)."""
         return p / self.m
 
+    def functions(self) -> dict[str, Any]:
+        """The four fields of `Scene` that these are."""
+        return {name: getattr(self, name) for name in ("hamiltonian", "lagrangian", "momentum", "velocity")}
+
 
 def scene_without_closed_form(
     *,
@@ -49,7 +53,8 @@ def scene_without_closed_form(
     momentum: StateFunction,
     velocity: StateFunction,
     force: StateFunction,
-    rate: StateFunction,
+    rate: StateFunction | float,
+    hamiltonian: StateFunction | None = None,
     rules: Mapping[str, DiscreteLagrangian] | None = None,
     external: External | None = None,
     **fields: Any,
@@ -59,8 +64,10 @@ def scene_without_closed_form(
     Parameters
     ----------
     force, rate
-        L_q(q, v, s), (..., n), and L_s(q, v, s), (...): written out, so that the flow is fast and differentiable. The
-        tests hold them to `contact_vector_field` of the Hamiltonian.
+        L_q(q, v, s), (..., n), and L_s(q, v, s), (...), or its constant value: written out, so that the flow is fast
+        and differentiable. The tests hold them to `contact_vector_field` of the Hamiltonian.
+    hamiltonian
+        H(q, p, s); by default p·v − L(q, v, s) at v = `velocity`(q, p, s).
     rules
         Discretisations beside the general ones of `rules.py`, or instead of those of the same name.
     external
@@ -68,7 +75,7 @@ def scene_without_closed_form(
     fields
         The other fields of `Scene`.
     """
-    general = all_rules(lagrangian)
+    general, rate = all_rules(lagrangian), rate if callable(rate) else constant_rate(rate)
     if external is None:
         motion = herglotz_motion(lagrangian, momentum, velocity, force, rate)
     else:
@@ -76,7 +83,13 @@ def scene_without_closed_form(
         whole = lambda q, v, s: force(q, v, s) + external(q, v)  # noqa: E731
         motion = herglotz_motion(lagrangian, momentum, velocity, whole, rate)
     offered = {**general, **(rules or {})}
+
+    def energy(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        v = velocity(q, p, s)
+        return (p * v).sum(-1) - lagrangian(q, v, s)
+
     return Scene(
+        hamiltonian=hamiltonian or energy,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
@@ -86,5 +99,37 @@ def scene_without_closed_form(
         L_d_rules=offered,
         numerical=None if external else exact_discrete_lagrangian(motion),
         external=external,
+        **fields,
+    )
+
+
+def natural_scene(
+    potential: Callable[[Tensor], Tensor],
+    slope: Callable[[Tensor], Tensor],
+    gamma: float,
+    m: float = 1.0,
+    *,
+    rules: Mapping[str, DiscreteLagrangian] | None = None,
+    **fields: Any,
+) -> Scene:
+    """The scene of L = m|v|²/2 − V(q) − γs.
+
+    Parameters
+    ----------
+    potential, slope
+        V(q), (...), and its gradient, (..., n).
+    gamma, m
+        Damping rate, and mass.
+    rules
+        Discretisations beside the general ones; by default the composition `strang`.
+    fields
+        The other fields of `Scene`.
+    """
+    system = Natural(potential, gamma, m)
+    return scene_without_closed_form(
+        **system.functions(),
+        force=lambda q, v, s: -slope(q),  # noqa: ARG005
+        rate=-gamma,
+        rules={"strang": strang(potential, m, gamma)} if rules is None else rules,
         **fields,
     )

@@ -39,10 +39,6 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
         p1, p2, m = p[..., 0] + drag * s, p[..., 1], 1 + 0.3 * torch.sin(q[..., 0])
         return torch.stack([1.2 * p1 - 0.2 * p2, m * p2 - 0.2 * p1], -1) / (1.2 * m - 0.04)[..., None]
 
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        v = velocity(q, p, s)
-        return (p * v).sum(-1) - lagrangian(q, v, s)
-
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         q1, q2 = q.unbind(-1)
         wave = torch.sin(q1 * q2)
@@ -55,13 +51,10 @@ def nonlinear_action(damping: float = 1.0) -> Scene:
     return scene_without_closed_form(
         name="nonlinear_action",
         description="two degrees of freedom, nonlinear in s; no closed form, reference flow to about 1e-13",
-        dof=2,
         coordinates=("q1", "q2"),
         units=("1", "1"),
         time_unit="1",
-        angles=(False, False),
         parameters={"damping": damping},
-        hamiltonian=hamiltonian,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,

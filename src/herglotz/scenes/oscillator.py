@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics import Partials
 from herglotz.scenes.natural import Natural
 from herglotz.scenes.rules import all_rules, strang
-from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 
@@ -90,8 +89,7 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
 
     Source: section 3 of `docs/mathematics.md`.
     """
-    if not m > 0:
-        raise InputError(f"damped_oscillator: mass m must be > 0, got {m}")
+    require_positive("damped_oscillator", mass_m=m)
     L_d = ExactOscillator(m, omega0, gamma)
     stiffness = m * omega0**2
 
@@ -131,16 +129,10 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
     return Scene(
         name="damped_oscillator",
         description="damped harmonic oscillator, q̈ = −ω₀²q − γq̇, in closed form at any damping",
-        dof=1,
         coordinates=("q",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={"m": m, "omega0": omega0, "gamma": gamma},
-        hamiltonian=system.hamiltonian,
-        lagrangian=system.lagrangian,
-        momentum=system.momentum,
-        velocity=system.velocity,
+        **system.functions(),
         flow=flow,
         L_d=L_d,
         exact=True,

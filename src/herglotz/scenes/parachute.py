@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
 from herglotz.scenes.rules import all_rules
-from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 
@@ -90,8 +90,7 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
 
     Source: section 3 and erratum E9 of `docs/mathematics.md`.
     """
-    if not m > 0:
-        raise InputError(f"parachute: mass m must be > 0, got {m}")
+    require_positive("parachute", mass_m=m)
     if lam == 0:
         raise InputError(f"parachute: drag lam must not be 0, got {lam}; without drag use a value such as 1e-6")
     L_d = ExactParachute(m, g, lam)
@@ -169,11 +168,8 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
     return Scene(
         name="parachute",
         description="fall with quadratic drag, q̈ = λq̇² − g, in closed form; damping depends on the motion",
-        dof=1,
         coordinates=("q",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={"m": m, "g": g, "lam": lam},
         hamiltonian=hamiltonian,
         lagrangian=lagrangian,

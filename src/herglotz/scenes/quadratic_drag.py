@@ -10,7 +10,7 @@ from dataclasses import replace
 
 from herglotz.errors import InputError
 from herglotz.scenes.parachute import parachute
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
@@ -30,8 +30,7 @@ def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
 
     Source: section 3 of `docs/mathematics.md`; the parachute's formulas, which are analytic in λg, at g = 0.
     """
-    if not m > 0:
-        raise InputError(f"quadratic_drag: mass m must be > 0, got {m}")
+    require_positive("quadratic_drag", mass_m=m)
     if lam == 0:
         raise InputError(f"quadratic_drag: drag lam must not be 0, got {lam}; without drag use a value such as 1e-6")
     return replace(

@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
 from herglotz.scenes.natural import scene_without_closed_form
 from herglotz.scenes.scene import Scene
 
@@ -71,14 +70,9 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
         yaw = (sr * O2 + cr * O3) / cp
         return torch.stack([O1 + sp * yaw, cr * O2 - sr * O3, yaw], -1)
 
-    def kinetic(O: Tensor) -> Tensor:  # noqa: E741
-        return 0.5 * (inertia(O) * O * O).sum(-1)
-
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return kinetic(body_velocity(q, v)) - gamma * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return kinetic(body_momentum(q, p) / inertia(p)) + gamma * s
+        turning = body_velocity(q, v)
+        return 0.5 * (inertia(v) * turning * turning).sum(-1) - gamma * s
 
     def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         """L_q = JΩ·Ω_q, with Ω_φ = (0, Ω3, −Ω2) and no yaw in L."""
@@ -90,18 +84,14 @@ def rigid_body(J1: float = 3.0, J2: float = 2.0, J3: float = 1.0, gamma: float =
     return scene_without_closed_form(
         name="rigid_body",
         description="free rigid body with one damping rate, in roll, pitch and yaw; reference flow to about 1e-13",
-        dof=3,
         coordinates=("roll", "pitch", "yaw"),
         units=("rad", "rad", "rad"),
-        time_unit="s",
-        angles=(True, True, True),
         parameters={"J1": J1, "J2": J2, "J3": J3, "gamma": gamma},
-        hamiltonian=hamiltonian,
         lagrangian=lagrangian,
         momentum=momentum,
         velocity=velocity,
         force=force,
-        rate=constant_rate(-gamma),
+        rate=-gamma,
         q_range=((-1.0, -0.4, -1.0), (1.0, 0.4, 1.0)),
         v_range=((0.8, -0.2, -0.2), (1.2, 0.2, 0.2)),
         h=0.1,

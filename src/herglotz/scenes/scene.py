@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 
 StateFunction = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -53,11 +54,8 @@ class Scene:
 
     name: str
     description: str
-    dof: int
     coordinates: tuple[str, ...]
     units: tuple[str, ...]
-    time_unit: str
-    angles: tuple[bool, ...]
     parameters: Mapping[str, float]
     hamiltonian: StateFunction
     lagrangian: StateFunction
@@ -70,6 +68,7 @@ class Scene:
     q_range: Range
     v_range: Range
     h: float
+    time_unit: str = "s"
     H_plus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
     H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
     numerical: DiscreteLagrangian | None = None
@@ -79,6 +78,23 @@ class Scene:
     external: Callable[[Tensor, Tensor], Tensor] | None = None
 
     @property
+    def dof(self) -> int:
+        """The number n of coordinates."""
+        return len(self.coordinates)
+
+    @property
+    def angles(self) -> tuple[bool, ...]:
+        """Which coordinates are angles: those in rad."""
+        return tuple(unit == "rad" for unit in self.units)
+
+    @property
     def L_d_exact(self) -> DiscreteLagrangian | None:
         """The exact discrete Lagrangian: `L_d` where it is one, else the numerical one, else None."""
         return self.L_d if self.exact else self.numerical
+
+
+def require_positive(scene: str, **numbers: float) -> None:
+    """Refuse a parameter of a scene that is not positive; blanks in its name are written as `_`."""
+    for name, value in numbers.items():
+        if not value > 0:
+            raise InputError(f"{scene}: {name.replace('_', ' ')} must be > 0, got {value}")

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.scenes.driven import driven_scene
-from herglotz.scenes.scene import Scene, State, Step
+from herglotz.scenes.scene import Scene, State, Step, require_positive
 
 # L_d has no set-valued force: below this share of the default speed range its dry friction is smoothed, as tanh.
 SMOOTHED = 0.01
@@ -58,8 +58,7 @@ def servo_axis(
     InputError
         If the mass is not positive or a friction is negative.
     """
-    if not m > 0:
-        raise InputError(f"servo_axis: mass m must be > 0, got {m}")
+    require_positive("servo_axis", mass_m=m)
     for name, value in (("viscous", viscous), ("dry", dry)):
         if not value >= 0:
             raise InputError(f"servo_axis: {name} friction must be >= 0, got {value}")
@@ -79,11 +78,8 @@ def servo_axis(
         flow=flow,
         name="servo_axis",
         description="motor axis with dry friction and sticking, no spring, in closed form between reversals",
-        dof=1,
         coordinates=("x",),
         units=("m",),
-        time_unit="s",
-        angles=(False,),
         parameters={
             "m": m, "viscous": viscous, "dry": dry, "offset": offset, "amplitude": amplitude, "frequency": frequency,
         },

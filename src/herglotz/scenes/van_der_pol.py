@@ -6,12 +6,8 @@ with x. No closed form: the reference flow is the answer.
 
 from __future__ import annotations
 
-from torch import Tensor
-
-from herglotz.errors import InputError
-from herglotz.scenes.motion import constant_rate
-from herglotz.scenes.natural import Natural, scene_without_closed_form
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.natural import natural_scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def van_der_pol(mu: float = 1.0) -> Scene:
@@ -29,35 +25,19 @@ def van_der_pol(mu: float = 1.0) -> Scene:
 
     Source: B. van der Pol, On relaxation-oscillations, Phil. Mag. 2 (1926) 978.
     """
-    if not mu > 0:
-        raise InputError(f"van_der_pol: mu must be > 0, got {mu}")
+    require_positive("van_der_pol", mu=mu)
 
-    def potential(q: Tensor) -> Tensor:
-        return 0.5 * q[..., 0] ** 2
-
-    def force(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return -q
-
-    def external(q: Tensor, v: Tensor) -> Tensor:
-        return mu * (1.0 - q * q) * v
-
-    system = Natural(potential, 0.0)
-    return scene_without_closed_form(
+    return natural_scene(
+        lambda q: 0.5 * q[..., 0] ** 2,
+        lambda q: q,
+        0.0,
+        rules={},
         name="van_der_pol",
         description="self-excited oscillator, ẍ = μ(1 − x²)ẋ − x; reference flow to about 1e-13",
-        dof=1,
         coordinates=("x",),
         units=("1",),
-        time_unit="s",
-        angles=(False,),
         parameters={"mu": mu},
-        hamiltonian=system.hamiltonian,
-        lagrangian=system.lagrangian,
-        momentum=system.momentum,
-        velocity=system.velocity,
-        force=force,
-        rate=constant_rate(0.0),
-        external=external,
+        external=lambda q, v: mu * (1.0 - q * q) * v,
         q_range=(-2.0, 2.0),
         v_range=(-1.5, 1.5),
         h=0.1,
