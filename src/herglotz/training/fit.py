@@ -14,6 +14,7 @@ from typing import Any
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.lock import locked
+from herglotz.data.units import DEGREES
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
@@ -110,6 +111,8 @@ def _fit(
         task = Task(seen.kept, seen.base, seen.settings, stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
     run.metrics["equation"] = _equation(run, plan).as_dict()
+    if degrees := [name for name, _, unit in data.columns if name in data.names and unit in DEGREES]:
+        run.metrics["degrees"] = degrees  # the model has radians; errors are told in degrees too
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 
