@@ -7,8 +7,8 @@
 # %%
 import herglotz as hz
 
-data = hz.simulate(hz.scene("double_pendulum"), trajectories=6, steps=100, h=0.04, seed=0)
-run = hz.fit(data, features="pendulums", order=4)
+data = hz.simulate(hz.scene("double_pendulum"), trajectories=4, steps=60, h=0.04, seed=0)
+run = hz.fit(data, level="linear", features="pendulums", order=4)
 print(run.summary())
 
 # %% [markdown]
