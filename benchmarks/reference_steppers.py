@@ -1,4 +1,4 @@
-"""The same step in other hands, for `stepper.py`: plain C, JAX, and torch.func."""
+"""The same step in other hands, for `stepper.py`: plain C and JAX."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from torch import Tensor
 from herglotz.export.c_wrapper import compiler
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import Kinetic
-from herglotz.stepping import State
 
 HAND_FLAGS = ("-std=c99", "-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
 
@@ -157,27 +156,3 @@ def jax_rollout(model: ContactLagrangian, iterations: int) -> Callable[..., Any]
         return batched(*arrays, dtype(h), steps).block_until_ready()
 
     return rollout
-
-
-def func_step(model: ContactLagrangian, iterations: int) -> Callable[[State, float], State]:
-    """One step by torch.func: grad and jacfwd of the plain value, under vmap; the batch is (B, n)."""
-    from torch.func import grad, jacfwd, vmap
-
-    def value(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        return model.partials(q0, q1, s0, h, 1).L
-
-    def equation(q1: Tensor, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        return grad(value, 0)(q0, q1, s0, h) + (1 + grad(value, 2)(q0, q1, s0, h)) * p0
-
-    def one(q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        q1 = q0
-        for _ in range(iterations):
-            F, J = equation(q1, q0, p0, s0, h), jacfwd(equation)(q1, q0, p0, s0, h)
-            q1 = q1 - torch.linalg.solve_ex(J, F)[0]
-        return q1, grad(value, 1)(q0, q1, s0, h), s0 + value(q0, q1, s0, h)
-
-    def step(state: State, h: float) -> State:
-        all_h = torch.full_like(state.s, h)
-        return State(*vmap(one)(*state, all_h))
-
-    return step

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import os
-import resource
 import statistics
 import sys
 import tempfile
@@ -27,18 +26,16 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 import herglotz
 from benchmarks import harness
 from benchmarks.harness import seconds
-from benchmarks.reference_steppers import func_step, hand_written, jax_rollout
+from benchmarks.reference_steppers import hand_written, jax_rollout
 from herglotz import export
 from herglotz.errors import InputError
-from herglotz.export import compile_c, export_c
-from herglotz.export.c_header import c_source, read_metadata
-from herglotz.export.c_stepper import CompiledStepper
+from herglotz.export import compile_c
+from herglotz.export.c_stepper import CLibrary
 from herglotz.export.c_wrapper import FLAGS
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 
 H = 0.1
-LEVELS = ("conservative", "linear", "affine", "forced", "full", "mass")
 Row = dict[str, Any]
 
 
@@ -219,129 +216,20 @@ def against_eager(name: str, model: ContactLagrangian, form: Any, steps: int) ->
     return row(f"{name} against eager over {steps} steps, float64", 1e-12, value=worst)
 
 
-def eager_rows(quick: bool) -> list[Row]:
-    """The eager step against torch.func, and what Newton costs where the step is explicit."""
-    rows, few, repeats = [], 3 if quick else 10, 3 if quick else 7
-    state, stepper, func = start(2, 1, torch.float64), Stepper(model_of(2, 16)), func_step(model_of(2, 16), 3)
-    ours, theirs = (lambda f=f: [f(state, H) for _ in range(few)] for f in (stepper.step, func))
-    timed = alternate(ours, theirs, repeats, (few, few))
-    rows.append(row("torch.func step / eager step, n=2, 16x2, B=1", least=15, **timed))
-    for n in (1, 2, 8):
-        model, state, steps = model_of(n, 0), start(n, 1, torch.float64), 30 if quick else 200
-        explicit, implicit = (rolls(s, state, steps) for s in (Stepper(model), Stepper(model, explicit=False)))
-        timed = alternate(explicit, implicit, repeats, (steps, steps))
-        rows.append(row(f"Newton / explicit step, eager, n={n}, B=1", least=4, **timed))
-        with tempfile.TemporaryDirectory() as folder:
-            text = export_c(model, Path(folder, "a.h"), h=H).read_text()
-        newton = CompiledStepper(c_source(model, read_metadata(text, ""), "a.h", explicit=False))
-        one, many = State(*(x[0] for x in state)), 5000 if quick else 50000
-        explicit, implicit = (rolls(s, one, many) for s in (compile_c(model, h=H), newton))
-        timed = alternate(explicit, implicit, 3 if quick else 9, (many, many))
-        what = f"Newton / explicit step, C, n={n}, B=1 (Newton starts at the solution: one evaluation, no more)"
-        rows.append(row(what, least=2, **timed))
+def derivatives(quick: bool) -> list[Row]:
+    """A step with its Jacobian in C against a step of a rollout over the same motion, both sample by sample."""
+    rows, steps, times = [], 100, 20 if quick else 200
+    for width in (0, 16):
+        ours, one = compile_c(model_of(2, width), h=H), start(2, 1, torch.float64)
+        assert isinstance(ours.loop, CLibrary)
+        roll, (q, p, s, *_) = ours.loop.prepared(*one, torch.full((1, steps), H, dtype=torch.float64))
+        roll()
+        states = State(*(x[0, 1:].repeat(times, *(1,) * (x.ndim - 2)) for x in (q, p, s)))
+        again = lambda roll=roll: [roll() for _ in range(times)]  # noqa: E731
+        timed = alternate(again, lambda o=ours, x=states: o.linearise(x, H), 9, (steps * times, steps * times))
+        what = f"{width}x2" if width else "explicit"
+        rows.append(row(f"C, step with Jacobian / step of a rollout, n=2, {what}, float64", 3, **timed))
     return rows
-
-
-def agreement(quick: bool) -> list[Row]:
-    """C against eager after 1000 steps of a damped scene; float32 against float64 with the same weights."""
-    rows, steps = [], 100 if quick else 1000
-    for level in LEVELS:
-        model, state = model_of(2, 6, level), start(2, 2, torch.float64)
-        try:
-            ours = compile_c(model, h=H)
-        except InputError as error:
-            rows.append(row(f"C against eager, {level}", 1e-12, note=str(error).split(";")[0]))
-            continue
-        finals = [rolls(form, state, steps)().final for form in (ours, Stepper(model, tol=4e-16))]
-        worst = max(_relative(a, b) for a, b in zip(*finals, strict=True))
-        rows.append(row(f"C against eager after {steps} steps, {level}, float64", 1e-12, value=worst))
-        single, h = model_of(2, 6, level).float(), float(torch.tensor(H))
-        small = State(*(x.float() for x in state))
-        exact = compile_c(model_of(2, 6, level).float().double(), h=h)
-        exact = exact.rollout(*(x.double() for x in small), h=h, steps=steps).final
-        for name, form in (("C", compile_c(single, h=H)), ("eager", Stepper(single))):
-            worst = max(_relative(a, b) for a, b in zip(rolls(form, small, steps)().final, exact, strict=True))
-            rows.append(row(f"{name} float32 against float64 after {steps} steps, {level}", 1e-5, value=worst))
-    return rows
-
-
-def sizes(quick: bool) -> list[Row]:
-    """Time and memory over n and B."""
-    rows = []
-    for n in (1, 8) if quick else (1, 2, 4, 8, 16, 32, 64):
-        model = model_of(n, 16)
-        ours, eager = compile_c(model, h=H), Stepper(model)
-        for batch in (1, 256) if quick else (1, 16, 256, 4096, 65536):
-            steps = max(2, min(2000, 400_000 // (batch * n * n)))
-            state, repeats = start(n, batch, torch.float64), 3 if n * batch <= 8 * 65536 else 1
-            took = min(seconds(rolls(ours, state, steps)) for _ in range(repeats))
-            found = {"n": n, "B": batch, "c_us": 1e6 * took / steps / batch, "steps": steps}
-            found["output_bytes_per_trajectory"] = 8 * ((steps + 1) * (2 * n + 2) + steps) + steps
-            found["peak_mb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-            if batch <= 256 and n <= 8:
-                found["eager_us"] = 1e6 * min(seconds(rolls(eager, state, 3)) for _ in range(2)) / 3 / batch
-            rows.append(found)
-    return rows
-
-
-def exponents(curve: list[Row]) -> list[Row]:
-    """The x of time ~ B^x for each n, by least squares over B >= 256, where the cost of a call is nothing."""
-    rows = []
-    for n in sorted({r["n"] for r in curve}):
-        mine = [(math.log(r["B"]), math.log(r["B"] * r["c_us"])) for r in curve if r["n"] == n and r["B"] >= 256]
-        if len(mine) > 1:
-            x = statistics.linear_regression(*zip(*mine, strict=True)).slope
-            largest = max(r["B"] for r in curve if r["n"] == n)
-            what = f"C, time ~ B^x from B=256 to {largest}, n={n}: x"
-            rows.append(row(what, 1.1, least=0.9, value=x))
-    return rows
-
-
-def gpu(quick: bool) -> list[Row]:
-    """Eager, compiled and CUDA-graph steps as a fraction of the measured rate of matrix products."""
-    if not torch.cuda.is_available():
-        return [row("GPU step", note="no GPU on this machine")]
-    device, rows = torch.device("cuda"), []
-    model = model_of(2, 64, dtype=torch.float32).to(device).requires_grad_(False)
-    a = torch.randn(8192, 4096, device=device)
-    rate = 2 * 8192 * 4096**2 / _cuda_seconds(lambda: a @ a[:4096])
-    step = export.StepModule(model, 4)
-    # evaluations · multiply-add · (value, gradient, two tangents of both) · weights
-    flops = 4 * 2 * 6 * (7 * 64 + 64 * 64)
-    for batch in (1000, 10_000) if quick else (1000, 10_000, 100_000, 1_000_000):
-        arguments = [x.to(device) for x in (*start(2, batch, torch.float32), torch.full((batch,), H))]
-        forms: dict[str, Callable[[], Any]]
-        forms = {
-            name: lambda f=f, x=arguments: f(*x) for name, f in (("eager", step), ("compiled", torch.compile(step)))
-        }
-        with torch.no_grad():
-            for _ in range(3):
-                step(*arguments)
-            torch.cuda.synchronize()
-            graph = torch.cuda.CUDAGraph()
-            try:
-                with torch.cuda.graph(graph):
-                    step(*arguments)
-                forms["CUDA graph"] = graph.replay
-            except RuntimeError as error:
-                rows.append(row(f"GPU CUDA graph, B={batch}", note=str(error).splitlines()[0][:100]))
-        for name, form in forms.items():
-            took = _cuda_seconds(form)
-            what, share = f"GPU {name} step, n=2, 64x2, float32, B={batch}", flops * batch / took / rate
-            rows.append(row(what, unit="ms", value=took * 1e3, fraction_of_gemm=share))
-    return rows
-
-
-def _cuda_seconds(run: Callable[[], Any], repeats: int = 10) -> float:
-    with torch.no_grad():
-        for _ in range(3):
-            run()
-        torch.cuda.synchronize()
-        begin = time.perf_counter()
-        for _ in range(repeats):
-            run()
-        torch.cuda.synchronize()
-    return (time.perf_counter() - begin) / repeats
 
 
 def _relative(a: torch.Tensor, b: torch.Tensor) -> float:
@@ -367,7 +255,7 @@ def table(rows: list[Row]) -> str:
     return "\n".join(harness.table(("what", "measured", "range", "µs a step: ours, other", "target", "met"), cells))
 
 
-PARTS = (against_hand, against_jax, long_rollout, other_formats, other_levels, eager_rows, agreement, gpu, sizes)
+PARTS = (against_hand, against_jax, long_rollout, other_formats, other_levels, derivatives)
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -376,19 +264,12 @@ def main(argv: list[str] | None = None) -> None:
     arguments = parser.parse_args(argv)
     os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
     path, found = harness.json_file(arguments, "stepper"), harness.conditions("jax", "onnxruntime")
-    rows, curve = [], []
+    rows = []
     for part in (bar := tqdm([p for p in PARTS if not arguments.only or p.__name__ in arguments.only])):
         bar.set_description(part.__name__)
-        if part is sizes:
-            curve = sizes(arguments.quick)
-            rows += exponents(curve)
-        else:
-            rows += part(arguments.quick)
-        found |= {"flags": FLAGS, "h": H, "quick": arguments.quick, "rows": rows, "sizes": curve}
-        harness.store(path, found, table(rows))
+        rows += part(arguments.quick)
+        harness.store(path, found | {"flags": FLAGS, "h": H, "quick": arguments.quick, "rows": rows}, table(rows))
     print(table(rows))
-    for r in curve:
-        print({k: round(v, 3) for k, v in r.items()})
 
 
 if __name__ == "__main__":

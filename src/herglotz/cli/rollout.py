@@ -18,7 +18,7 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from herglotz.export import CompiledStepper, ExportedStepper
+    from herglotz.export import ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
 
 DESCRIPTION = """\
@@ -39,7 +39,7 @@ SUFFIXES = (".pt2", ".onnx", ".h")
 class Source:
     """A model that can be stepped, with the start, labels and box that its file holds."""
 
-    stepper: Stepper | ExportedStepper | CompiledStepper
+    stepper: Stepper | ExportedStepper
     start: State | None
     t0: float
     h: float

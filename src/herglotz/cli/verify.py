@@ -101,7 +101,7 @@ def _draw(target: Any, folder: Path) -> None:
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:
     """Open a file; a C header of a run that is at hand is generated again, and opened where it is the same text."""
     from herglotz.export import load_c, load_exported
-    from herglotz.export.c_stepper import read_header
+    from herglotz.export.load import read_header
     from herglotz.training import load_run
 
     if path.suffix.lower() in (".csv", ".npz", ".txt"):

@@ -1,22 +1,27 @@
-"""`hz.compile`: the fastest stepper that this machine can offer for a model."""
+"""A model compiled and loaded at once: `hz.compile`, the fastest stepper that this machine can offer, and C itself."""
 
 from __future__ import annotations
 
+import copy
 import os
 import warnings
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_stepper import CompiledStepper, compile_c, load_c
+from herglotz.export.c_header import c_source, described
+from herglotz.export.c_stepper import compiled
 from herglotz.export.c_wrapper import compiler
+from herglotz.export.exported import ExportedStepper
+from herglotz.export.load import load_c
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
 
 def compile(
     source: Stepper | ContactLagrangian | PathLike | Any, *, trust_code: bool = False
-) -> CompiledStepper | Stepper:
+) -> ExportedStepper | Stepper:
     """A stepper with the interface of `Stepper` that steps in C, without derivatives.
 
     Compiled once: the library is kept in ~/.cache/herglotz/c by the hash of the model. Without a C compiler, or for a
@@ -31,7 +36,7 @@ def compile(
 
     Returns
     -------
-    CompiledStepper or Stepper
+    ExportedStepper or Stepper
         The second where C cannot be had.
 
     Raises
@@ -69,3 +74,46 @@ def compile(
 def _fall_back(eager: Stepper, reason: str) -> Stepper:
     warnings.warn(f"hz.compile: stepping in PyTorch instead of C: {reason}", RuntimeWarning, stacklevel=3)
     return eager
+
+
+def compile_c(
+    source: PathLike | ContactLagrangian,
+    *,
+    h: float = 1.0,
+    box: Mapping[str, Sequence[float]] | None = None,
+    units: Sequence[str] = (),
+    dtype: str | None = None,
+    tolerance: float | None = None,
+    trust_code: bool = False,
+) -> ExportedStepper:
+    """Compile a header that `export_c` wrote, or a model directly, and load it.
+
+    The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
+    processor. The compiler is $CC, or cc, gcc or clang from the PATH.
+
+    Parameters
+    ----------
+    source
+        A header, or a model.
+    h, box, units, dtype, tolerance
+        As in `export_c`, for a model only; dtype defaults to the model's.
+    trust_code
+        As in `load_c`, for a header only.
+
+    Returns
+    -------
+    ExportedStepper
+        A drop-in for `Stepper`.
+
+    Raises
+    ------
+    InputError
+        If there is no compiler, or the source is not usable.
+    """
+    if not isinstance(source, ContactLagrangian):
+        return load_c(source, trust_code=trust_code)
+    dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
+    entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
+    kept = copy.deepcopy(source)  # the model may be trained on
+    header = c_source(kept, entries, "stepper.h", derivatives=False)
+    return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

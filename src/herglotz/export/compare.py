@@ -33,7 +33,7 @@ def compare(
     Parameters
     ----------
     exported
-        `ExportedStepper` or `CompiledStepper`.
+        The stepper of a file.
     stepper
         The eager stepper of the same model, in the same dtype.
     batches

@@ -19,7 +19,6 @@ from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
 from herglotz.stepping.stick_slip import StickSlip
 
 HELD = 2  # tensors that set-valued friction adds to an iteration: K and w/K
-LEAN = 6  # outputs of `StepEquation` that every Newton iteration needs
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
 # u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
 
@@ -37,11 +36,6 @@ class Terms:
         else:
             self.equation = maker.at(q, p, s, h, u[0] if u else None, True, Field(*here))
 
-    @property
-    def whole(self) -> bool:
-        """Whether what a step gains is known at evaluated points only."""
-        return isinstance(self.equation, PartialsEquation)
-
     def __call__(self, x: Tensor, second: bool) -> Point:
         """F, and J if `second`, at Δ = x."""
         return self.equation(x, second)
@@ -53,15 +47,6 @@ class Terms:
         """
         form = self.equation
         return form.end(x, point) if isinstance(form, PartialsEquation) else form.end_without_field(form.at(x, point))
-
-    def leap(self, q: Tensor) -> Tensor:
-        """A first guess of Δ."""
-        return torch.zeros_like(q) if isinstance(self.equation, PartialsEquation) else self.equation.leap()
-
-    def kinetic(self, x: Tensor) -> Tensor:
-        """J⁻¹ x with the kinetic part of J alone."""
-        assert isinstance(self.equation, StepOfModel)
-        return self.equation.over_kinetic(x)
 
 
 class StepEquation(nn.Module):
@@ -144,11 +129,6 @@ class Equations:
         if not self.model.capabilities.by_terms:
             return None
         return traced(FieldAt(self.model), example(self.model, 0.1)[:1])
-
-    @cached_property
-    def newton(self) -> Graph:
-        """`StepEquation` without J."""
-        return self.slopes.first(LEAN)
 
     @cached_property
     def slopes(self) -> Graph:

@@ -11,31 +11,43 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.export.box import Box
-from herglotz.export.inputs import check_every, check_inputs, check_range, check_state, checked_h, decimated, spread_h
-from herglotz.stepping import Linearised, Rollout, State, Status, Step, step_sizes
-from herglotz.stepping.state import check_started
+from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
+from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
+from herglotz.stepping.events import Watch
+from herglotz.stepping.rollout import Plan, Track, without_lost_factors
+from herglotz.stepping.state import check_rows, check_started
 
 Program = Callable[..., tuple[Tensor, ...]]
+# (q (B, n), p (B, n), s (B,), h (B, K)[, u (B, K, m)]) → K steps, in any memory layout
+Loop = Callable[..., Track]
+FILES = {"pt2": "a .pt2", "aoti": "an AOTInductor", "onnx": "an ONNX", "c": "a C"}
 
 
-class ExportedStepper:
+class ExportedStepper(OneStepMethod):
     """The flow Φ̃ of an exported model; results are those of `Stepper`.
 
     Parameters
     ----------
     programs
         What the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) → K steps, and
-        where the format has them `model`, one differentiable step, and `init`.
+        where the format has them `model`, one differentiable step, `linearise` and `init`.
     metadata
         The file's own description: model, dof, dtype, h, units, angles, box, versions, weights_sha256.
     path
         Where it came from, for messages.
     kind
-        "pt2", "aoti" or "onnx".
+        "pt2", "aoti", "onnx" or "c".
+    loop
+        K steps, of a format that has no program `rollout`. It needs no inputs where none act.
     """
 
     def __init__(
-        self, programs: Mapping[str, Program], metadata: dict[str, Any], path: str = "exported model", kind: str = "pt2"
+        self,
+        programs: Mapping[str, Program],
+        metadata: dict[str, Any],
+        path: str = "exported model",
+        kind: str = "pt2",
+        loop: Loop | None = None,
     ):
         self.programs = dict(programs)
         self.metadata = metadata
@@ -45,6 +57,10 @@ class ExportedStepper:
         self.inputs: int = metadata.get("inputs", 0)
         self.dtype: torch.dtype = getattr(torch, metadata["dtype"])
         self.h: float = metadata["h"]
+        self.loop = scanned(self.programs["rollout"]) if loop is None else loop
+        self._idle: Tensor | None = None  # the inputs that do not act, for programs that want some
+        if loop is None and self.inputs:
+            self._idle = torch.tensor(metadata.get("input_zero") or [0.0] * self.inputs, dtype=self.dtype)
         box = metadata["box"]
         self._box = None if box is None else Box(box, metadata.get("angles", [False] * self.dof), self.dtype)
 
@@ -64,14 +80,13 @@ class ExportedStepper:
             As `step`, and where the format holds no such program.
         """
         if "init" not in self.programs:
-            raise InputError(f"{self.path}: an {self.kind} file starts from (q, p, s) only; use a .pt2 file for init")
+            raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
         self._check(q0, q1, s0, ("q0", "q1", "s0"))
-        h = self._checked_h(h)
-        p, s = self.programs["init"](*self._flat(State(q0, q1, s0), spread_h(h, s0), u))
+        p, s = self.programs["init"](*map(plain, self._flat(State(q0, q1, s0), h, u)))
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
 
-    def step(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Step:
+    def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step.
 
         Parameters
@@ -80,6 +95,8 @@ class ExportedStepper:
             (q, p, s) with shapes (..., n), (..., n), (...), in the dtype of the file.
         h
             Time step > 0, scalar or (...).
+        guess
+            Taken for the sake of `Stepper`'s signature; the file has its own guess.
         u
             (..., m) inputs, for a model that takes some; None: no input acts.
 
@@ -93,81 +110,15 @@ class ExportedStepper:
         InputError
             If a shape, the dtype or a value is not what the file takes.
         """
-        q, p, s = state
-        self._check(q, p, s)
-        h = spread_h(self._checked_h(h), s)
+        del guess
+        self._check(*state)
         flat = self._flat(state, h, u)
-        if "model" in self.programs:
-            out = self.programs["model"](*flat)
-        else:
-            out = tuple(x[0] for x in self.programs["rollout"](*flat[:3], *(x[None] for x in flat[3:])))
-        return self._step(out, state)
-
-    def _step(self, out: Sequence[Tensor], state: State) -> Step:
-        """The outputs of a program as a step of the shape of `state`."""
-        q, _, s = state
-        q1, p1, s1, c, residual, status, *outside = out
-        new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
-        c, residual, status, *outside = (x.reshape(s.shape) for x in (c, residual, status, *outside))
-        return Step(new, c, status, residual, self.metadata["newton_iterations"], *outside)
-
-    def rollout(
-        self,
-        q: Tensor,
-        p: Tensor,
-        s: Tensor | None = None,
-        *,
-        h: Tensor | float,
-        steps: int | None = None,
-        inputs: Tensor | None = None,
-        every: int = 1,
-    ) -> Rollout:
-        """Step K times from (q, p, s), inside the file; everything after a failed step is NaN. No derivatives.
-
-        Parameters
-        ----------
-        q, p, s
-            (..., n), (..., n), (...); s defaults to 0.
-        h
-            A scalar for equal steps, (K,) for steps shared by the batch, or (..., K).
-        steps
-            K; needed for a scalar h without inputs only.
-        inputs
-            (K, m) or (..., K, m): u_k of each step, for a model that takes some; None: no input acts.
-        every
-            Keep each m-th state only; m divides K. Statuses, residuals and flags are the worst of the m steps.
-
-        Raises
-        ------
-        InputError
-            As `step`, and if the length of h and `steps` disagree.
-        """
-        s = torch.zeros_like(q[..., 0]) if s is None else s
-        self._check(q, p, s)
-        if inputs is not None and inputs.ndim < 2:
-            raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
-        if inputs is not None and steps is None and torch.as_tensor(h).ndim == 0:
-            steps = inputs.shape[-2]
-        h_all = step_sizes(self._checked_h(h), steps)
-        steps, size = h_all.shape[-1], s.numel()
-        check_every(every, steps)
-        rows = [spread_h(h_all[..., k], s).reshape(-1) for k in range(steps)] if h_all.ndim > 1 else []
-        h_rows = torch.stack(rows) if rows else h_all.reshape(-1, 1).expand(steps, size)
-        more = tuple(x.reshape(size, steps, -1).transpose(0, 1) for x in self._inputs(inputs, (*s.shape, steps)))
-        start = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1))
-        with torch.no_grad():
-            out = self.programs["rollout"](*(_plain(x) for x in (*start, h_rows, *more)))
-        q_all, p_all, s_all, c, *rest = (x.movedim(0, 1).reshape(*s.shape, *_tail(x)) for x in out)
-        status, residual, outside = rest[1], rest[0], (rest[2] if len(rest) > 2 else None)
-        sigma = torch.cat([torch.ones_like(s)[..., None], c], -1).cumprod(-1)
-        lost = ~torch.isfinite(sigma[..., 1:])  # σ is no number of the file's: too large a one is found here
-        status = torch.where(lost & (status == 0), int(Status.DIVERGED), status).to(torch.uint8)
-        nan = torch.where(lost, torch.nan, torch.zeros_like(c))
-        sigma = torch.cat([sigma[..., :1], sigma[..., 1:] + nan], -1)
-        ends = (q_all + nan[..., None], p_all + nan[..., None], s_all + nan)
-        q, p, s = (torch.cat([x.unsqueeze(s.ndim), y], s.ndim) for x, y in zip((q, p, s), ends, strict=True))
-        found = Rollout(q=q, p=p, s=s, sigma=sigma, status=status, residual=residual, outside=outside)
-        return decimated(found, every)
+        if self.differentiable:
+            return self._step(self.programs["model"](*map(plain, flat)), state)
+        track = self._with_box(self.loop(*flat[:3], *(x[:, None] for x in flat[3:])))
+        outside = () if track.outside is None else (track.outside[:, 0],)
+        new = (x[:, 1] for x in (*track.states, track.sigma))
+        return self._step((*new, track.residual[:, 0], track.status[:, 0], *outside), state)
 
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
         """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
@@ -181,6 +132,7 @@ class ExportedStepper:
         -------
         Linearised
             The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du.
+            NaN where the step failed.
 
         Raises
         ------
@@ -188,12 +140,11 @@ class ExportedStepper:
             As `step`, and where the format holds no derivative.
         """
         if "linearise" not in self.programs:
-            raise InputError(f"{self.path}: an {self.kind} file holds no derivative; use a .pt2, ONNX or C file")
+            raise InputError(f"{self.path}: {self._file} file holds no derivative; use a .pt2, ONNX or C file")
         state = State(*(x.detach() for x in state))
         self._check(*state)
-        h = spread_h(self._checked_h(h), state.s)
         with torch.no_grad():
-            *out, J = self.programs["linearise"](*self._flat(state, h, u))
+            *out, J = self.programs["linearise"](*map(plain, self._flat(state, h, u)))
         J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1
         by_input = J[..., size + 1 :] if self.inputs else None
         return Linearised(self._step(out, state), J[..., :size], J[..., size], by_input)
@@ -204,11 +155,65 @@ class ExportedStepper:
         Raises
         ------
         InputError
-            If the file records no box.
+            If the file records no box, or the state is not of its shape or dtype.
         """
         if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
+        check_state(*state, self.dof, self.dtype, finite=False)
         return self._box(*state)
+
+    def _roll_out(
+        self,
+        start: State,
+        h: Tensor | float,
+        steps: int | None,
+        inputs: Tensor | None = None,
+        watch: Watch | None = None,
+        **plan: Any,
+    ) -> Track:
+        """K steps inside the file, without derivatives."""
+        if watch is not None:
+            raise InputError(f"{self._file} file has no events; use herglotz.Stepper")
+        every, batch = plan["every"], start.s.shape
+        h_all = step_sizes(self._checked_h(h), steps)
+        steps = h_all.shape[-1]
+        Plan(steps, every)
+        h_all = (
+            h_all.expand(*batch, steps)
+            if h_all.ndim == 1
+            else spread_h(h_all, start.s[..., None].expand(*batch, steps))
+        )
+        flat = (x.reshape(-1, *x.shape[len(batch) :]) for x in (*start, h_all, *self._inputs(inputs, (*batch, steps))))
+        with torch.no_grad():
+            track = self._with_box(without_lost_factors(self.loop(*flat)))
+        return _decimated(track, every, batch)
+
+    def _with_box(self, track: Track) -> Track:
+        """With the flag of every step that starts or ends outside, where the loop has not set it."""
+        if self._box is None or track.outside is not None:
+            return track
+        there = self._box(*track.states)
+        return track._replace(outside=(there[..., 1:] | there[..., :-1]).to(torch.uint8))
+
+    def _step(self, out: Sequence[Tensor], state: State) -> Step:
+        """The outputs of a program as a step of the shape of `state`."""
+        q, _, s = state
+        q1, p1, s1, c, residual, status, *outside = out
+        new = State(q1.reshape(q.shape), p1.reshape(q.shape), s1.reshape(s.shape))
+        c, residual, status, *outside = (x.reshape(s.shape) for x in (c, residual, status, *outside))
+        return Step(new, c, status, residual, self.metadata["newton_iterations"], *outside)
+
+    @property
+    def _file(self) -> str:
+        return FILES[self.kind]
+
+    def _checked(self, state: State) -> State:
+        self._check(*state)
+        return state
+
+    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002  another dtype is refused
+        check_rows(inputs)
+        return inputs
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor, names: tuple[str, str, str] = ("q", "p", "s")) -> None:
         check_state(q, p, s, self.dof, self.dtype, names)
@@ -216,25 +221,25 @@ class ExportedStepper:
             if x.device.type != "cpu":
                 raise InputError(f"{name} must be on the CPU, got {x.device}; use {name}.cpu()")
             if x.requires_grad and not self.differentiable and torch.is_grad_enabled():
-                raise InputError(f"an {self.kind} file has no derivatives; use a .pt2 file, or {name}.detach()")
+                message = f"{self._file} file has no derivatives: it takes {name} without gradient"
+                raise InputError(f"{message}; use a .pt2 file, or {name}.detach()")
 
     def _checked_h(self, h: Tensor | float) -> Tensor:
         h = checked_h(h, self.dtype)
         check_range(h, self.metadata.get("h_range"))
         return h
 
-    def _flat(self, state: State, h: Tensor, u: Tensor | None) -> tuple[Tensor, ...]:
-        """(B, n), (B, n), (B,), (B,)[, (B, m)], each with its own storage in standard layout."""
+    def _flat(self, state: State, h: Tensor | float, u: Tensor | None) -> tuple[Tensor, ...]:
+        """(B, n), (B, n), (B,), (B,)[, (B, m)]."""
         q, p, s = state
-        flat = (q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1))
-        more = (x.reshape(len(flat[2]), -1) for x in self._inputs(u, s.shape))
-        return tuple(_plain(x) for x in (*flat, *more))
+        h = spread_h(self._checked_h(h), s)
+        more = (x.reshape(s.numel(), -1) for x in self._inputs(u, s.shape))
+        return q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1), *more
 
     def _inputs(self, u: Tensor | None, shape: tuple[int, ...]) -> tuple[Tensor, ...]:
-        """(u,) of shape (*shape, m) for a model that takes inputs, those that do not act for None; () for another."""
+        """(u,) of shape (*shape, m) for a model that takes inputs; for None those that do not act, or nothing."""
         if u is None:
-            idle = torch.tensor(self.metadata.get("input_zero") or [0.0] * self.inputs, dtype=self.dtype)
-            return (idle.expand(*shape, self.inputs),) if self.inputs else ()
+            return () if self._idle is None else (self._idle.expand(*shape, self.inputs),)
         if u.ndim and u.ndim <= len(shape) + 1:
             with suppress(RuntimeError):  # left as it is, for the message below
                 u = u.expand(*shape, u.shape[-1])
@@ -242,11 +247,33 @@ class ExportedStepper:
         return (u,)
 
 
-def _plain(x: Tensor) -> Tensor:
+def scanned(program: Program) -> Loop:
+    """A program of K steps (q, p, s, h (K, B)[, u (K, B, m)]) → (K, B, ...) as a loop."""
+
+    def loop(q: Tensor, p: Tensor, s: Tensor, *rows: Tensor) -> Track:
+        out = program(*map(plain, (q, p, s, *(x.transpose(0, 1) for x in rows))))
+        *new, c, residual, status = (x.movedim(0, 1) for x in out[:6])
+        states = tuple(torch.cat([x[:, None], y], 1) for x, y in zip((q, p, s), new, strict=True))
+        sigma = torch.cat([torch.ones_like(s)[:, None], c], 1).cumprod(1)
+        return Track(states, sigma, status, residual, outside=out[6].T if len(out) > 6 else None)
+
+    return loop
+
+
+def plain(x: Tensor) -> Tensor:
     """Standard layout; compiled code reads memory in that order whatever the strides say."""
     return x.contiguous() if x.requires_grad else x.clone(memory_format=torch.contiguous_format)
 
 
-def _tail(x: Tensor) -> tuple[int, ...]:
-    """The shape of (K, B, ...) without B."""
-    return (x.shape[0], *x.shape[2:])
+def _decimated(track: Track, every: int, batch: tuple[int, ...]) -> Track:
+    """Each m-th state, with the worst status, residual and flag of the steps before it, for a batch of any shape."""
+
+    def kept(x: Tensor) -> Tensor:
+        return x[:, ::every].reshape(*batch, -1, *x.shape[2:])
+
+    def worst(x: Tensor) -> Tensor:
+        return (x if every == 1 else x.unflatten(1, (-1, every)).amax(2)).reshape(*batch, -1)
+
+    outside = None if track.outside is None else worst(track.outside)
+    states = tuple(map(kept, track.states))
+    return Track(states, kept(track.sigma), worst(track.status), worst(track.residual), (), outside)

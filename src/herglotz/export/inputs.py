@@ -1,4 +1,4 @@
-"""What exported steppers share: checks of shapes, dtype, values and h before they step, and decimation after it."""
+"""What exported steppers check before they step: shapes, dtype, values and h."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.stepping import Rollout
 
 
 def check_state(
@@ -91,26 +90,3 @@ def check_inputs(u: Tensor, count: int, shape: tuple[int, ...], dtype: torch.dty
         raise InputError("the model takes no inputs; leave u out")
     if u.shape != (*shape, count) or u.dtype != dtype or not bool(torch.isfinite(u).all()):
         raise InputError(f"u needs {count} finite number(s) a step in {dtype}, got {tuple(u.shape)} in {u.dtype}")
-
-
-def check_every(every: int, steps: int) -> None:
-    """Refuse a decimation that does not divide the number of steps."""
-    if every < 1 or steps % every:
-        raise InputError(f"every must divide the number of steps, got {every} and {steps}")
-
-
-def decimated(rollout: Rollout, every: int) -> Rollout:
-    """Each m-th state, with the worst status, residual and flag of the steps before it."""
-    if every == 1:
-        return rollout
-    worst = {
-        name: None if (x := getattr(rollout, name)) is None else x.unflatten(-1, (-1, every)).amax(-1)
-        for name in ("status", "residual", "outside")
-    }
-    return Rollout(
-        q=rollout.q[..., ::every, :],
-        p=rollout.p[..., ::every, :],
-        s=rollout.s[..., ::every],
-        sigma=rollout.sigma[..., ::every],
-        **worst,  # pyright: ignore[reportArgumentType]
-    )

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,12 +15,41 @@ import torch
 from torch import Tensor
 
 from herglotz.data.files import PathLike, read_bytes
-from herglotz.data.seal import check_seal
+from herglotz.data.seal import check_seal, sealed_text
 from herglotz.errors import InputError
+from herglotz.export.c_header import c_source, read_metadata
+from herglotz.export.c_stepper import compiled
 from herglotz.export.exported import ExportedStepper, Program
-from herglotz.export.metadata import AOTI, KEY, METADATA, from_json
+from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_digest
 from herglotz.export.programs import quiet
 from herglotz.export.trusted import check_trusted
+from herglotz.models import ContactLagrangian
+
+
+def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
+    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
+
+    Parameters
+    ----------
+    path
+        The file.
+    trust_code
+        As in `load_pt2`, also for a header. An ONNX file needs no trust: opening it runs nothing.
+
+    Returns
+    -------
+    ExportedStepper
+        With `init`, `step`, `rollout`, `linearise`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
+
+    Raises
+    ------
+    InputError
+        As the reader of that format.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix == ".onnx":
+        return load_onnx(path)
+    return (load_c if suffix == ".h" else load_pt2)(path, trust_code=trust_code)
 
 
 def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
@@ -35,26 +67,17 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     InputError
         If the file is missing, damaged, changed, not one of ours, of another format version, or not trusted.
     """
-    content = read_bytes(path)
-    check_seal(content, path)
+    content = _sealed(path)
     check_trusted(content, path, trust_code)
-    try:
-        with quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
-            if _is_compiled(content):
-                return _load_aoti(path)
-            from torch.export.pt2_archive._package import load_pt2 as unpack
+    with _reading(path, ".pt2"), quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
+        if _is_compiled(content):
+            return _load_aoti(path)
+        from torch.export.pt2_archive._package import load_pt2 as unpack
 
-            found = unpack(io.BytesIO(content))
-            text = found.extra_files.get(METADATA)
-            metadata = from_json(text.decode() if isinstance(text, bytes) else text, path)
-            modules = {name: program.module(check_guards=False) for name, program in found.exported_programs.items()}
-    except InputError:
-        raise
-    except Exception as error:  # torch raises whatever its zip, JSON and graph readers raise
-        line = str(error).strip().splitlines() or [""]
-        raise InputError(
-            f"{path}: is not a readable .pt2 file ({type(error).__name__}: {line[0][:120]}); export the model again"
-        ) from error
+        found = unpack(io.BytesIO(content))
+        text = found.extra_files.get(METADATA)
+        metadata = from_json(text.decode() if isinstance(text, bytes) else text, path)
+        modules = {name: program.module(check_guards=False) for name, program in found.exported_programs.items()}
     return ExportedStepper(modules, metadata, str(path), "pt2")
 
 
@@ -66,8 +89,7 @@ def load_onnx(path: PathLike) -> ExportedStepper:
     InputError
         If onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another version.
     """
-    content = read_bytes(path)
-    check_seal(content, path)
+    content = _sealed(path)
     try:
         import onnxruntime as ort
     except ImportError:
@@ -77,50 +99,86 @@ def load_onnx(path: PathLike) -> ExportedStepper:
     options.inter_op_num_threads = 1
     options.enable_cpu_mem_arena = False  # a tenth faster for tensors of a few numbers, and no slower for others
     options.log_severity_level = 4  # an exception says it; its log line would be a second
-    try:
-        session = ort.InferenceSession(content, options, providers=["CPUExecutionProvider"])
-        entries = session.get_modelmeta().custom_metadata_map
+    session = lambda text: ort.InferenceSession(text, options, providers=["CPUExecutionProvider"])  # noqa: E731
+    with _reading(path, ".onnx"):
+        first = session(content)
+        entries = first.get_modelmeta().custom_metadata_map
         metadata = from_json(entries.get(KEY), path)
-        programs = {"rollout": _session_program(session)}
+        programs = {"rollout": _session_program(first)}
         for name in (x for x in entries if x.startswith(f"{KEY}_")):  # further models, in base 64
-            second = ort.InferenceSession(base64.b64decode(entries[name]), options, providers=["CPUExecutionProvider"])
-            programs[name.removeprefix(f"{KEY}_")] = _session_program(second)
-    except InputError:
-        raise
-    except Exception as error:  # onnxruntime has a dozen exception classes and no common one
-        line = (str(error).strip().splitlines() or [""])[0]
-        raise InputError(f"{path}: is not a readable .onnx file ({line[:120]}); export the model again") from None
+            programs[name.removeprefix(f"{KEY}_")] = _session_program(session(base64.b64decode(entries[name])))
     return ExportedStepper(programs, metadata, str(path), "onnx")
 
 
-def load_exported(path: PathLike, *, trust_code: bool = False) -> Any:
-    """Read any exported file, by its name: `.pt2` (also compiled), `.onnx`, or a C header `.h`.
+def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian | None = None) -> ExportedStepper:
+    """Compile a header that `export_c` wrote, and load it.
 
     Parameters
     ----------
     path
-        The file.
+        The header.
     trust_code
-        As in `load_pt2`, also for a header. An ONNX file needs no trust: opening it runs nothing.
+        Compile a header that was not written by this user on this machine: that runs what stands in it.
+    model
+        Of the run it was exported from: a header that is what this model gives, letter for letter, needs no trust.
 
     Returns
     -------
-    ExportedStepper or CompiledStepper
-        Both have `step`, `rollout`, `outside_box`, `metadata`, `dof`, `dtype` and `h`.
+    ExportedStepper
+        With the header's own dtype and its `metadata`.
 
     Raises
     ------
     InputError
-        As the reader of that format.
+        If the file cannot be read, was changed, is no such header or not trusted, or there is no compiler.
     """
-    suffix = Path(path).suffix.lower()
-    if suffix == ".onnx":
-        return load_onnx(path)
-    if suffix == ".h":
-        from herglotz.export.c_stepper import load_c
+    text, _ = read_header(path)
+    check_trusted(text.encode(), path, trust_code or (model is not None and _is_of(text, path, model)))
+    return compiled(text, path)
 
-        return load_c(path, trust_code=trust_code)
-    return load_pt2(path, trust_code=trust_code)
+
+def read_header(path: PathLike) -> tuple[str, dict[str, Any]]:
+    """The text of a header and its metadata; nothing of it is compiled.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, was changed or is no such header.
+    """
+    text = _sealed(path, text=True).decode("utf-8", "replace")
+    return text, read_metadata(text, path)
+
+
+def _sealed(path: PathLike, text: bool = False) -> bytes:
+    """The content of a file that nobody has changed."""
+    content = read_bytes(path)
+    check_seal(content, path, text=text)
+    return content
+
+
+@contextmanager
+def _reading(path: PathLike, kind: str) -> Iterator[None]:
+    """What another package's reader raises as an `InputError`: torch and onnxruntime have no common exception."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        line = (str(error).strip().splitlines() or [""])[0][:120]
+        message = f"is not a readable {kind} file ({type(error).__name__}: {line}); export the model again"
+        raise InputError(f"{path}: {message}") from error
+
+
+def _is_of(text: str, path: PathLike, model: ContactLagrangian) -> bool:
+    """Whether the header is what the model gives with the header's own metadata."""
+    entries = read_metadata(text, path)
+    if entries.get("weights_sha256") != weights_digest(model):
+        return False
+    file = re.search(r'#include "([^"\n]*)"', text)
+    try:
+        return text == sealed_text(c_source(model, entries, file[1] if file else ""))
+    except (KeyError, ValueError, TypeError, AttributeError):  # metadata that this version would not have written
+        return False
 
 
 def _is_compiled(content: bytes) -> bool:

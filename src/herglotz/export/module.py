@@ -14,7 +14,6 @@ from herglotz.errors import InputError
 from herglotz.export.equation import Equations, dense
 from herglotz.export.newton import CARRIED, CONVERGED, ITERATIONS, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
-from herglotz.export.trace import Graph
 from herglotz.mechanics.legendre import beyond
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.linearise import eliminate
@@ -97,7 +96,8 @@ class StepModule(nn.Module):
     """(q, p, s, h[, u]) → (q1, p1, s1, c, residual, status[, outside]), differentiable in the state.
 
     The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J at the
-    solution. A step in closed form is differentiated as it stands.
+    solution. A step in closed form is differentiated as it stands. With `linearised`, d(q, p, s)′ / d(q, p, s, h, u),
+    (B, 2n+1, 2n+2+m), is one more output instead.
 
     Parameters
     ----------
@@ -109,6 +109,8 @@ class StepModule(nn.Module):
         Add the output `outside`, uint8: 1 where the step starts or ends outside the box, and 2 where h is outside.
     graphs
         The functions of a step, where they are made already.
+    linearised
+        Give the derivative as an output.
     """
 
     def __init__(
@@ -118,14 +120,15 @@ class StepModule(nn.Module):
         box: Mapping[str, Sequence[float]] | None = None,
         h_range: Sequence[float] | None = None,
         graphs: StepGraphs | None = None,
+        linearised: bool = False,
     ):
         super().__init__()
         if iterations < 2:
             raise InputError(f"newton_iterations must be at least 2, got {iterations}; {ITERATIONS} suits most models")
         equations = Equations.of(model)
         self.graphs = StepGraphs(equations.model, box, h_range) if graphs is None else graphs
-        if self.graphs.layout.iterates:
-            self.iterations = iterations
+        self.iterations, self.jacobian = iterations, equations.jacobian if linearised else None
+        if self.graphs.layout.iterates and not linearised:
             self.slopes, self.first_order = equations.slopes, equations.first_order
 
     def forward(
@@ -142,7 +145,8 @@ class StepModule(nn.Module):
         -------
         tuple of Tensor
             q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a
-            box, outside (B,) uint8. NaN in the samples whose status is not `Status.CONVERGED`.
+            box, outside (B,) uint8; last the derivative, if asked for. NaN in the samples whose status is not
+            `Status.CONVERGED`.
         """
         graphs = self.graphs
         carry, found = graphs.start(q, p, s), ()
@@ -151,9 +155,14 @@ class StepModule(nn.Module):
             constants = graphs.begin.constants, graphs.iterate.constants
             split = 1 + len(u)
             found = solved(graphs, self.iterations, fixed[0], tuple(fixed[1:split]), fixed[split:], constants)
-            found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
+            if self.jacobian is None:
+                found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
         new = graphs.finish(h, *u, *carry, *found)
-        return graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
+        if self.jacobian is None:
+            return said
+        (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)
+        return *said, torch.where((said[5] == CONVERGED)[:, None, None], J, torch.nan)
 
     def _attached(self, problem: Values, more: Values, found: Values) -> Values:
         """Newton's last carry, with Δ, p1, L and c as functions of the problem."""
@@ -164,36 +173,6 @@ class StepModule(nn.Module):
         delta = delta - eliminate(J, (F - F.detach())[..., None])[..., 0]  # the same value
         _, *values = self.first_order(*problem, delta, *more)
         return (*found[:2], delta, *found[3:7], *values)
-
-
-class LinearisedModule(nn.Module):
-    """(q, p, s, h[, u]) → the outputs of a step, then d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m).
-
-    Parameters
-    ----------
-    graphs
-        The functions of a step.
-    jacobian
-        The derivative of a solved step, traced.
-    iterations
-        Bound on the Newton iterations.
-    """
-
-    def __init__(self, graphs: StepGraphs, jacobian: Graph, iterations: int = ITERATIONS):
-        super().__init__()
-        self.graphs, self.jacobian, self.iterations = graphs, jacobian, iterations
-
-    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
-        """One step and its derivative; NaN in the samples whose status is not `Status.CONVERGED`."""
-        graphs = self.graphs
-        carry, found = graphs.start(q, p, s), ()
-        if graphs.layout.iterates:
-            constants = graphs.begin.constants, graphs.iterate.constants
-            found = solved(graphs, self.iterations, h, u, carry, constants)
-        new = graphs.finish(h, *u, *carry, *found)
-        said = graphs.report(h, q, p, s, *new[:STATE], *new[len(carry) :])
-        (J,) = self.jacobian(q, p, s, h, found[2] if found else new[0] - q, *u)
-        return *said, torch.where((said[5] == CONVERGED)[:, None, None], J, torch.nan)
 
 
 class InitModule(nn.Module):

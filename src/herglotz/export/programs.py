@@ -14,7 +14,7 @@ from torch.export import Dim, ExportedProgram
 
 from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
-from herglotz.export.module import InitModule, LinearisedModule, RolloutModule, StepModule
+from herglotz.export.module import InitModule, RolloutModule, StepModule
 from herglotz.export.step import StepGraphs
 from herglotz.models import ContactLagrangian
 
@@ -35,8 +35,10 @@ def programs_of(
     iterations = entries["newton_iterations"]
     make = {
         "model": lambda: _program(StepModule(equations, iterations, graphs=graphs), (q, p, s, *more)),
+        "linearise": lambda: _program(
+            StepModule(equations, iterations, graphs=graphs, linearised=True), (q, p, s, *more)
+        ),
         "rollout": lambda: _program(RolloutModule(graphs, iterations), (q, p, s, *stacked), stacked=3),
-        "linearise": lambda: _program(LinearisedModule(graphs, equations.jacobian, iterations), (q, p, s, *more)),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
     }
     return {name: make[name]() for name in names}

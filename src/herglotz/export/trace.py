@@ -21,12 +21,14 @@ SAME = (  # what leaves its first argument as it is, wherever shape and dtype st
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
     aten.broadcast_to.default, aten.movedim.intlist,
 )  # fmt: skip
-# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value.
+# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value;
+# the sign of a complex number, which is what derivatives of |x| ask for, is that of a real one.
 INSTEAD: dict[Any, Any] = {
     aten.view.default: aten.reshape.default,
     aten._unsafe_view.default: aten.reshape.default,
     aten.sub_.Tensor: aten.sub.Tensor,
     aten.fill_.Scalar: aten.full_like.default,
+    aten.sgn.default: aten.sign.default,
 }
 
 
@@ -65,14 +67,6 @@ class Graph(nn.Module):
     def forward(self, *inputs: Tensor) -> Any:
         """Evaluate at inputs."""
         return self.call(*inputs, *self.constants)
-
-    def first(self, count: int) -> Graph:
-        """The same graph with its first outputs only, and nothing that the others alone need."""
-        graph = fx.Graph()
-        outputs: Any = graph.graph_copy(self.code.graph, {})
-        graph.output(outputs[:count])
-        graph.eliminate_dead_code()
-        return Graph(*without_unused(graph, self.constants), self.batch)
 
 
 def example_batch(sizes: set[int]) -> int:
@@ -185,7 +179,7 @@ class Recorder(TorchDispatchMode):
         order = [node for node in graph.nodes if node.op == "placeholder"]
         kept = {place.name: value for place, value in self.constants.values()}
         _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
-        return Graph(*without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
+        return Graph(*_without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func._schema.is_mutable and func not in INSTEAD:
@@ -291,7 +285,7 @@ def _inputs_first(graph: fx.Graph, inputs: list[fx.Node], constants: list[fx.Nod
             first = node
 
 
-def without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
+def _without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
     """Constants that nobody reads are dropped; they are the last placeholders."""
     places = [node for node in graph.nodes if node.op == "placeholder"]
     places = places[len(places) - len(constants) :]

@@ -9,9 +9,10 @@ import torch
 from torch import Tensor
 
 from herglotz.scenes.scene import State, StateFunction
-from herglotz.theory.continuous import derivatives, herglotz_acceleration, jacobian
+from herglotz.theory.continuous import derivatives, herglotz_acceleration
 
 Field = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor]]
+Balance = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tensor, Tensor]]
 
 
 @dataclass(frozen=True)
@@ -24,13 +25,13 @@ class Motion:
         (q, y, s) → (q̇, ẏ, ṡ, L_s), where L_s is the rate at which the contact form is scaled, ċ = c L_s.
     start
         (q, v, s) → y: where a velocity is known.
-    momentum
-        (q, y, s) → p.
+    balance
+        (q, y, s) → (q̇, p, ṗ, ṡ, L_s), which for a Lagrangian needs no acceleration.
     """
 
     field: Field
     start: StateFunction
-    momentum: StateFunction
+    balance: Balance
 
     def vector_field(self, q: Tensor, y: Tensor, s: Tensor) -> State:
         """(q̇, ẏ, ṡ)."""
@@ -51,7 +52,7 @@ def herglotz_motion(
         L_s = rate(q, v, s)
         return v, force(q, v, s) + L_s[..., None] * p, lagrangian(q, v, s), L_s
 
-    return Motion(field, momentum, lambda q, p, s: p)  # noqa: ARG005
+    return _in_momenta(field, momentum)
 
 
 def constant_rate(L_s: float) -> StateFunction:
@@ -66,7 +67,7 @@ def hamiltonian_motion(hamiltonian: StateFunction, momentum: StateFunction) -> M
         H = derivatives(hamiltonian, q, p, s)
         return H.D2, -(H.D1 + p * H.D3[..., None]), (p * H.D2).sum(-1) - H.L, -H.D3
 
-    return Motion(field, momentum, lambda q, p, s: p)  # noqa: ARG005
+    return _in_momenta(field, momentum)
 
 
 def lagrangian_motion(lagrangian: StateFunction) -> Motion:
@@ -76,19 +77,18 @@ def lagrangian_motion(lagrangian: StateFunction) -> Motion:
         L = derivatives(lagrangian, q, v, s)
         return v, herglotz_acceleration(lagrangian, q, v, s), L.L, L.D3
 
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return derivatives(lagrangian, q, v, s).D2
+    def balance(q: Tensor, v: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        L = derivatives(lagrangian, q, v, s)
+        return v, L.D2, L.D1 + L.D3[..., None] * L.D2, L.L, L.D3
 
-    return Motion(field, lambda q, v, s: v, momentum)  # noqa: ARG005
+    return Motion(field, lambda q, v, s: v, balance)  # noqa: ARG005
 
 
-def state_change(motion: Motion, q: Tensor, y: Tensor, s: Tensor) -> Tensor:
-    """The derivative of (q, y, s) ↦ (q, p, s), (..., 2n+1, 2n+1)."""
-    n = q.shape[-1]
-    x = torch.cat([q, y, s[..., None]], -1)
+def _in_momenta(field: Field, momentum: StateFunction) -> Motion:
+    """Of a field in (q, p, s)."""
 
-    def change(x: Tensor) -> Tensor:
-        q, y, s = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
-        return torch.cat([q, motion.momentum(q, y, s), s[..., None]], -1)
+    def balance(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        q_dot, p_dot, s_dot, rate = field(q, p, s)
+        return q_dot, p, p_dot, s_dot, rate
 
-    return jacobian(change, x)[1]
+    return Motion(field, momentum, balance)

@@ -42,7 +42,7 @@ class Scene:
         Typical initial positions, initial velocities and step: where examples and generated data start. A range is
         (low, high), each a number or a tuple of `dof` numbers.
     numerical
-        The exact L_d computed by shooting (`herglotz.scenes.exact`), for a scene without a closed form.
+        The exact L_d computed by collocation (`herglotz.scenes.exact`), for a scene without a closed form.
     examples
         Parameters off the defaults, at which the tests check the scene too: a default of 1 hides powers.
     external

@@ -75,15 +75,14 @@ class OneStepMethod(ABC):
         """
         start = self._checked(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s))
         if inputs is not None:
-            inputs = torch.as_tensor(inputs, dtype=q.dtype, device=q.device)
-            self._check_inputs(inputs)
+            inputs = self._checked_inputs(torch.as_tensor(inputs), q)
             steps = inputs.shape[-2] if steps is None and torch.as_tensor(h).ndim == 0 else steps
         if events and checkpoint is not None:
             raise InputError("events and checkpoint exclude one another; leave one out")
         watch = Watch(events, start) if events else None
         track = self._roll_out(start, h, steps, inputs, watch, every=every, chunk=chunk, checkpoint=checkpoint)
         q, p, s = track.states
-        return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events)
+        return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events, track.outside)
 
     def _roll_out(
         self,
@@ -105,8 +104,8 @@ class OneStepMethod(ABC):
         """The state, if this stepper can start from it."""
         return check_state(state)
 
-    def _check_inputs(self, inputs: Tensor) -> None:
-        """Refuse inputs that this stepper does not take."""
+    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002
+        """The inputs (K, m) or (..., K, m) as a step takes them, beside positions `like`; refused if it takes none."""
         raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
 
     @property

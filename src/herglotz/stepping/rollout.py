@@ -51,7 +51,8 @@ class Track(NamedTuple):
     sigma: Tensor  # (..., K+1)
     status: Tensor  # (..., K)
     residual: Tensor  # (..., K)
-    events: tuple[Crossings, ...]
+    events: tuple[Crossings, ...] = ()
+    outside: Tensor | None = None  # (..., K), of an exported file
 
 
 # (state, h, guess, u, low) → the step and its `low`; a guess of None is the step's own.
@@ -164,11 +165,13 @@ def roll_out(start: Any, drive: Drive) -> Track:
     events = () if drive.watch is None else drive.watch.crossings(carry.state)
     move = lambda x: x.movedim(0, axis)  # noqa: E731
     track = Track(tuple(map(move, states)), move(sigma), move(status), move(residual), events)
-    return track if bool(torch.isfinite(carry.sigma).all()) else _without_lost_factors(track)
+    return without_lost_factors(track)
 
 
-def _without_lost_factors(track: Track) -> Track:
+def without_lost_factors(track: Track) -> Track:
     """Steps from where σ = ∏ c_j is too large a number are lost: they are NaN and have a status, as in C."""
+    if bool(torch.isfinite(track.sigma[..., -1]).all()):
+        return track
     lost = ~torch.isfinite(track.sigma) & (torch.arange(track.sigma.shape[-1]) > 0).to(track.sigma.device)
     nan = torch.where(lost, torch.nan, 0.0).to(track.sigma.dtype)
     states = tuple(x + nan.reshape(nan.shape + (1,) * (x.ndim - nan.ndim)) for x in track.states)

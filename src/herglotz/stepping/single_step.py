@@ -174,8 +174,9 @@ def _attach(
     F = momentum_residual(P, p0)
     if P.force is not None and P.force.held is not None and not increments:  # what is held has q1 = q0
         F = F + torch.where(P.force.held > 0, J.diagonal(0, -2, -1) * (x - q0), 0.0)
-    x = attached(x, J, F)
-    P = _evaluate(L_d, q0, x, s0, h, increments)
+    if F.requires_grad:  # an argument, or a parameter of L_d
+        x = attached(x, J, F)
+        P = _evaluate(L_d, q0, x, s0, h, increments)
     return x, End(momentum_plus(P), P.L, P.c)
 
 

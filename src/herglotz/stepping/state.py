@@ -165,6 +165,12 @@ def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     return h
 
 
+def check_rows(inputs: Tensor) -> None:
+    """Refuse inputs of a rollout that are no rows: one row (m) a step is wanted."""
+    if inputs.ndim < 2:
+        raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
+
+
 def step_sizes(h: Tensor, steps: int | None) -> Tensor:
     """All K steps, (K,) or (..., K), from a scalar and a count or from a list.
 

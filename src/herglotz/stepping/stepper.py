@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, legendre_plus
 from herglotz.models import capabilities
 from herglotz.stepping.explain import explain_step
@@ -19,6 +18,7 @@ from herglotz.stepping.state import (
     Step,
     StepError,
     check_h,
+    check_rows,
     check_started,
     check_state,
     step_sizes,
@@ -150,10 +150,11 @@ class Stepper(OneStepMethod):
     def _checked(self, state: State) -> State:
         return check_state(state, self.L_d)
 
-    def _check_inputs(self, inputs: Tensor) -> None:
-        if inputs.ndim < 2:
-            raise InputError(f"inputs need the shape (K, m) or (..., K, m), got {tuple(inputs.shape)}")
+    def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:
+        check_rows(inputs)
+        inputs = inputs.to(like)
         driven_by(self.L_d, inputs[..., 0, :])
+        return inputs
 
     @property
     def _iterates(self) -> bool:

@@ -66,13 +66,14 @@ def jacobian(
 
 
 def square_jacobian(
-    f: Callable[[Tensor], Tensor],  # (..., m) → (..., m), samples apart; takes one more leading dimension
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart; takes one more leading dimension
     x: Tensor,  # (..., m)
+    rows: int | None = None,  # k, default m
 ) -> tuple[Tensor, Tensor]:
-    """The same as `jacobian` by one backward pass instead of m: on m copies of x, of which copy i gives row i."""
-    copies = x.expand(x.shape[-1], *x.shape)
-    y, rows, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
-    return y.movedim(0, -1), rows.movedim(0, -2)
+    """The same as `jacobian` by one backward pass instead of k: on k copies of x, of which copy i gives row i."""
+    copies = x.expand(x.shape[-1] if rows is None else rows, *x.shape)
+    y, J, _ = gradient(lambda x: f(x).diagonal(dim1=0, dim2=-1).movedim(-1, 0), copies)
+    return y.movedim(0, -1), J.movedim(0, -2)
 
 
 def contact_vector_field(

@@ -5,7 +5,6 @@ Only steps inside the horizon are timed: a damped motion comes to rest, and a st
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
@@ -13,7 +12,8 @@ from typing import Any
 
 import torch
 
-from herglotz.export import CompiledStepper
+from herglotz.export import ExportedStepper
+from herglotz.export.c_stepper import CLibrary
 from herglotz.stepping import State
 from herglotz.tune.kick_composition_c import CompiledKicks
 
@@ -55,10 +55,10 @@ def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
 
 def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
     """Return rollouts of `steps` steps, one start after the other; for C the overhead of the call is timed too."""
-    if isinstance(stepper, CompiledStepper):
+    if isinstance(stepper, ExportedStepper) and isinstance(stepper.loop, CLibrary):
         count = min(C_STARTS, len(starts.s))
         repeats = max(1, C_STEPS // (count * steps))
-        run, idle = (_native(stepper, starts, count, h, k, repeats) for k in (steps, 0))
+        run, idle = (_native(stepper.loop, starts, count, h, k, repeats) for k in (steps, 0))
         return Timed(run, count * steps * repeats, idle)
     if isinstance(stepper, CompiledKicks):
         count = min(C_STARTS, len(starts.s))
@@ -88,36 +88,18 @@ def _repeated(call: Callable[[], None], times: int) -> Callable[[], None]:
     return run
 
 
-def _native(
-    stepper: CompiledStepper, starts: State, count: int, h: float, steps: int, repeats: int
-) -> Callable[[], None]:
+def _native(library: CLibrary, starts: State, count: int, h: float, steps: int, repeats: int) -> Callable[[], None]:
     """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
-    n, dtype = stepper.dof, stepper.dtype
-    h_all = torch.full((max(steps, 1),), h, dtype=dtype)
-    outputs = [torch.empty(size, dtype=dtype) for size in ((steps + 1, n), (steps + 1, n), steps + 1, steps + 1)]
-    outputs += [torch.empty(steps + 1, dtype=torch.uint8), torch.empty(steps + 1, dtype=dtype)]
-    keep = [h_all, *outputs]
-    calls = []
-    for i in range(count):
-        start = [x[i : i + 1].to(dtype).contiguous() for x in starts]
-        keep += start
-        numbers = (1, steps, *start, h_all, 0, 1, None, 0, *outputs)
-        calls.append([_argument(x) for x in numbers])
-    function = stepper._library.herglotz_rollouts
+    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
+    one = [State(*(x[i : i + 1].to(library.dtype) for x in starts)) for i in range(count)]
+    calls = [library.prepared(*start, h_all)[0] for start in one]
 
     def run() -> None:
         for _ in range(repeats):
-            for arguments in calls:
-                function(*arguments)
+            for call in calls:
+                call()
 
-    run.keep = keep  # type: ignore[attr-defined]  # the buffers live as long as the function
     return run
-
-
-def _argument(x: Any) -> Any:
-    if isinstance(x, int):
-        return ctypes.c_long(x)
-    return ctypes.c_void_p(None if x is None else x.data_ptr())
 
 
 def _seconds(run: Callable[[], None]) -> float:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.export import CompiledStepper, DifferencedStepper, ExportedStepper, load_exported
+from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
@@ -92,13 +92,12 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
             target.model,
             run=target,
         )
-    if isinstance(target, ExportedStepper | CompiledStepper):
-        kind = target.kind if isinstance(target, ExportedStepper) else "c"
-        closed = not getattr(target, "differentiable", False)
+    if isinstance(target, ExportedStepper):
+        closed = not target.differentiable
         smooth = DifferencedStepper(target) if closed else target
         states, size = draw(target, samples, make), _step_size(h, target.h)
         forced = target.metadata.get("level") == "forced"
-        return Subject(target.path, kind, smooth.step, states, size, forced=forced, differenced=closed)
+        return Subject(target.path, target.kind, smooth.step, states, size, forced=forced, differenced=closed)
     if isinstance(target, tuple) and len(target) == 2:
         return _pair(*target, h)
     if hasattr(target, "step"):
@@ -119,7 +118,7 @@ def named(target: Any) -> Any:
     return _open(target) if isinstance(target, str | os.PathLike) else target
 
 
-def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper | CompiledStepper:
+def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
     """Return a scene by its name, a run by its folder, or an exported file."""
     if target in scene_names():
         return scene(str(target))

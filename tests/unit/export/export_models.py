@@ -59,6 +59,7 @@ TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "m(q)": (2, {"mass_width": 3}),
     "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
     "coupled": (2, {"level": "forced", "coupled": True, "coulomb": True}),
+    "drag": (2, {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "v2^3", "load 1")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
     "sticking, two joints": (2, {"level": "forced", "coulomb": True, "sticking": True, "coupled": True}),
 }
@@ -76,6 +77,8 @@ def with_terms(case) -> Any:
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        if model.drag is not None:  # so large that a missing force is seen
+            model.drag.coefficient.abs_().add_(0.2)
         if model.friction is not None and model.friction.sticking:  # so strong that joints stop
             model.friction.coulomb.abs_().add_(0.2)
     return model

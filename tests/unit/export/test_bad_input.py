@@ -123,8 +123,8 @@ def test_what_leaves_the_box_is_flagged(stepper):
 def test_a_file_by_itself_has_a_status_for_what_is_no_number(stepper):
     # fails if a NaN passes a file's own loop with status 0, or spreads to its neighbours, or a step h that is not of
     # the range has no flag
-    programs = getattr(stepper, "programs", None)
-    if programs is None:
+    programs = stepper.programs
+    if "rollout" not in programs:
         pytest.skip("C is tested by programs in C: test_c_program.py")
     h = torch.full((2, 3), 0.1, dtype=torch.float64)
     fine = programs["rollout"](q, p, s, h)

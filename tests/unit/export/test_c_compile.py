@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import herglotz as hz
-from herglotz.export import CompiledStepper, compile_c, export_c, load_c
+from herglotz.export import ExportedStepper, compile_c, export_c, load_c
 from herglotz.stepping import State, Stepper
 
 needs_compiler = pytest.mark.skipif(
@@ -43,11 +43,11 @@ def test_whatever_holds_a_model_compiles(tmp_path):
     out = []
     for source in (m, Stepper(m), run, path, str(path)):
         compiled = hz.compile(source)
-        assert isinstance(compiled, CompiledStepper)
+        assert isinstance(compiled, ExportedStepper)
         out.append(compiled.rollout(*states(), h=0.1, steps=5).q)
     assert all(torch.equal(out[0], q) for q in out)
     recorded = hz.compile(run)
-    assert isinstance(recorded, CompiledStepper)
+    assert isinstance(recorded, ExportedStepper)
     assert recorded.metadata["box"] == box
 
 

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.export import CompiledStepper, compile_c, export_c, weights_digest
+from herglotz.export import ExportedStepper, compile_c, export_c, weights_digest
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 
@@ -353,7 +353,7 @@ def test_wrong_states_are_refused(tmp_path):
     # fails if a wrong dtype or shape reaches C, where it would read other memory
     path = export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1)
     compiled = compile_c(path)
-    assert isinstance(compiled, CompiledStepper)
+    assert isinstance(compiled, ExportedStepper)
     q, p, s = states_of(2, 3)
     for state, h, message in (
         (State(q.float(), p, s), 0.1, "must be torch.float64"),

@@ -31,6 +31,7 @@ CASES: dict[str, dict[str, Any]] = {
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},
     "coupled": {"level": "forced", "coupled": True},
+    "drag": {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "v2^3", "load 1"), "potential_width": 2},
     "sticking": {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1, "potential_width": 2},
     "velocities": {"level": "linear", "features": ("cos(q1) v1 v2", "q2^2 v2^2")},
     "order 4": {"level": "linear", "order": 4, "potential_width": 0, "features": ("q2^4", "cos(q1) v1 v2")},
@@ -41,10 +42,10 @@ CASES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 # Derivatives that the default suite compiles, which takes 5 to 15 s each: every kind of term is in one of them.
-ALWAYS = ("affine, tanh", "full, correction", "motors", "sticking", "velocities", "order 4, coupled motors")
+ALWAYS = ("affine, tanh", "drag", "full, correction", "motors", "sticking", "velocities", "order 4, coupled motors")
 
 
-SLOW_STICKING = pytest.param("sticking", marks=pytest.mark.slow)
+SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("sticking", "drag")]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -70,6 +71,8 @@ def damped(case):
             model.friction.viscous.abs_()
             if model.friction.sticking:  # so strong that joints stop
                 model.friction.coulomb.abs_().add_(0.2)
+        if model.drag is not None:  # so large that a missing force is seen
+            model.drag.coefficient.abs_().add_(0.2)
         if model.action is not None:  # so large that a missing term is seen
             model.action.rate.mul_(6)
         if isinstance(model.kinetic, PositionKinetic):
@@ -128,7 +131,7 @@ def test_every_level_agrees_with_the_eager_stepper(case):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", ["coupled", "sticking", "velocities", "order 4", "order 4, coupled motors"])
+@pytest.mark.parametrize("case", ["coupled", "drag", "sticking", "velocities", "order 4", "order 4, coupled motors"])
 def test_a_thousand_steps_of_features_and_joints_agree(case):
     # fails if rounding of features, of coupled friction or of order 4 adds up (test_c_matrix.py has the other terms)
     model, states, options = problem(case, 1000)
@@ -170,7 +173,7 @@ def test_a_failed_step_has_no_derivative():
     assert bool(torch.isnan(found.by_state).all())
 
 
-@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4", SLOW_STICKING])
+@pytest.mark.parametrize("case", ["linear", "affine, tanh", "full", "mass", "order 4", *SLOW])
 def test_float32_keeps_its_digits_over_many_steps(case):
     # fails if c is multiplied into p or sigma: 1 + E rounds, and 1000 steps add it up to 3e-5
     model, states, options = problem(case, 1000, torch.float32)

@@ -118,7 +118,7 @@ def test_inputs_reach_their_own_step(form, written):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=str)
-@pytest.mark.parametrize("name", [*LEVELS, "order 4", "sticking"])
+@pytest.mark.parametrize("name", [*LEVELS, "order 4", "sticking", "drag"])
 @pytest.mark.parametrize("form", ["pt2", "onnx"])
 def test_a_thousand_steps_at_every_batch_size(form, name, dtype, written):
     # fails if a graph is specialised to a batch or mixes samples, a float64 constant turns a float32 graph into a mixed

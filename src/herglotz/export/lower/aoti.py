@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import tempfile
-from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,29 +13,19 @@ import torch._inductor
 from torch._inductor.package.package import package_aoti
 from torch.export import ExportedProgram
 
-from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export.compare import compare
 from herglotz.export.load import load_pt2
-from herglotz.export.metadata import AOTI, KEY, describe, to_json
-from herglotz.export.newton import ITERATIONS
+from herglotz.export.metadata import AOTI, KEY, to_json
 from herglotz.export.programs import programs_of, quiet
-from herglotz.export.trusted import remember
+from herglotz.export.write import writes
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
 
-def export_aoti(
-    model: ContactLagrangian,
-    path: PathLike,
-    *,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None = None,
-    units: Sequence[str] = (),
-    metadata: Mapping[str, Any] | None = None,
-    newton_iterations: int = ITERATIONS,
-) -> Path:
+@writes
+def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     """Compile K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow to machine code.
 
     h has the shape (K, B), and so have the outputs (q and p: (K, B, n)); K = 1 is one step. The compiled code checks
@@ -60,7 +49,6 @@ def export_aoti(
         If there is no C++ compiler, an argument is not usable, what was compiled does not step like the model, or the
         file cannot be written.
     """
-    entries = describe(model, h, box, units, newton_iterations, metadata or {})
     settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
     check_compiler()
     with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
@@ -70,9 +58,7 @@ def export_aoti(
         content = sealed_zip(Path(package).read_bytes())
         Path(package).write_bytes(content)
         _check(package, model)
-    write_atomically(path, content)
-    remember(content)
-    return Path(path)
+    return content
 
 
 def _compiled(program: ExportedProgram, settings: dict[str, Any]) -> Any:

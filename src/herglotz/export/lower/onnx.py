@@ -4,37 +4,27 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 from torch import Tensor
 from torch.export import ExportedProgram
 from torch.export.graph_signature import InputKind
 
-from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.seal import sealed_onnx
 from herglotz.errors import InputError
 from herglotz.export.lower.onnx_table import write
 from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of
-from herglotz.export.metadata import KEY, describe, to_json
-from herglotz.export.newton import ITERATIONS
+from herglotz.export.metadata import KEY, to_json
 from herglotz.export.programs import programs_of, quiet
+from herglotz.export.write import writes
 from herglotz.models import ContactLagrangian
 
 OPSET = 20
 OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
 
 
-def export_onnx(
-    model: ContactLagrangian,
-    path: PathLike,
-    *,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None = None,
-    units: Sequence[str] = (),
-    metadata: Mapping[str, Any] | None = None,
-    newton_iterations: int = ITERATIONS,
-) -> Path:
+@writes
+def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     """Write K steps (q, p, s, h) → (q, p, s, c, residual, status[, outside]) of the model's flow as an ONNX graph.
 
     Inputs q, p (B, n), s (B,) and h (K, B), a row a step; K = 1 is one step. Outputs q, p (K, B, n), the others (K, B):
@@ -62,7 +52,6 @@ def export_onnx(
         import onnx  # noqa: F401
     except ImportError as error:
         raise InputError(f"ONNX export needs {error.name}; install it with: pip install 'herglotz[export]'") from None
-    entries = describe(model, h, box, units, newton_iterations, metadata or {})
     text = to_json(entries)
     with quiet():
         programs = programs_of(model, entries, ("rollout", "linearise", "init"))
@@ -77,8 +66,7 @@ def export_onnx(
         second = graph_of(programs[name], (*inputs, *u), outputs, {})
         properties[f"{KEY}_{name}"] = base64.b64encode(second).decode()
     content = graph_of(programs["rollout"], ("q", "p", "s", "h", *u), said, properties)
-    write_atomically(path, sealed_onnx(content))
-    return Path(path)
+    return sealed_onnx(content)
 
 
 def graph_of(

@@ -18,6 +18,8 @@ import numpy as np
 from herglotz.errors import InputError
 
 LOOP = 8  # results from which on a loop is written; shorter rows are faster and no longer as scalars
+# Computed in one loop, of which compilers make one call: networks read both, side by side.
+SINE_AND_COSINE = ("FN_sin({0})", "FN_cos({0})")
 DENSE = 64  # nonzero weights from which on a matrix product is a call
 
 
@@ -121,6 +123,15 @@ class Program:
             return [self.scalar(form, atoms) for atoms in entries]
         columns = list(zip(*entries, strict=True))
         number = len(self.statements)
+        if form in SINE_AND_COSINE:
+            lines = [f"@{number}[k{at}] = {f.format(self._in_loop(columns[0]))};" for f, at in
+                     zip(SINE_AND_COSINE, ("", f" + {count}"), strict=True)]  # fmt: skip
+            text = f"for (k = 0; k < {count}; k++) {{ {' '.join(lines)} }}"
+            self._append(Statement(text, 2 * count, _mentioned(text) - {number}))
+            for i, atoms in enumerate(entries):
+                for j, f in enumerate(SINE_AND_COSINE):
+                    self.known[(f, *atoms)] = Ref(number, j * count + i)
+            return [self.known[(form, *atoms)] for atoms in entries]
         if kernel is not None:
             where = self.pointer(columns[0])
             number = len(self.statements)

@@ -3,29 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
-from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.seal import sealed_zip
-from herglotz.export.metadata import METADATA, describe, to_json
-from herglotz.export.newton import ITERATIONS
+from herglotz.export.metadata import METADATA, to_json
 from herglotz.export.programs import programs_of, quiet
-from herglotz.export.trusted import remember
+from herglotz.export.write import writes
 from herglotz.models import ContactLagrangian
 
 
-def export_pt2(
-    model: ContactLagrangian,
-    path: PathLike,
-    *,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None = None,
-    units: Sequence[str] = (),
-    metadata: Mapping[str, Any] | None = None,
-    newton_iterations: int = ITERATIONS,
-) -> Path:
+@writes
+def export_pt2(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     """Write the model's flow as a `.pt2` file: graphs of tensor operations that any PyTorch of this version runs.
 
     It holds four programs. `model`, the one that `torch.export.load(path).module()` gives on a machine without
@@ -63,15 +51,10 @@ def export_pt2(
     InputError
         If h, box, units or metadata are not usable, or the file cannot be written.
     """
-    entries = describe(model, h, box, units, newton_iterations, metadata or {})
-    text = to_json(entries)
     with quiet():
         programs = programs_of(model, entries, ("model", "rollout", "linearise", "init"))
         from torch.export.pt2_archive._package import package_pt2  # what torch.export.save calls for a single program
 
         buffer = io.BytesIO()
-        package_pt2(buffer, exported_programs=programs, extra_files={METADATA: text})
-    content = sealed_zip(buffer.getvalue())
-    write_atomically(path, content)
-    remember(content)
-    return Path(path)
+        package_pt2(buffer, exported_programs=programs, extra_files={METADATA: to_json(entries)})
+    return sealed_zip(buffer.getvalue())

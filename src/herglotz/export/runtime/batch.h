@@ -258,11 +258,11 @@ static inline void hz_wide_advance(hz_wide_state *state, hz_wide_track *track, c
   hz_wide_gains(P, &t, x, &V1, dp, &ds, &E);
   for (i = 0; i < hz_N; i++) {
     next.p[i] = hz_wide_add(P->p0[i], dp[i], &low_p[i]);
-    sum += hz_wide_fabs(x[i]) + hz_wide_fabs(next.p[i]) + hz_wide_fabs(next.q[i]);
+    sum += next.p[i] + next.q[i]; /* what is not finite stays so in a sum */
   }
   next.s = hz_wide_add(P->s0, ds, &low_s);
   next.sigma = hz_wide_add(state->sigma, E * state->sigma, &low_sigma);
-  sum += hz_wide_fabs(next.s) + hz_wide_fabs(next.sigma);
+  sum += next.s + next.sigma;
   for (w = 0; w < hz_LANES; w++) {
     hz_state one;
     if (status[w] == hz_CONVERGED && !open[w] && hz_finite(sum[w]) && hz_R(1.0) + E[w] > hz_R(0.0)) continue;

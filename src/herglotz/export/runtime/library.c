@@ -142,12 +142,3 @@ void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_r
     s_out[b] = x.s;
   }
 }
-
-void herglotz_outside_box(long batch, const hz_real *q, const hz_real *p, const hz_real *s, unsigned char *out) {
-  long b;
-  for (b = 0; b < batch; b++) {
-    hz_state x;
-    load(q, p, s, b, &x);
-    out[b] = hz_outside_box(&x) != 0;
-  }
-}

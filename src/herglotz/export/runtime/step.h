@@ -250,8 +250,8 @@ static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAK
   }
   hz_potential(q1, &V1);
   hz_gains(P, &t, x, &V1, dp, &ds, &E);
-  for (i = 0; i < hz_N; i++) sum += hz_fabs(x[i]) + hz_fabs(P->p0[i] + dp[i]) + hz_fabs(q1[i]);
-  sum += hz_fabs(P->s0 + ds) + hz_fabs(state->sigma + E * state->sigma);
+  for (i = 0; i < hz_N; i++) sum += (P->p0[i] + dp[i]) + q1[i]; /* what is not finite stays so in a sum */
+  sum += (P->s0 + ds) + (state->sigma + E * state->sigma);
   if (!hz_finite(sum)) return hz_DIVERGED;
   if (!(hz_R(1.0) + E > hz_R(0.0))) return hz_SINGULAR;
   for (i = 0; i < hz_N; i++) {

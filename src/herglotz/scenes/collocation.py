@@ -1,0 +1,139 @@
+"""A motion between two positions by collocation: polynomials through the Gauss–Lobatto nodes of a step."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.mechanics.newton import find_root
+from herglotz.scenes.lobatto import lobatto
+from herglotz.scenes.motion import Motion
+from herglotz.theory.continuous import square_jacobian
+
+SMALL = 1e-8  # of the unknowns: the move after one below is below rounding
+PIECE = 4  # nodes from one look for a conjugate point to the next
+
+
+class End(NamedTuple):
+    """A motion at both ends of the step, and the derivatives of its end in (q0, p0, s0)."""
+
+    p0: Tensor  # (..., n)
+    p1: Tensor  # (..., n)
+    L: Tensor  # (...) s1 − s0
+    c: Tensor  # (...) conformal factor
+    D: Tensor  # (..., 2n+1, 2n+1) ∂(q1, p1, s1)/∂(q0, p0, s0)
+    log_c: Tensor  # (..., 2n+1) its gradient
+    opened: Tensor  # (...) bool: no conjugate point seen
+
+
+@dataclass(frozen=True)
+class Collocation:
+    """The motion from q0 to q1 as polynomials through k nodes: x_i = (q_i, y_i, s_i), (B, k, 2n+1).
+
+    With z = (q, p, s) and f = ż, the integrated equations are z_i = z_0 + h Σ_j a_ij f_j for i > 0; at the first node
+    stand the boundary values, q_0, q_{k−1} and s_0.
+    """
+
+    motion: Motion
+    count: int
+    q0: Tensor  # (B, n)
+    q1: Tensor  # (B, n)
+    s0: Tensor  # (B,)
+    h: Tensor  # (B,)
+
+    def start(self) -> Tensor:
+        """Uniform motion, with the action that it gathers; (B, k, 2n+1)."""
+        c, a, _ = (x.to(self.q0) for x in lobatto(self.count))
+        q = self.q0[:, None] + c[:, None] * (self.q1 - self.q0)[:, None]
+        s = self.s0[:, None].expand(-1, self.count)
+        y = self.motion.start(q, ((self.q1 - self.q0) / self.h[:, None])[:, None].expand_as(q), s)
+        s = s + self.h[:, None] * (self.motion.balance(q, y, s)[3] @ a.mT)
+        return torch.cat([q, y, s[..., None]], -1)
+
+    def solve(self, guess: Tensor | None, iterations: int) -> tuple[Tensor, Tensor]:
+        """The nodes, and where Newton's method has converged, (B,)."""
+        x = self.start() if guess is None else guess
+
+        def equations(flat: Tensor) -> tuple[Tensor, Tensor]:
+            F, _, J, *_ = self._equations(flat.unflatten(-1, x.shape[1:]))
+            return F.flatten(1), J.flatten(1, 2).flatten(2)
+
+        scale = (1.0 + x.abs().amax(1, keepdim=True)).expand_as(x)
+        root = find_root(equations, x.flatten(1), scale.flatten(1), iterations=iterations, tol=SMALL)
+        return (root.x + root.move).unflatten(-1, x.shape[1:]), root.converged
+
+    def log_c(self, x: Tensor) -> Tensor:
+        """The integral ln c = ∫ L_s dt, (B,)."""
+        rate = self.motion.balance(*_split(x))[4]
+        return self.h * (rate @ lobatto(self.count)[1][-1].to(x))
+
+    def _equations(self, x: Tensor) -> tuple[Tensor, ...]:
+        """The equations (B, k, 2n+1), z, the derivatives (B, k, 2n+1, k, 2n+1) and ∂z/∂x, L_s and its derivative."""
+        n, k = self.q0.shape[-1], self.count
+        a = lobatto(k)[1].to(x)
+        difference = torch.eye(k, dtype=x.dtype, device=x.device)
+        difference[:, 0] -= 1.0
+
+        def rates(x: Tensor) -> Tensor:  # p, q̇, ṗ, ṡ, L_s
+            q_dot, p, p_dot, s_dot, rate = self.motion.balance(*_split(x))
+            return torch.cat([p, q_dot, p_dot, s_dot[..., None], rate[..., None]], -1)
+
+        R, J = square_jacobian(rates, x, 3 * n + 2)
+        z = torch.cat([x[..., :n], R[..., :n], x[..., -1:]], -1)
+        z_x = torch.eye(2 * n + 1, dtype=x.dtype, device=x.device).expand(*x.shape[:-1], -1, -1).clone()
+        z_x[..., n : 2 * n, :] = J[..., :n, :]
+        f, f_x = R[..., n:-1], J[..., n:-1, :]
+        F = z - z[:, :1] - self.h[:, None, None] * (a @ f)
+        F_x = difference[:, None, :, None] * z_x.movedim(1, 2)[:, None]
+        F_x = F_x - (self.h[:, None, None] * a)[:, :, None, :, None] * f_x.movedim(1, 2)[:, None]
+        F[:, 0] = torch.cat([x[:, 0, :n] - self.q0, x[:, -1, :n] - self.q1, (x[:, 0, -1] - self.s0)[:, None]], -1)
+        F_x[:, 0] = 0.0
+        unit = torch.eye(n, dtype=x.dtype, device=x.device)
+        F_x[:, 0, :n, 0, :n], F_x[:, 0, n : 2 * n, -1, :n], F_x[:, 0, -1, 0, -1] = unit, unit, 1.0
+        return F, z, F_x, z_x, R[..., -1], J[..., -1, :]
+
+    def end(self, x: Tensor) -> tuple[End, Tensor]:
+        """What is wanted of a motion, and what it leaves of its equations, (B,), relative to 1 + |z|."""
+        n, k = self.q0.shape[-1], self.count
+        weights = lobatto(k)[1][-1].to(x)
+        F, z, F_x, z_x, rate, rate_x = self._equations(x)
+        error = (F.abs() / (1.0 + z.abs())).flatten(1).amax(1)
+        F_x[:, 0, n : 2 * n] = 0.0  # the momentum is given in the place of q1
+        F_x[:, 0, n : 2 * n, 0] = z_x[:, 0, n : 2 * n]
+        given = x.new_zeros(k * (2 * n + 1), 2 * n + 1)
+        given[: 2 * n + 1] = torch.eye(2 * n + 1, dtype=x.dtype, device=x.device)
+        x_0 = torch.linalg.solve_ex(F_x.flatten(1, 2).flatten(2), given.expand(len(x), -1, -1))[0]
+        x_0 = x_0.unflatten(1, (k, 2 * n + 1))  # ∂x_i/∂(q0, p0, s0)
+        D = z_x @ x_0
+        log_c = self.h * (rate @ weights)
+        gradient = self.h[:, None] * torch.einsum("bkm,bkmr,k->br", rate_x, x_0, weights)
+        opened = _regular(D[:, ::PIECE], n)
+        return End(
+            z[:, 0, n:-1], z[:, -1, n:-1], z[:, -1, -1] - self.s0, log_c.exp(), D[:, -1], gradient, opened
+        ), error
+
+
+def _split(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    n = x.shape[-1] // 2
+    return x[..., :n], x[..., n : 2 * n], x[..., -1]
+
+
+def _regular(D: Tensor, n: int) -> Tensor:
+    """Whether there is no conjugate point, from the derivatives D_i of (q, p, s) at the ends of the pieces, (B,).
+
+    At the end of a piece alone, Y = ∂q/∂p has eigenvalues with positive real parts, as it has at t → 0. Where a piece
+    `own` is joined to those before, the action has the second derivative W = c own⁻¹ now before⁻¹ in the position q
+    between them, with `before` and `now` = ∂q/∂p0 at the ends of the piece, and is a minimum where W > 0, which is
+    where the symmetric beforeᵀ own⁻¹ now is. The eigenvalues of `now` would not do: gyroscopic terms turn it, and two
+    of them may change sign together.
+    """
+    pieces = torch.linalg.solve_ex(D[:, :-1], D[:, 1:], left=False)[0]
+    own, Y = pieces[..., :n, n : 2 * n], D[..., :n, n : 2 * n]
+    W = Y[:, 1:-1].mT @ torch.linalg.solve_ex(own[:, 1:], Y[:, 2:])[0]
+    finite = torch.isfinite(own).flatten(1).all(1) & torch.isfinite(W).flatten(1).all(1)
+    own, W = (torch.where(finite[:, None, None, None], x, 0.0) for x in (own, W))
+    opened = (torch.linalg.eigvals(own).real > 0).flatten(1).all(1)
+    return finite & opened & (torch.linalg.eigvalsh(0.5 * (W + W.mT)) > 0).flatten(1).all(1)

@@ -1,0 +1,96 @@
+"""Mutants drawn at random: an operator, a comparison or a name exchanged for its opposite somewhere in a room."""
+
+from __future__ import annotations
+
+import ast
+import random
+from collections.abc import Iterator
+from pathlib import Path
+
+Change = tuple[int, str, str]  # where in the text, what stands there, what stands there instead
+
+BINARY = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
+COMPARE = {
+    ast.Lt: ("<", ">="),
+    ast.LtE: ("<=", ">"),
+    ast.Gt: (">", "<="),
+    ast.GtE: (">=", "<"),
+    ast.Eq: ("==", "!="),
+    ast.NotEq: ("!=", "=="),
+}
+BOOLEAN = {ast.And: ("and", "or"), ast.Or: ("or", "and")}
+NAMES = {"min": "max", "amin": "amax", "minimum": "maximum", "sin": "cos", "any": "all", "argmin": "argmax"}
+NAMES |= {new: old for old, new in NAMES.items()}
+
+
+class _Text:
+    """A source with the places of its nodes: `ast` counts columns in bytes."""
+
+    def __init__(self, text: str):
+        self.data = text.encode()
+        self.lines = [0]
+        for line in self.data.splitlines(keepends=True):
+            self.lines.append(self.lines[-1] + len(line))
+
+    def at(self, line: int, column: int) -> int:
+        return self.lines[line - 1] + column
+
+    def between(self, left: ast.expr, right: ast.expr, old: str, new: str) -> Iterator[Change]:
+        start = self.at(left.end_lineno or 0, left.end_col_offset or 0)
+        end = self.at(right.lineno, right.col_offset)
+        place = self.data.find(old.encode(), start, end)
+        if place >= 0:
+            yield self.change(place, old, new)
+
+    def change(self, place: int, old: str, new: str) -> Change:
+        return len(self.data[:place].decode()), old, new
+
+
+def changes(text: str) -> list[Change]:
+    """All places of a source that can be mutated; none in what only makes a message."""
+    tree, where = ast.parse(text), _Text(text)
+    found: list[Change] = []
+    for node in _code(tree):
+        found += _changes(node, where)
+    return sorted(found)
+
+
+def _code(node: ast.AST) -> Iterator[ast.AST]:
+    """The nodes under a node that compute: not messages, asserts, annotations."""
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Raise | ast.JoinedStr | ast.Assert | ast.arg):
+            continue
+        if isinstance(child, ast.AnnAssign) and child.value is not None:
+            child = child.value
+        yield child
+        yield from _code(child)
+
+
+def _changes(node: ast.AST, where: _Text) -> Iterator[Change]:
+    if isinstance(node, ast.BinOp) and type(node.op) in BINARY:
+        if not any(isinstance(x, ast.Constant) and isinstance(x.value, str) for x in (node.left, node.right)):
+            yield from where.between(node.left, node.right, *BINARY[type(node.op)])
+    elif isinstance(node, ast.Compare) and len(node.ops) == 1 and type(node.ops[0]) in COMPARE:
+        yield from where.between(node.left, node.comparators[0], *COMPARE[type(node.ops[0])])
+    elif isinstance(node, ast.BoolOp):
+        yield from where.between(node.values[0], node.values[1], *BOOLEAN[type(node.op)])
+    elif isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.Not):
+        old = "-" if isinstance(node.op, ast.USub) else "not "
+        yield where.change(where.at(node.lineno, node.col_offset), old, "")
+    elif isinstance(node, ast.Attribute | ast.Name):
+        name = node.attr if isinstance(node, ast.Attribute) else node.id
+        end = where.at(node.end_lineno or 0, node.end_col_offset or 0)
+        if name in NAMES:
+            yield where.change(end - len(name), name, NAMES[name])
+        elif name == "mT":
+            yield where.change(end - len(".mT"), ".mT", "")
+
+
+def sample(src: Path, room: str, number: int, seed: int) -> list[tuple[str, int, str, str]]:
+    """A draw of `number` mutants of a room: (file, place, old, new); the same for a seed and sources."""
+    every = [
+        (str(path.relative_to(src)), *change)
+        for path in sorted((src / room).rglob("*.py"))
+        for change in changes(path.read_text(encoding="utf-8"))
+    ]
+    return sorted(random.Random(f"{seed} {room}").sample(every, min(number, len(every))))
