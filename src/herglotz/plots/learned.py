@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.models.terms import LinearDamping
 from herglotz.plots.fan import units
 from herglotz.plots.motion import trained_mask
 from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, styled, with_unit
@@ -108,14 +109,18 @@ def _force(run: Run, i: int, x: Tensor) -> Callable[[], Tensor]:
 
 
 def _friction(run: Run, i: int, v: Tensor) -> Callable[[], Tensor]:
-    friction = run.model.friction
+    """The force against the velocity of coordinate i: −γ m v of the contact term, and that of the friction."""
+    friction, damping = run.model.friction, run.model.damping
+    m = _masses(run, _line(run, i, run.states.q[:1, i]))[..., 0]
     speeds = torch.zeros(len(v), run.data.dof, dtype=run.states.q.dtype)
     speeds[:, i] = v.to(speeds)
 
     def f() -> Tensor:
         assert friction is not None
         smooth = friction.force(speeds, None).value
-        return (smooth - friction.grip(speeds)[0] * speeds.sign() if friction.sticking else smooth)[:, i]
+        held = friction.grip(speeds)[0] * speeds.sign() if friction.sticking else 0.0
+        contact = damping.rate * speeds @ m if isinstance(damping, LinearDamping) else 0.0
+        return (smooth - held - contact)[:, i]
 
     return f
 

@@ -234,9 +234,17 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 5
+    assert len(written) == 6
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_animate(monkeypatch, tiny_csv, tiny_run, tmp_path, capsys):  # fails if the flag draws nothing, or takes data
+    monkeypatch.setattr("herglotz.plots.animation.FRAMES", 2)
+    assert main(["plot", str(tiny_run), "--animate", "--out", str(tmp_path)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["animation.gif"]
+    assert main(["plot", str(tiny_csv), "--animate", "--out", str(tmp_path)]) == 2
+    assert "--animate draws a run" in capsys.readouterr().err
 
 
 def test_identities_are_drawn_by_verify(tiny_run, tmp_path, capsys):  # fails if they are lost, or drawn of a scene
