@@ -1,18 +1,24 @@
 """The suite on other machines than this one: other instructions, threads, versions and roundings.
 
-`python tests/anywhere.py` (or `make test-anywhere`) runs pytest once a variant and ends with a table; what follows
-`--` is handed to pytest. `--only NAME ...` chooses variants. Each takes as long as `make test`.
+`python tests/anywhere.py` (or `make test-anywhere`) runs pytest folder by folder for every variant and ends with a
+table. It can be stopped and started again: what passed with the same sources is not run twice. `--only NAME ...`
+chooses variants, `--folders` folders, `--minutes` when to stop, `--again` forgets what passed; what follows `--` is
+handed to pytest.
 """
 
 import argparse
+import hashlib
+import json
 import os
-import shutil
+import re
 import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
+RESULTS = ROOT / "build" / "anywhere.json"
 ONE = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
 VARIANTS = {  # name: (environment, workers, versions)
     "native": (ONE, 2, None),
@@ -25,17 +31,31 @@ VARIANTS = {  # name: (environment, workers, versions)
     "newest": (ONE, 2, ("numpy", "matplotlib")),
 }
 PYTHONS = {f"python3.{minor}": (ONE, 2, ()) for minor in (11, 12, 13)}  # interpreters, with the pinned versions
-ABSENT = "no such interpreter here"
 EVERY = {**VARIANTS, **PYTHONS}
+COUNTED = ("passed", "failed", "error", "skipped", "xfailed")
 
 
-def python(versions: tuple[str, ...] | None, name: str) -> str | None:
-    """The interpreter of a virtual environment with these versions, made on its first use; None where it is absent."""
+def folders() -> list[str]:
+    """The folders that hold tests, those of a few seconds first."""
+    found = {path.parent.relative_to(ROOT).as_posix() for path in (ROOT / "tests").rglob("test_*.py")}
+    last = ("tests/unit/export", "tests/learned", "tests/unit/training")
+    return [*sorted(found - set(last)), *(x for x in last if x in found)]
+
+
+def sources() -> str:
+    """A hash of the package and its tests: results of other sources are forgotten."""
+    total = hashlib.sha256()
+    for path in sorted(path for room in ("src", "tests") for path in (ROOT / room).rglob("*.*")):
+        if path.is_file() and "__pycache__" not in path.parts:
+            total.update(path.relative_to(ROOT).as_posix().encode() + path.read_bytes())
+    return total.hexdigest()
+
+
+def python(versions: tuple[str, ...] | None, name: str) -> str:
+    """The interpreter of a virtual environment with these versions; made on its first use."""
     if versions is None:
         return sys.executable
-    base = shutil.which(name) if name.startswith("python") else sys.executable
-    if base is None or subprocess.run([base, "-c", ""], capture_output=True, check=False).returncode:
-        return None
+    base = name if name.startswith("python") else sys.executable
     folder = ROOT / ".venv" / f"anywhere-{name}"
     own = folder / "bin" / "python"
     if not (folder / "installed").exists():
@@ -49,27 +69,55 @@ def python(versions: tuple[str, ...] | None, name: str) -> str | None:
     return str(own)
 
 
+def run(variant: str, folder: str, options: list[str]) -> dict[str, Any]:
+    """One folder in one variant: the counts of pytest, and which tests failed."""
+    environment, workers, versions = EVERY[variant]
+    paths = sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob("test_*.py"))
+    spread = ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
+    command = [python(versions, variant), "-m", "pytest", "-q", "-rfE", *spread, *paths, *options]
+    done = subprocess.run(command, cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, check=False)
+    lines = done.stdout.splitlines() or [done.stderr[-200:]]
+    counts = {name: int(n) for n, name in re.findall(rf"(\d+) ({'|'.join(COUNTED)})", lines[-1])}
+    failed = [line for line in lines if line.startswith(("FAILED ", "ERROR "))]
+    if done.returncode not in (0, 5) and not failed:  # 5: every test of the folder is left out
+        failed = [lines[-1]]
+    return {"counts": counts, "failed": failed}
+
+
+def table(results: dict[str, dict[str, Any]], wanted: list[str]) -> str:
+    """One row a variant: sums of the counts, folders done, and the tests that failed below."""
+    rows, below = [f"{'variant':16}" + "".join(f"{name:>9}" for name in COUNTED) + "  folders"], []
+    for variant, found in results.items():
+        sums = [sum(x["counts"].get(name, 0) for x in found.values()) for name in COUNTED]
+        rows.append(f"{variant:16}" + "".join(f"{n:9}" for n in sums) + f"  {len(found)} of {len(wanted)}")
+        below += [f"{variant}: {line}" for x in found.values() for line in x["failed"]]
+    return "\n".join(rows + below)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=EVERY, default=list(VARIANTS), help="variants to run")
+    parser.add_argument("--folders", nargs="+", default=folders(), help="folders to run, such as tests/unit/data")
+    parser.add_argument("--minutes", type=float, default=float("inf"), help="start no folder after so long")
+    parser.add_argument("--again", action="store_true", help="forget what passed")
     parser.add_argument("pytest", nargs="*", help="arguments of pytest, after --")
     arguments = parser.parse_args()
-    rows = []
-    for name in arguments.only:
-        environment, workers, versions = EVERY[name]
-        began, own = time.monotonic(), python(versions, name)
-        if own is None:
-            rows.append((name, ABSENT, 0.0))
-            continue
-        command = [own, "-m", "pytest", "-q", "-n", str(workers), *arguments.pytest]
-        print(f"== {name}", flush=True)
-        done = subprocess.run(command, cwd=ROOT, env=os.environ | environment, check=False)
-        rows.append(
-            (name, "passed" if done.returncode == 0 else f"FAILED ({done.returncode})", time.monotonic() - began)
-        )
-    for name, outcome, seconds in rows:
-        print(f"{name:16} {outcome:12} {seconds:6.0f} s")
-    return int(any(outcome not in ("passed", ABSENT) for _, outcome, _ in rows))
+    key = sources() + " ".join(arguments.pytest)
+    stored = json.loads(RESULTS.read_text(encoding="utf-8")) if RESULTS.exists() and not arguments.again else {}
+    results = stored["results"] if stored.get("key") == key else {}
+    stop = time.monotonic() + 60 * arguments.minutes
+    for variant in arguments.only:
+        found = results.setdefault(variant, {})
+        for folder in arguments.folders:
+            if time.monotonic() > stop or (folder in found and not found[folder]["failed"]):
+                continue
+            found[folder] = run(variant, folder, arguments.pytest)
+            print(f"{variant}: {folder}: {found[folder]['counts']}", flush=True)
+            RESULTS.parent.mkdir(exist_ok=True)
+            RESULTS.write_text(json.dumps({"key": key, "results": results}, indent=1), encoding="utf-8")
+    print(table(results, arguments.folders))
+    complete = all(set(arguments.folders) <= set(results[variant]) for variant in arguments.only)
+    return int(not complete or any(x["failed"] for found in results.values() for x in found.values()))
 
 
 if __name__ == "__main__":

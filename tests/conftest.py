@@ -1,5 +1,6 @@
-"""The rounding shake: every fit of the suite from data disturbed in the last digit, on request.
+"""C of the tests is compiled without optimisation; and the rounding shake, on request.
 
+The rounding shake: every fit of the suite from data disturbed in the last digit.
 `HERGLOTZ_SHAKE=SEED` multiplies the positions and inputs that `fit` is given by 1 + 1e-14 ξ, ξ standard normal and
 decided by the seed and the data. An assertion on a trained quantity that holds with one rounding and fails with another
 is found so on one machine (`make test-anywhere`).
@@ -9,8 +10,12 @@ import os
 import sys
 from dataclasses import replace
 
+import pytest
 import torch
 
+from herglotz.export import c_wrapper
+
+OPTIMISED = c_wrapper.FLAGS
 RELATIVE = 1e-14
 
 
@@ -38,3 +43,17 @@ def pytest_configure():
     for name, module in list(sys.modules.items()):
         if name.startswith("herglotz") and getattr(module, "fit", None) is fit:
             setattr(module, "fit", fit_shaken)  # noqa: B010  a module has no such attribute to type checkers
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _unoptimised_c():
+    """C without optimisation: what it computes does not hang on -O3, which takes the compiler 4 to 8 times as long."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(c_wrapper, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in OPTIMISED))
+        yield
+
+
+@pytest.fixture
+def optimised_c(monkeypatch):
+    """C as the package compiles it."""
+    monkeypatch.setattr(c_wrapper, "FLAGS", OPTIMISED)

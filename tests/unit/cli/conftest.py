@@ -1,5 +1,8 @@
 """Tiny data and one fitted run for all tests of the command line."""
 
+import json
+from contextlib import redirect_stdout
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -36,8 +39,9 @@ def tiny_run(tiny_csv, tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def tiny_pt2(tiny_run, tmp_path_factory) -> Path:
-    """The run as an exported file; treat it as read-only."""
-    path = tmp_path_factory.mktemp("cli_pt2") / "tiny.pt2"
-    assert main(["export", str(tiny_run), "--out", str(path)]) == 0
-    return path
+def exported_pt2(tiny_run, tmp_path_factory) -> tuple[Path, dict]:
+    """The run as an exported file, and what `export --json` said; treat the file as read-only."""
+    path, said = tmp_path_factory.mktemp("cli_pt2") / "tiny.pt2", StringIO()
+    with redirect_stdout(said):
+        assert main(["export", str(tiny_run), "--out", str(path), "--json"]) == 0
+    return path, json.loads(said.getvalue())

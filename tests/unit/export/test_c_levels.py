@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.export import c_wrapper, compile_c
+from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
 from herglotz.stepping import State, Stepper
@@ -52,8 +52,6 @@ SLOW = [pytest.param(case, marks=pytest.mark.slow) for case in ("sticking", "dra
 def _cache(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        # What the code computes does not hang on -O3, which takes half of the compiler's time; test_c_header.py has it.
-        patch.setattr(c_wrapper, "FLAGS", tuple("-O1" if flag == "-O3" else flag for flag in c_wrapper.FLAGS))
         yield
 
 

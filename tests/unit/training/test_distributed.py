@@ -11,12 +11,15 @@ import torch
 
 WORK = """
 import sys
+from dataclasses import replace
 import torch
 from herglotz.data import simulate
 from herglotz.training import distributed
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, ResidualProblem, fit, levenberg_marquardt
+from herglotz.training import FitConfig, ResidualProblem, ShootingProblem, SmoothingProblem, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.first_states import first_states
+from herglotz.training.problems.grid import segment_grid
 from herglotz.training.task import build_model
 from herglotz.training.distributed import is_first, process_group
 from herglotz.training.solvers.matrix_free import MatrixFree
@@ -26,28 +29,32 @@ torch.set_num_threads(1)
 distributed.LEAST = 8  # there are few rows, and each process shall have some
 found = {}
 with process_group():
-    for objective, level, optimiser, iterations in (
-        ("residual", "affine", "lm", 8), ("trajectory", "linear", "lm", 40), ("smoothing", "linear", "lm", 8),
-        ("raw", "linear", "adam", 3)
-    ):
-        noise = 0.01 if objective in ("trajectory", "smoothing") else 0.0
-        data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, noise=noise, seed=0)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
+    for objective, level, optimiser, iterations in (("residual", "affine", "lm", 5), ("raw", "linear", "adam", 2)):
         settings = FitConfig(
             objective=objective, level=level, optimiser=optimiser, iterations=iterations, departures=(1e-3,),
-            correction_width=5, damping_width=3,
+            correction_width=5, damping_width=3, potential_width=4, train_fraction=1.0,
         )
         run = fit(data, settings, progress=False)
         found[objective] = torch.nn.utils.parameters_to_vector(run.model.parameters()).detach()
         found[objective + " cost"] = torch.tensor([row["cost"] for row in run.history], dtype=torch.float64)
-    data = simulate(scene("damped_pendulum"), trajectories=2, steps=24, h=0.2, seed=0)
     base = estimate_baseline(data)
+    model = build_model(base, FitConfig(potential_width=4, level="linear"), "potential")
+    noisy = replace(data, q=data.q + 0.01 * torch.sin(1e3 * data.t)[:, None])
+    grid, options = segment_grid(noisy, 8, base.model_step), {"sigma": 0.01, "prior": prior_of(model, base, 1e-3)}
+    shooting = ShootingProblem(model, noisy, grid, **options)
+    start = shooting.pack(shooting.parameters.get(), first_states(shooting, shooting.parameters.get()))
+    smoothing = SmoothingProblem(model, noisy, grid, process=0.1, **options)
+    for name, problem, x in (("trajectory", shooting, start), ("smoothing", smoothing, smoothing.start())):
+        search = levenberg_marquardt(problem, x, max_iterations=4)
+        found[name], found[name + " cost"] = search.x, torch.tensor(search.history, dtype=torch.float64)
     model = build_model(base, FitConfig(correction_width=5, level="linear"), "correction")
     problem = MatrixFree(ResidualProblem(model, data, sigma=1e-3, prior=prior_of(model, base, None)))
     x = problem.problem.start()
     cost, curvature, b = problem.normal_equations(x)
     step = curvature.solve(-b, 0.3 * curvature.diagonal(), tol=1e-13)
     found["products"] = torch.cat([cost[None], b, curvature.diagonal(), curvature @ step, step])
-    found["search by products"] = levenberg_marquardt(problem, x, max_iterations=8).x
+    found["search by products"] = levenberg_marquardt(problem, x, max_iterations=2).x
     if is_first():
         torch.save(found, sys.argv[1])
 """

@@ -95,7 +95,7 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residu
   if (!hz_usable(state, h) || hz_BAD_U(u)) return hz_BAD_INPUT;
   outside = hz_outside_box(state) | hz_outside_h(h);
   hz_track_start(state, &track);
-  status = hz_advance(state, &track, h, hz_PASS_U & left);
+  status = hz_advance(state, &track, h, hz_WITH_U(u) &left);
   if (residual) *residual = left;
   return status | outside | hz_outside_box(state);
 }
@@ -109,20 +109,13 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residu
 
    Any of them and `residual` may be null; they are written on success only. */
 static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual, hz_real *by_state,
-#if hz_INPUTS
-    hz_real *by_input,
-#endif
-    hz_real *by_h) {
+    hz_WITH_U(hz_real *by_input) hz_real *by_h) {
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N };
   const hz_state before = *state;
   hz_problem P;
   hz_real slopes[SIZE * WIDTH], move[hz_N];
   int i, j;
-#if hz_INPUTS
-  const int status = hz_step(state, h, u, residual);
-#else
-  const int status = hz_step(state, h, residual);
-#endif
+  const int status = hz_step(state, h, hz_WITH_U(u) residual);
   if (status & 15) return status;
   for (i = 0; i < hz_N; i++) {
     P.q0[i] = before.q[i];
@@ -167,12 +160,9 @@ static inline int hz_rollout(hz_state *state, hz_real h, hz_TAKES_U long steps, 
   hz_track_start(state, &track);
   for (k = 0; k <= steps; k++) {
     if (k > 0 && !status) {
-#if hz_INPUTS
-      const hz_real *now = hz_U_OF_STEP(u, k - 1);
-      status = hz_BAD_U(now) ? hz_BAD_INPUT : hz_advance(state, &track, h, now, &residual);
-#else
-      status = hz_advance(state, &track, h, &residual);
-#endif
+      status = hz_BAD_U(hz_U_OF_STEP(u, k - 1))
+                   ? hz_BAD_INPUT
+                   : hz_advance(state, &track, h, hz_WITH_U(hz_U_OF_STEP(u, k - 1)) &residual);
       outside |= hz_outside_box(state);
     }
     if (k % every) continue;
@@ -258,11 +248,7 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
   for (; b < count; b++) {
     hz_real *const q = q_out ? q_out + b * entries * hz_N : 0, *const p = p_out ? p_out + b * entries * hz_N : 0;
     hz_real *const s = s_out ? s_out + b * entries : 0;
-#if hz_INPUTS
-    const int status = hz_rollout(states + b, h, hz_U_OF_STEP(u, b * steps), steps, every, q, p, s);
-#else
-    const int status = hz_rollout(states + b, h, steps, every, q, p, s);
-#endif
+    const int status = hz_rollout(states + b, h, hz_WITH_U(hz_U_OF_STEP(u, b * steps)) steps, every, q, p, s);
     if (!worst) worst = status & 15;
     flagged |= status & ~15;
     if (statuses) statuses[b] = status;
@@ -272,9 +258,5 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
 
 /* hz_step of `count` samples; `statuses` may be null. Returns as hz_rollout_batch. */
 static inline int hz_step_batch(long count, hz_state *states, hz_real h, hz_TAKES_U int *statuses) {
-#if hz_INPUTS
-  return hz_rollout_batch(count, states, h, u, 1, 1, 0, 0, 0, statuses);
-#else
-  return hz_rollout_batch(count, states, h, 1, 1, 0, 0, 0, statuses);
-#endif
+  return hz_rollout_batch(count, states, h, hz_WITH_U(u) 1, 1, 0, 0, 0, statuses);
 }

@@ -192,16 +192,14 @@ static inline int hz_wide_alone(hz_wide_state *state, hz_real h, hz_TAKES_U int 
   int status;
   hz_wide_get(state, w, &one);
   hz_track_start(&one, &track);
-  status = hz_advance(&one, &track, h, hz_PASS_U residual);
+  status = hz_advance(&one, &track, h, hz_WITH_U(u) residual);
   hz_wide_set(state, w, &one);
   return status;
 }
 
 /* hz_advance for every lane whose status is 0; a lane that fails gets its status and keeps its state. */
 static inline void hz_wide_advance(hz_wide_state *state, hz_wide_track *track, const hz_real h[hz_LANES],
-#if hz_INPUTS
-    const hz_real *const u[hz_LANES],
-#endif
+    hz_WITH_U(const hz_real *const u[hz_LANES])
     int status[hz_LANES], hz_real residual[hz_LANES]) {
   hz_wide_problem *P = &track->P;
   hz_wide_terms t;
@@ -274,11 +272,7 @@ static inline void hz_wide_advance(hz_wide_state *state, hz_wide_track *track, c
 #if !hz_EXPLICIT
     track->known[w] = 0;
 #endif
-#if hz_INPUTS
-    if (status[w] == hz_CONVERGED) status[w] = hz_wide_alone(&next, h[w], u[w], w, &residual[w]);
-#else
-    if (status[w] == hz_CONVERGED) status[w] = hz_wide_alone(&next, h[w], w, &residual[w]);
-#endif
+    if (status[w] == hz_CONVERGED) status[w] = hz_wide_alone(&next, h[w], hz_WITH_U(u[w]) w, &residual[w]);
   }
   if (redo) hz_wide_potential(next.q, &V1);
   *state = next;

@@ -2,12 +2,6 @@
 
 #include "stepper.h"
 
-#if hz_INPUTS
-#define U(expression) (expression),
-#else
-#define U(expression)
-#endif
-
 static void load(const hz_real *q, const hz_real *p, const hz_real *s, long b, hz_state *x) {
   int i;
   for (i = 0; i < hz_N; i++) {
@@ -55,7 +49,7 @@ static void lanes(long b, long batch, long steps, const hz_real *q, const hz_rea
       push[w] = u && k > 0 ? u + sample * u_sample + (k - 1) * hz_M : 0;
     }
     (void)push;
-    if (k > 0) hz_wide_advance(&x, &track, now, U(push) status, left);
+    if (k > 0) hz_wide_advance(&x, &track, now, hz_WITH_U(push) status, left);
     for (w = 0; w < count; w++) {
       if (before[w]) continue;
       if (k > 0) {
@@ -96,7 +90,7 @@ void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *
         const long step = b * steps + k - 1;
         const hz_real now = h[b * h_sample + (k - 1) * h_step];
         hz_real left = (hz_real)0.0;
-        const int status = hz_advance(&x, &track, now, U(u ? u + b * u_sample + (k - 1) * hz_M : 0) &left);
+        const int status = hz_advance(&x, &track, now, hz_WITH_U(u ? u + b * u_sample + (k - 1) * hz_M : 0) &left);
         status_out[step] = (unsigned char)status;
         residual_out[step] = left;
         if (status) break;
@@ -119,8 +113,8 @@ void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz
     hz_state x;
     int status;
     load(q, p, s, b, &x);
-    status = hz_step_jacobian(&x, h[b], U(u ? u + b * hz_M : 0) residual_out + b, by_state + b * size * size,
-        U(by_input + b * size * hz_M) by_h + b * size);
+    status = hz_step_jacobian(&x, h[b], hz_WITH_U(u ? u + b * hz_M : 0) residual_out + b, by_state + b * size * size,
+        hz_WITH_U(by_input + b * size * hz_M) by_h + b * size);
     status_out[b] = (unsigned char)(status & 15);
     if (!(status & 15)) store(&x, b, q_out, p_out, s_out, sigma_out);
   }
@@ -135,7 +129,8 @@ void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_r
   (void)u_sample;
   for (b = 0; b < batch; b++) {
     hz_state x;
-    const int status = hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b * h_sample], U(u ? u + b * u_sample : 0) &x) & 15;
+    const int status =
+        15 & hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b * h_sample], hz_WITH_U(u ? u + b * u_sample : 0) &x);
     status_out[b] = (unsigned char)status;
     if (status) continue;
     for (i = 0; i < hz_N; i++) p_out[b * hz_N + i] = x.p[i];

@@ -161,10 +161,10 @@ static inline void hz_push(const hz_real *u, hz_real push[hz_N]) {
   }
 }
 #define hz_TAKES_U const hz_real *u,
-#define hz_PASS_U u,
+#define hz_WITH_U(argument) argument,
 #else
 #define hz_TAKES_U
-#define hz_PASS_U
+#define hz_WITH_U(argument)
 #endif
 
 /* The move of what Newton has solved for: the move itself or, where dry friction can hold a coordinate, a number z of
