@@ -7,12 +7,13 @@ import json
 import time
 from contextlib import nullcontext, suppress
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
+from herglotz.data.units import DEGREES
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
@@ -24,7 +25,7 @@ from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
 from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
-from herglotz.training.stages import Stages
+from herglotz.training.stages import Progress, Stages
 from herglotz.training.task import Task
 from herglotz.training.uncertainty import laplace
 
@@ -36,7 +37,7 @@ def fit(
     *,
     plan: Plan | None = None,
     out: str | Path | None = None,
-    progress: bool | Literal["lines"] | None = None,
+    progress: Progress = None,
     resume: bool = False,
     **settings: Any,
 ) -> Run:
@@ -57,7 +58,8 @@ def fit(
     out
         Folder for the checkpoint (`checkpoint.pt`); nothing is written without it. Use `save_run` for the result.
     progress
-        Show progress bars; None: on a terminal only; "lines": one line on stderr after every stage.
+        Show one bar; None: on a terminal only; "lines": one line on stderr after every stage; "iterations": after every
+        iteration, too.
     resume
         Go on from the checkpoint in `out`, if there is one.
     **settings
@@ -94,19 +96,22 @@ def _fit(
     config: FitConfig,
     plan: Plan | None,
     out: str | Path | None,
-    progress: bool | Literal["lines"] | None,
+    progress: Progress,
     resume: bool,
 ) -> Run:
     started = time.perf_counter()
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
-    seen = look(data, config, stages, plan)
-    if plan is None and seen.found is not None and seen.found.doubt:
-        seen, plan = held_out_winner(data, config, stages, seen)
-    plan = plan or choose(seen, config)
-    task = Task(seen.kept, seen.base, seen.settings, stages)
-    run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
+    with stages.bar:
+        seen = look(data, config, stages, plan)
+        if plan is None and seen.found is not None and seen.found.doubt:
+            seen, plan = held_out_winner(data, config, stages, seen)
+        plan = plan or choose(seen, config)
+        task = Task(seen.kept, seen.base, seen.settings, stages)
+        run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
     run.metrics["equation"] = _equation(run, plan).as_dict()
+    if degrees := [name for name, _, unit in data.columns if name in data.names and unit in DEGREES]:
+        run.metrics["degrees"] = degrees  # the model has radians; errors are told in degrees too
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 
