@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
@@ -31,14 +32,35 @@ def from_table(
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     groups = group_rows(path, at, labels, values[:, 0].tolist(), _called(columns))
-    table = values[[i for group in groups for i in group]]
+    return _trajectories(path, columns, values[[i for group in groups for i in group]], tuple(map(len, groups)))
+
+
+def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values: np.ndarray) -> Trajectories | None:
+    """As `from_table` of a large table, whose labels are numbers, (N,); None where `from_table` would raise."""
+    lengths = (len(values),)
+    if labels is not None:
+        _, first, place, counts = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
+        order = np.argsort(first)  # of first appearance
+        rank = np.argsort(order)[place]
+        if np.any(np.diff(rank) < 0):
+            values = values[np.argsort(rank, kind="stable")]
+        lengths = tuple(counts[order].tolist())
+    same = np.ones(max(len(values) - 1, 0), dtype=bool)
+    same[np.cumsum(lengths)[:-1] - 1] = False
+    if min(lengths) < MIN_SAMPLES or not np.all(np.diff(values[:, 0])[same] > 0):
+        return None
+    return _trajectories(path, columns, values, lengths)
+
+
+def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tuple[int, ...]) -> Trajectories:
+    """The set whose samples are the rows of the table, (N, columns.numeric), trajectory after trajectory."""
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
     units = tuple(columns.units[i] or "1" for i in columns.q)
     return Trajectories.of(
         t[:, 0],
         q,
-        tuple(len(group) for group in groups),
+        lengths,
         names=tuple(columns.names[i] for i in columns.q),
         units=units,
         angles=tuple(unit == "rad" for unit in units),
@@ -51,18 +73,20 @@ def from_table(
     )
 
 
-def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
+def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:
     """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
+
+    `where` begins messages.
 
     Raises
     ------
     InputError
         Naming column, row (counted from 0), value and remedy.
     """
-    where, heads = Path("DataFrame"), [str(name) for name in frame.columns]
+    heads = [str(name) for name in frame.columns]
     columns = assign(heads, str(where), wanted)
     raw = [np.asarray(frame[name]) for name in frame.columns]
-    numbers = np.stack([_numbers(columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
+    numbers = np.stack([_numbers(where, columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
     labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     return from_table(where, columns, range(len(numbers)), labels, numbers)
 
@@ -80,15 +104,17 @@ def _called(columns: Columns) -> tuple[str, str]:
     return label, columns.names[columns.time]
 
 
-def _numbers(name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
+def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
     """A column as finite float64; dates become seconds since the first of them."""
     if is_time and column.dtype.kind == "M":
         return (column - column[:1]) / np.timedelta64(1, "s")
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"DataFrame, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+        raise InputError(f"{where}, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+    if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
+        raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
     bad = np.nonzero(~np.isfinite(found))[0]
     if len(bad):
-        raise InputError(f"DataFrame, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
+        raise InputError(f"{where}, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
     return found
