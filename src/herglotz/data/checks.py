@@ -15,6 +15,8 @@ from herglotz.errors import InputError
 
 ARRAYS = ("t", "q", "s", "p", "u")
 MIN_SAMPLES = 3  # one discrete Herglotz residual joins q_{k−1}, q_k, q_{k+1}
+EXACT = 2**53  # integers up to here are floats of double precision
+SMALLEST, LARGEST = 1e-50, 1e50  # of numbers that are fitted: cubes and sums of a million squares are numbers
 DTYPES = (torch.float32, torch.float64)
 
 
@@ -139,6 +141,15 @@ def _check_finite(where: str, offsets: tuple[int, ...], name: str, x: Tensor) ->
     value = float(x[tuple(place)])
     column = f"{name}[{place[1]}]" if len(place) > 1 else name
     raise InputError(f"{where}: {column} of trajectory {b}, sample {k}, is {value}; delete that sample")
+
+
+def check_sizes(where: str, q: Tensor, names: Sequence[str]) -> None:
+    """Raise where positions (N, n) are so large or small that their squares are no numbers: a fit needs those."""
+    for name, size in zip(names, q.detach().abs().amax(0).tolist(), strict=True):
+        if size > LARGEST:
+            raise InputError(f"{where}: {name} has a number of {size:.1e}, above {LARGEST:.0e}; use a larger unit")
+        if 0.0 < size < SMALLEST:
+            raise InputError(f"{where}: all numbers of {name} are below {SMALLEST:.0e}; use a smaller unit")
 
 
 def _check_time(where: str, offsets: tuple[int, ...], t: Tensor) -> None:

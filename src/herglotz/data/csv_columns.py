@@ -94,14 +94,15 @@ def assign(
         If a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named column is absent.
     """
     names, units = _parse(cells, where)
+    place = {name: i for i, name in enumerate(names)}
     for asked in wanted.names:
-        if asked not in names:
+        if asked not in place:
             raise InputError(f"{where}: there is no column {quote(asked)}; the columns are {', '.join(names)}")
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         roles[wanted.role(name) or _by_itself(name, unit, wanted)].append(i)
     clock = _clock(where, names, roles["time"])
-    q = tuple(roles["q"] if wanted.coordinates is None else (names.index(x) for x in _several(wanted.coordinates)))
+    q = tuple(roles["q"] if wanted.coordinates is None else (place[x] for x in _several(wanted.coordinates)))
     if not q:
         raise InputError(f"{where}: no coordinate column, only {', '.join(names)}; add a column such as q[rad]")
     if len(roles["trajectory"]) > 1:
@@ -136,7 +137,8 @@ def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
 
 
 def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    names, units = [], []
+    names: dict[str, None] = {}
+    units = []
     for i, cell in enumerate(cells):
         match = HEADER_CELL.fullmatch(cell)
         if match is None or not cell.isprintable():
@@ -144,7 +146,7 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
         name = match[1]
         if name in names:
             raise InputError(f"{where}: the column {quote(name)} comes twice; rename or delete one")
-        names.append(name)
+        names[name] = None
         units.append((match[2] or "").strip())
     if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")

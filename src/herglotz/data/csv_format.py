@@ -3,20 +3,24 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 
+from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import number, quote
-from herglotz.data.table import from_table, moment
+from herglotz.data.rows import SHOWN, number, quote
+from herglotz.data.table import from_numbers, from_table, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
+LONG = 100_000  # characters of a row of plain numbers
 HOLD = r"#\s*hold:\s*(\w+)"  # the comment that says what inputs do between samples
 
 
@@ -50,6 +54,13 @@ def read_csv(
     InputError
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
+    wanted = Wanted(time, coordinates, inputs, drop, group)
+    found = _read_numbers(Path(path), wanted) or _read_rows(Path(path), wanted)
+    return found if angles is None else found.with_angles(angles)
+
+
+def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
+    """Row by row: dates, names of trajectories, and the place of every mistake."""
     lines = read_lines(path)
     rows = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
     if not rows:
@@ -57,11 +68,41 @@ def read_csv(
     at, header = rows[0]
     if "," not in header and (";" in header or "\t" in header):
         raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
-    columns = assign(_cells(header), f"{Path(path)}, row {at}", Wanted(time, coordinates, inputs, drop, group))
-    found = from_table(Path(path), columns, *_parse_rows(Path(path), columns, rows[1:]))
+    columns = assign(_cells(header), f"{path}, row {at}", wanted)
+    found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]))
     said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
-    found = replace(found, hold=said[0]) if said else found
-    return found if angles is None else found.with_angles(angles)
+    return replace(found, hold=said[0]) if said else found
+
+
+def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
+    """A table of plain numbers by numpy's parser, a fifth of the time and of the memory; None for any other file."""
+    said: list[str] = []
+
+    def rows(file: TextIO) -> Iterator[str]:
+        for line in file:
+            if line.startswith("#"):
+                said.extend(match[1] for match in [re.fullmatch(HOLD, line.strip())] if match)
+            elif not line.isspace():
+                if len(line) > LONG:
+                    raise ValueError(line[:SHOWN])
+                yield line
+
+    if not path.is_file():
+        return None
+    try:
+        with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
+            lines = rows(file)
+            columns = assign(_cells(next(lines)), str(path), wanted)
+            table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
+    except (OSError, ValueError, StopIteration, InputError):
+        return None  # read row by row, the mistake has a place
+    if table.shape[1] != len(columns.names) or len(table) < MIN_SAMPLES or not np.isfinite(table).all():
+        return None
+    labels = None if columns.trajectory is None else table[:, columns.trajectory]
+    if np.abs(table).max() >= EXACT or (labels is not None and np.any(labels != np.round(labels))):
+        return None
+    found = from_numbers(path, columns, labels, table[:, columns.numeric])
+    return replace(found, hold=said[0]) if said and found is not None else found
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:

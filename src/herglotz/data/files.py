@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import tempfile
 from contextlib import suppress
 from pathlib import Path
@@ -12,17 +13,21 @@ from herglotz.errors import InputError
 PathLike = str | os.PathLike[str]
 
 
-def read_bytes(path: PathLike) -> bytes:
-    """Return the contents of a file.
+def read_bytes(path: PathLike, most: int = -1) -> bytes:
+    """Return the contents of a file, or its first `most` bytes.
 
     Raises
     ------
     InputError
-        If there is no such file, it is a directory, empty or not readable.
+        If there is no such file, it is a directory, a pipe or a device (which may never end), empty or not readable.
     """
     path = Path(path)
     try:
-        content = path.read_bytes()
+        mode = path.stat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise InputError(f"{path}: is a pipe or a device, not a file; save what it says to a file first")
+        with open(path, "rb") as file:
+            content = file.read(most)
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; check the name and the folder") from None
     except IsADirectoryError:

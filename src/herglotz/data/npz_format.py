@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS
+from herglotz.data.checks import ARRAYS, EXACT
 from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 LABELS = ("names", "units", "angles", "time_unit", "source", "hold")
 USED = (*ARRAYS, "lengths", "metadata")
+LARGEST = 2**31  # bytes that the arrays of an archive may take: 67 million samples of t and three coordinates
 # Exceptions that numpy and zipfile raise on a damaged archive.
 DAMAGE = (
     *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
@@ -86,6 +87,7 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     name = ""
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            _check_size(path, archive.zip)
             for name in archive.files:  # only what is used is inflated: an archive can hold gigabytes of zeros
                 arrays[name] = np.asarray(archive[name]) if name in USED else np.empty(0)
     except DAMAGE as error:
@@ -99,9 +101,24 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
     return arrays
 
 
+def _check_size(path: Path, archive: zipfile.ZipFile) -> None:
+    """Zeros take a thousandth of their size in an archive: memory is not spent before it is asked how much."""
+    used = [one for one in archive.infolist() if one.filename.removesuffix(".npy") in USED]
+    size = sum(one.file_size for one in used)
+    if size > LARGEST:
+        raise InputError(
+            f"{path}: its arrays take {size / 2**30:.1f} GB of memory, more than {LARGEST / 2**30:.0f}; "
+            "save fewer samples"
+        )
+
+
 def _floating(path: Path, name: str, x: np.ndarray) -> Tensor:
     """Return float32 and float64 as they are, integers as float64."""
     if x.dtype.kind in "iu":
+        if x.size and max(abs(int(x.min())), abs(int(x.max()))) > EXACT:
+            raise InputError(
+                f"{path}: array {name!r} has integers above 2^53, which float64 would round; subtract the first one"
+            )
         return torch.from_numpy(x.astype(np.float64))
     if x.dtype.kind != "f" or x.dtype.itemsize not in (4, 8):
         raise InputError(f"{path}: array {name!r} has dtype {x.dtype}; save it as float64")

@@ -98,7 +98,7 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
 
 def _read(path: Path, wanted: Wanted) -> Trajectories:
     suffix = path.suffix.lower()
-    line = read_bytes(path)[:200].decode("utf-8", "replace").lstrip().split("\n")[0] if suffix != ".npz" else ""
+    line = read_bytes(path, 800).decode("utf-8", "replace").lstrip().split("\n")[0] if suffix != ".npz" else ""
     candidates = [one for one in FORMATS if one.suffix == suffix]
     for one in candidates:
         if one.first_line(line):

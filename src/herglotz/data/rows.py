@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
-from herglotz.data.checks import MIN_SAMPLES
+from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.errors import InputError
 
 SHOWN = 40  # characters of a bad cell that a message quotes
@@ -36,6 +36,8 @@ def number(
     if value is None or "_" in text:  # Python reads 1_000 as a number; in a data file it is a mistake
         what = quote(text) if text else "a blank cell"
         raise InputError(f"{where}: {what} is not a number; correct or delete the row")
+    if abs(value) >= EXACT and text.strip("+-").isdecimal() and int(text) != value:
+        raise InputError(f"{where}: {quote(text)} is above 2^53 and would be rounded; subtract the first one from all")
     if not math.isfinite(value):
         raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
     return value

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
@@ -31,14 +32,35 @@ def from_table(
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     groups = group_rows(path, at, labels, values[:, 0].tolist(), _called(columns))
-    table = values[[i for group in groups for i in group]]
+    return _trajectories(path, columns, values[[i for group in groups for i in group]], tuple(map(len, groups)))
+
+
+def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values: np.ndarray) -> Trajectories | None:
+    """As `from_table` of a large table, whose labels are numbers, (N,); None where `from_table` would raise."""
+    lengths = (len(values),)
+    if labels is not None:
+        _, first, place, counts = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
+        order = np.argsort(first)  # of first appearance
+        rank = np.argsort(order)[place]
+        if np.any(np.diff(rank) < 0):
+            values = values[np.argsort(rank, kind="stable")]
+        lengths = tuple(counts[order].tolist())
+    same = np.ones(max(len(values) - 1, 0), dtype=bool)
+    same[np.cumsum(lengths)[:-1] - 1] = False
+    if min(lengths) < MIN_SAMPLES or not np.all(np.diff(values[:, 0])[same] > 0):
+        return None
+    return _trajectories(path, columns, values, lengths)
+
+
+def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tuple[int, ...]) -> Trajectories:
+    """The set whose samples are the rows of the table, (N, columns.numeric), trajectory after trajectory."""
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
     units = tuple(columns.units[i] or "1" for i in columns.q)
     return Trajectories.of(
         t[:, 0],
         q,
-        tuple(len(group) for group in groups),
+        lengths,
         names=tuple(columns.names[i] for i in columns.q),
         units=units,
         angles=tuple(unit == "rad" for unit in units),
@@ -90,6 +112,8 @@ def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool) -> np.nd
         found = column.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{where}, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+    if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
+        raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
     bad = np.nonzero(~np.isfinite(found))[0]
     if len(bad):
         raise InputError(f"{where}, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
+from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
 from herglotz.data.units import DEGREES
 from herglotz.errors import InputError
@@ -21,15 +20,14 @@ from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.evaluate import evaluate
-from herglotz.training.look import Look, look
+from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
+from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.task import Task
 from herglotz.training.uncertainty import laplace
-
-INNER = 0.75  # of the training part that rivals are fitted to; they run free over the rest
 
 
 @one_thread()
@@ -88,6 +86,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = as_trajectories(data, **reading)
+    check_sizes(data.source or "data", data.q, data.names)
     with nullcontext() if out is None else locked(out):
         return _fit(data, config, plan, out, progress, resume)
 
@@ -125,24 +124,6 @@ def _equation(run: Run, plan: Plan) -> Equation:
             posterior = laplace(run)
             covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
     return equation_of(run, covariance)
-
-
-def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
-    """Named terms or networks: the plan whose free run over the last quarter of the training part errs less."""
-    other = look(data, config, stages, named=False)
-    plans = [choose(seen, config), choose(other, config)]
-
-    def errors() -> dict[str, Any]:
-        inner = replace(config, train_fraction=INNER)
-        runs = [fit(seen.train, inner, plan=plan, progress=False) for plan in plans]
-        return {"rms": [run.metrics["extrapolation_rms"] for run in runs]}
-
-    rms = [math.inf if x is None else x for x in stages.keep("held-out free runs", errors)["rms"]]
-    best = rms.index(min(rms))
-    why = f"free runs over the last quarter of the training part miss {rms[0]:.2g} with named terms, {rms[1]:.2g} with "
-    why += f"networks ({plans[1].objective})"
-    plan = replace(plans[best], reasons={**plans[best].reasons, "objective": why, "network": why})
-    return (seen, other)[best], plan
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:
