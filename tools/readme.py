@@ -32,12 +32,12 @@ def elsewhere(text: str, folder: Path, leaves: Callable[[str], bool]) -> str:
 
 
 try:
-    from hatchling.metadata.plugin.interface import MetadataHookInterface
+    from hatchling.metadata.plugin.interface import MetadataHookInterface  # pyright: ignore[reportMissingImports]
 except ImportError:  # the site needs `elsewhere` alone
     MetadataHookInterface = object
 
 
-class ReadmeHook(MetadataHookInterface):
+class ReadmeHook(MetadataHookInterface):  # pyright: ignore[reportGeneralTypeIssues]
     """Called by hatchling: README and addresses of the package."""
 
     def update(self, metadata: dict[str, Any]) -> None:

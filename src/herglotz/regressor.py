@@ -20,8 +20,8 @@ from herglotz.threads import one_thread
 from herglotz.training import FitConfig, fit
 
 try:
-    from sklearn.base import BaseEstimator, RegressorMixin
-    from sklearn.utils.validation import check_is_fitted
+    from sklearn.base import BaseEstimator, RegressorMixin  # pyright: ignore[reportMissingImports]
+    from sklearn.utils.validation import check_is_fitted  # pyright: ignore[reportMissingImports]
 except ImportError:
     raise ImportError("HerglotzRegressor needs scikit-learn; install it: pip install 'herglotz[sklearn]'") from None
 

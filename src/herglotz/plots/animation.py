@@ -67,8 +67,8 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
             moving.set_color(MODEL if time <= boundary else UNSEEN)
             cursor.set_xdata([time, time])
             canvas.restore_region(still)
-            for artist in artists:
-                artist.axes.draw_artist(artist)
+            for ax, artist in zip((left, left, right), artists, strict=True):
+                ax.draw_artist(artist)
             images.append(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS))
     write_atomically(path, _gif(images))
 

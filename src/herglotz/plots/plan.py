@@ -49,7 +49,7 @@ def plot_plan(run: Run) -> Figure:
             ax.text(1.4, top - height / 2, left, ha="center", va="center", color=INK, fontsize=8.5)
             ax.text(2.95, top - height / 2, right, ha="left", va="center", color="#555555", fontsize=8.5)
             if k + 1 < len(rows):
-                ends = {"xy": (1.4, top - height - GAP), "xytext": (1.4, top - height)}
-                ax.annotate("", **ends, arrowprops={"arrowstyle": "-|>", "color": MUTED, "lw": 0.8})
+                arrow = {"arrowstyle": "-|>", "color": MUTED, "lw": 0.8}
+                ax.annotate("", (1.4, top - height - GAP), (1.4, top - height), arrowprops=arrow)
             top -= height + GAP
     return figure

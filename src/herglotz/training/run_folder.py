@@ -184,9 +184,9 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
 def _log(history: list[dict[str, Any]]) -> bytes:
     """Stage, iteration and cost as csv."""
     buffer = StringIO()
-    writer = csv.DictWriter(buffer, ("stage", "iteration", "cost"), extrasaction="ignore", lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(history)
+    writer = csv.writer(buffer, lineterminator="\n")
+    writer.writerow(names := ("stage", "iteration", "cost"))
+    writer.writerows([row[name] for name in names] for row in history)
     return buffer.getvalue().encode()
 
 

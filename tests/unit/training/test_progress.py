@@ -4,7 +4,7 @@ import torch
 
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
-from herglotz.training.stages import Stages
+from herglotz.training.stages import Progress, Stages
 
 
 def optimise(x, callback):
@@ -15,11 +15,13 @@ def optimise(x, callback):
 
 def test_lines_of_stages_and_of_iterations(capsys):
     # fails if --verbose says no more than the default, --quiet speaks, or a cost is shown in units of its own
-    for progress, expected in (
+    cases: list[tuple[Progress, list[str]]] = [
         (False, []),
         ("lines", ["b"]),
         ("iterations", ["b, iteration 1", "b, iteration 2", "b"]),
-    ):
+    ]
+    lines = []
+    for progress, expected in cases:
         Stages(progress, None, "", False).run("b", torch.zeros(1), 9, optimise)
         lines = capsys.readouterr().err.splitlines()
         assert [line.split(":")[0] for line in lines] == expected
