@@ -7,16 +7,36 @@ ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 # Each worker takes tests that stand side by side, so that few fixtures of a module are made twice.
 SPREAD := -n $(WORKERS) --dist worksteal
 
-.PHONY: demo lint check test test-anywhere test-slow mutants fuzz census clean
+.PHONY: demo docs tutorials lint check test test-anywhere test-pythons test-slow mutants fuzz census clean
 
-.venv/installed: pyproject.toml constraints.txt
+# $(1): what is installed beside the package's own requirements
+define install
 	@$(PYTHON) -c 'import sys; sys.exit("herglotz needs Python >= 3.11, this is " + sys.version.split()[0]) if sys.version_info < (3, 11) else None'
-	$(PYTHON) -m venv .venv
-	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[dev]'
+	@[ -x $(PY) ] || $(PYTHON) -m venv .venv
+	$(PY) -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.$(1)'
+endef
+
+.venv/runtime: pyproject.toml constraints.txt
+	$(call install,)
 	@touch $@
 
-demo: .venv/installed
+.venv/installed: pyproject.toml constraints.txt
+	$(call install,[dev])
+	@touch .venv/runtime $@
+
+.venv/site: pyproject.toml constraints.txt
+	$(call install,[docs])
+	@touch .venv/runtime $@
+
+demo: .venv/runtime
 	MPLBACKEND=Agg $(PY) train/demo.py
+
+# The documentation site, in build/site; `make tutorials` executes the scripts of its tutorials again (minutes).
+docs: .venv/site
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --quiet
+
+tutorials: .venv/runtime
+	$(ENV) $(PY) tools/pages.py
 
 lint: .venv/installed
 	$(PY) -m ruff check .
@@ -35,6 +55,10 @@ test: lint
 # stopped and goes on where it was.
 test-anywhere: .venv/installed
 	$(PY) tests/anywhere.py
+
+# The suite on every Python that is supported and installed here, each in an environment of its own.
+test-pythons: .venv/installed
+	$(PY) tests/anywhere.py --only python3.11 python3.12 python3.13
 
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow

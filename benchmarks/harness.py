@@ -167,6 +167,6 @@ def picture(figure: Any, path: Path) -> None:
 
     whole, small = io.BytesIO(), io.BytesIO()
     figure.savefig(whole, format="png", dpi=DPI)
-    image = Image.open(whole).convert("RGB").quantize(COLOURS, dither=Image.Dither.NONE)
+    image = Image.open(whole).convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE)
     image.save(small, format="png", optimize=True)
     write_atomically(path, small.getvalue())

@@ -30,6 +30,8 @@ VARIANTS = {  # name: (environment, workers, versions)
     "oldest": (ONE, 2, ("numpy==1.26.*", "matplotlib==3.8.*")),  # the least that pyproject.toml allows
     "newest": (ONE, 2, ("numpy", "matplotlib")),
 }
+PYTHONS = {f"python3.{minor}": (ONE, 2, ()) for minor in (11, 12, 13)}  # interpreters, with the pinned versions
+EVERY = {**VARIANTS, **PYTHONS}
 COUNTED = ("passed", "failed", "error", "skipped", "xfailed")
 
 
@@ -53,12 +55,13 @@ def python(versions: tuple[str, ...] | None, name: str) -> str:
     """The interpreter of a virtual environment with these versions; made on its first use."""
     if versions is None:
         return sys.executable
+    base = name if name.startswith("python") else sys.executable
     folder = ROOT / ".venv" / f"anywhere-{name}"
     own = folder / "bin" / "python"
     if not (folder / "installed").exists():
         pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
-        kept = [line for line in pinned if not line.startswith(("numpy", "matplotlib"))]
-        subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
+        kept = [line for line in pinned if not (versions and line.startswith(("numpy", "matplotlib")))]
+        subprocess.run([base, "-m", "venv", str(folder)], check=True)
         (folder / "constraints.txt").write_text("\n".join([*kept, ""]), encoding="utf-8")
         install = [str(own), "-m", "pip", "install", "--quiet", "-c", str(folder / "constraints.txt")]
         subprocess.run([*install, "--upgrade", *versions, "-e", f"{ROOT}[dev]"], check=True)
@@ -68,7 +71,7 @@ def python(versions: tuple[str, ...] | None, name: str) -> str:
 
 def run(variant: str, folder: str, options: list[str]) -> dict[str, Any]:
     """One folder in one variant: the counts of pytest, and which tests failed."""
-    environment, workers, versions = VARIANTS[variant]
+    environment, workers, versions = EVERY[variant]
     paths = sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob("test_*.py"))
     spread = ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
     command = [python(versions, variant), "-m", "pytest", "-q", "-rfE", *spread, *paths, *options]
@@ -93,7 +96,7 @@ def table(results: dict[str, dict[str, Any]], wanted: list[str]) -> str:
 
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), help="variants to run")
+    parser.add_argument("--only", nargs="+", choices=EVERY, default=list(VARIANTS), help="variants to run")
     parser.add_argument("--folders", nargs="+", default=folders(), help="folders to run, such as tests/unit/data")
     parser.add_argument("--minutes", type=float, default=float("inf"), help="start no folder after so long")
     parser.add_argument("--again", action="store_true", help="forget what passed")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import statistics
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -122,7 +123,7 @@ def draw(result: dict[str, Any], path: Path) -> None:
     columns = min(4, len(shown))
     lines = -(-len(shown) // columns)
     with styled():
-        width, height = 2.6 + 2.5 * columns, 0.9 + (0.6 + 0.27 * len(peers)) * lines
+        width, height = 2.6 + 2.5 * columns, 0.9 + (1.0 + 0.27 * len(peers)) * lines
         title = "Error of rollouts from unseen starts: RMS (rad) of every seed, and the median seed"
         figure = new_figure(width, height, title)
         top = {"rect": (0.0, 0.0, 1.0, 1.0 - 0.32 / height)}  # room for the key under the title
@@ -144,7 +145,9 @@ def draw(result: dict[str, Any], path: Path) -> None:
                     ink = color if exact else MUTED
                     ax.text(0.99, y, "failed", transform=ax.get_yaxis_transform(), ha="right", va="center", color=ink,
                             fontsize=7.5, in_layout=False)  # fmt: skip
-            ax.set(xscale="log", title=data, ylim=(-0.7, len(peers) - 0.4))
+            words = result["titles"].get(data, data).split(";")[0].replace(" = ", "\u00a0=\u00a0")
+            ax.set_title(textwrap.fill(words, 38), fontsize=8)
+            ax.set(xscale="log", xlabel="RMS (rad)", ylim=(-0.7, len(peers) - 0.4))
             low, high = ax.get_xlim()
             ax.set_xlim(low, high * (high / low) ** 0.03)
             ax.set_yticks(list(place.values()), [PEERS[p].title for p in place])

@@ -31,7 +31,7 @@ def rollout_rms(model, h, seed, steps=100):
 
 @pytest.fixture(scope="module")
 def exact_data():
-    return simulate(scene("damped_pendulum"), trajectories=40, steps=40, h=0.5, seed=0)
+    return simulate(scene("damped_pendulum"), trajectories=12, steps=40, h=0.5, seed=0)
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_exact_positions_give_an_accurate_stepper(exact_run):
 def test_raw_residual_collapses_and_verify_says_so(exact_data, seed):
     # fails if ‖R‖² is as good as ‖M⁻¹R‖², or if `verify` passes a model that predicts nothing
     settings = FitConfig(train_fraction=1.0, objective="raw", optimiser="adam", iterations=50, seed=seed)
-    run = fit(exact_data, settings)
+    run = fit(exact_data.select(range(4)), settings)
     costs = [h["cost"] for h in run.history if h["stage"] == "one-step error"]
     assert costs[-1] < 1e-3 * costs[0]  # the objective says that training went well ...
     assert run.metrics["one_step_rms"] > 0.1 * run.metrics["one_step_rms_constant_velocity"]  # ... and it did not

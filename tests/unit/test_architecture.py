@@ -10,9 +10,15 @@ SOURCE = Path(__file__).resolve().parents[2] / "src" / "herglotz"
 # A ← B: B may import A. Rooms between two bars may not import one another; errors, settings and threads serve all.
 ORDER = "mechanics|models|stepping|theory|scenes|data|training|export|tune|verify|plots|report|cli"
 LEVEL = {room: i for i, rooms in enumerate(ORDER.split("|")) for room in rooms.split()}
-RUNTIME = {"torch", "numpy", "matplotlib", "tqdm", "herglotz"} | set(sys.stdlib_module_names)
-# Extras that only some users install: for the ONNX files, and inside functions, so that nothing else needs them.
-EXTRAS = {"onnx", "onnxruntime"}
+RUNTIME = {"torch", "numpy", "matplotlib", "PIL", "tqdm", "herglotz"} | set(
+    sys.stdlib_module_names
+)  # PIL comes with matplotlib
+# Extras that only some users install, with the files that may import them: inside functions, but for the regressor.
+EXTRAS = {
+    "onnx": ("export/lower/onnx*.py", "export/load.py"),
+    "onnxruntime": ("export/lower/onnx*.py", "export/load.py"),
+    "sklearn": ("regressor.py",),
+}
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
@@ -39,11 +45,8 @@ def test_imports_point_one_way(path):
     room = path.relative_to(SOURCE).parts[0]
     for name in imports(path):
         parts = name.split(".")
-        if (
-            parts[0] in EXTRAS
-            and (path.match("export/lower/onnx*.py") or path.match("export/load.py"))
-            and name not in top_level(path)
-        ):
+        inside = path.name == "regressor.py" or name not in top_level(path)
+        if inside and any(path.match(pattern) for pattern in EXTRAS.get(parts[0], ())):
             continue
         assert parts[0] in RUNTIME, f"{path} imports {name}, which is no runtime dependency"
         assert parts[0] != "train", f"{path} imports a script"

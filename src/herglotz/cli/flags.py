@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from herglotz.cli.common import check_output_folder, count, finite
+from herglotz.cli.common import check_output_folder
+from herglotz.cli.settings import add_data_settings
 from herglotz.errors import InputError
 
-DTYPES = ("float64", "float32")  # a copy, so that help does not import PyTorch; a test compares it with the package
+Progress = Literal[False, "lines", "iterations"] | None  # what `herglotz.training.fit` takes
 
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
-    """Add DATA, --out and --resume, and how the data are read: --angles, --train-fraction."""
+    """Add DATA, --out and --resume, --config, and how the data are read: --angles, --train-fraction."""
     parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
-    parser.add_argument(
-        "--train-fraction", type=finite, default=0.667, metavar="F",
-        help="part of every trajectory, in time, to train on, 0 < F <= 1 (default %(default)s)",
-    )  # fmt: skip
+    add_data_settings(parser)
     parser.add_argument(
         "--angles", metavar="NAMES",
         help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
@@ -44,12 +43,17 @@ def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     return {name: value for name, value in given.items() if value is not None}
 
 
-def add_machine_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --seed, --device, --dtype and --json."""
-    parser.add_argument("--seed", type=count, default=0, help="seed of the initial weights (default %(default)s)")
-    parser.add_argument("--device", default="cpu", metavar="D", help="cpu or cuda (default %(default)s)")
-    parser.add_argument("--dtype", choices=DTYPES, default="float64", help="precision (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
+def add_progress_flags(parser: argparse.ArgumentParser) -> None:
+    """Add --quiet and --verbose."""
+    parser.add_argument("--quiet", action="store_true", help="no progress: neither a bar nor lines")
+    parser.add_argument("--verbose", action="store_true", help="a line for every iteration, with its cost")
+
+
+def progress(arguments: argparse.Namespace) -> Progress:
+    """A bar on a terminal, a line a stage elsewhere, a line an iteration when verbose, nothing when quiet."""
+    if arguments.quiet:
+        return False
+    return "iterations" if arguments.verbose else None if sys.stderr.isatty() else "lines"
 
 
 def add_force_flag(parser: argparse.ArgumentParser) -> None:

@@ -6,15 +6,18 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import check_output_folder, is_run
+from herglotz.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
 DESCRIPTION = """\
-Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training. Of DATA: its
-samples. With --theory, of a SCENE or a RUN: the momentum against the generating function and the Hamilton–Jacobi
-residual; of parachute also the paper's two figures. (`herglotz verify RUN --plots` draws the first two as well.)
+Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training and the plan; with
+--animate, animation.gif instead, of data and model moving. Of DATA: its samples. With --theory, of a SCENE or a RUN:
+the momentum against the generating function and the Hamilton–Jacobi residual; of parachute also the paper's two
+figures. (`herglotz verify RUN --plots` draws the first two as well.)
 
 examples:
   herglotz plot runs/pendulum
+  herglotz plot runs/pendulum --animate
   herglotz plot pendulum.csv --out figures --format pdf
   herglotz plot parachute --theory --out figures
 """
@@ -30,6 +33,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
     )  # fmt: skip
     parser.add_argument("--format", choices=FORMATS, default="png", help="kind of file (default %(default)s)")
+    parser.add_argument("--animate", action="store_true", help="of a run: animation.gif, of its first trajectory")
     parser.set_defaults(run=run)
 
 
@@ -38,6 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     source: Path = arguments.source
     folder = arguments.out or (source if is_run(source) else Path())
     check_output_folder(folder)
+    if arguments.animate and (arguments.theory or not is_run(source)):
+        raise InputError(f"--animate draws a run; {source} is none: fit it first, and leave out --theory")
     if arguments.theory:
         from herglotz.plots import save_theory_figures
 
@@ -47,8 +53,13 @@ def run(arguments: argparse.Namespace) -> int:
 
         result = load_run(source)
 
-        from herglotz.plots import save_figures
+        from herglotz.plots import save_animation, save_figures
 
+        if arguments.animate:
+            folder.mkdir(parents=True, exist_ok=True)
+            save_animation(result, folder / "animation.gif")
+            print(folder / "animation.gif")
+            return 0
         written = save_figures(result, folder, form=arguments.format)
     else:
         from herglotz.data import load

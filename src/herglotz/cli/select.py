@@ -7,8 +7,8 @@ import json
 from pathlib import Path
 
 from herglotz.cli.common import count, print_json
-from herglotz.cli.fit import LEVELS
-from herglotz.cli.flags import add_machine_flags, add_run_flags, check_run_folder, columns_of, parse_angles
+from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, parse_angles, progress
+from herglotz.cli.settings import LEVELS, add_machine_flags, settings_of
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -31,6 +31,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "but full, and auto for joints; with recorded inputs u: forced and auto, which adds dry friction",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
+    add_progress_flags(parser)
     add_machine_flags(parser)
     parser.set_defaults(run=run)
 
@@ -44,17 +45,17 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.data.files import write_atomically
     from herglotz.data.lock import locked
     from herglotz.plots import plot_selection, save_figure
-    from herglotz.training import FitConfig, save_run, select
+    from herglotz.training import save_run, select
 
     data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
-    config = FitConfig(
-        train_fraction=arguments.train_fraction, seed=arguments.seed, dtype=arguments.dtype, device=arguments.device
-    )
+    config = settings_of(arguments)
     levels = None
     if arguments.levels is not None:
         levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
     with locked(out):
-        found = select(data, levels, arguments.seeds, config, out=out, resume=arguments.resume)
+        found = select(
+            data, levels, arguments.seeds, config, out=out, resume=arguments.resume, progress=progress(arguments)
+        )
         save_run(found.run, out)
         write_atomically(out / "selection.json", found.to_json().encode())
         save_figure(plot_selection(found), out / "selection.png")

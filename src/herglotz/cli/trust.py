@@ -79,7 +79,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(numbers)
     else:
-        _report(numbers, physical, folder / "bands.png")
+        _report(numbers, physical, result.metrics.get("equation"), folder / "bands.png")
     verdict = str(result.metrics.get("verdict", ""))
     if verdict.startswith("does not fit"):
         text = "the run does not fit its data: what is said here of its parameters means little; fit it better first"
@@ -95,7 +95,7 @@ def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
     return numbers
 
 
-def _report(numbers: dict[str, Any], physical: list[Quantity], figure: Path) -> None:
+def _report(numbers: dict[str, Any], physical: list[Quantity], equation: dict[str, Any] | None, figure: Path) -> None:
     percent = f"{100 * numbers['level']:g} % band"
     rows = [(f"{percent}, training", f"{100 * numbers['inside_training']:.1f} % of the samples inside")]
     if numbers["inside_held_out"] is not None:
@@ -105,6 +105,9 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], figure: Path) -> 
     worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
     rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
     print_table(rows)
+    if equation:  # the coefficients of named terms stand there with their deviations
+        print("Learned equation, standard deviations in brackets, of the last digits:")
+        print(*(f"  {line}" for line in equation["text"].splitlines()), sep="\n")
     print("Value ± standard deviation (the first mass is 1):")
     for x in physical:
         print(fill(f"{x.words}: {x}", COLUMNS, initial_indent="  ", subsequent_indent="      "))

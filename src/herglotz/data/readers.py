@@ -10,6 +10,7 @@ from typing import Any
 
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.extra_formats import read_hdf5, read_mat, read_parquet
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
@@ -25,19 +26,26 @@ class Format:
 
     name: str  # as messages say it
     suffix: str
-    read: Callable[[Path], Trajectories]
+    read: Callable[..., Trajectories]
+    is_table: bool = False  # whether columns can be chosen
     first_line: Callable[[str], bool] = lambda _: True  # whether the first line can belong to this format
 
 
 # The first format that fits reads the file: a special case of a suffix stands before the general one.
 FORMATS = (
-    Format("IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, looks_like_markers),
-    Format("t[s],q[rad],... (.csv)", ".csv", read_csv),
+    Format(
+        "IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, False, looks_like_markers,
+    ),
+    Format("t[s],q[rad],... (.csv)", ".csv", read_csv, True),
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format(
-        "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson,
+        "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
         lambda line: line.startswith("%"),
     ),
+    Format("columns as in csv (.parquet)", ".parquet", read_parquet, True),
+    Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_hdf5, True),
+    Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_hdf5, True),
+    Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_mat, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
 
@@ -94,10 +102,9 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
     candidates = [one for one in FORMATS if one.suffix == suffix]
     for one in candidates:
         if one.first_line(line):
-            if not wanted:
-                return one.read(path)
-            if one.read is not read_csv:
-                raise InputError(f"{path}: columns are chosen in a csv table; this is {one.name}")
-            return read_csv(path, **vars(wanted))
+            if wanted and not one.is_table:
+                raise InputError(f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}")
+            return one.read(path, **vars(wanted)) if one.is_table else one.read(path)
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
-    raise InputError(f"{path}: cannot read {what}; known formats: {'; '.join(one.name for one in FORMATS)}")
+    known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
+    raise InputError(f"{path}: cannot read {what}; known formats: {known}")

@@ -73,18 +73,20 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
     )
 
 
-def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
+def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:
     """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
+
+    `where` begins messages.
 
     Raises
     ------
     InputError
         Naming column, row (counted from 0), value and remedy.
     """
-    where, heads = Path("DataFrame"), [str(name) for name in frame.columns]
+    heads = [str(name) for name in frame.columns]
     columns = assign(heads, str(where), wanted)
     raw = [np.asarray(frame[name]) for name in frame.columns]
-    numbers = np.stack([_numbers(columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
+    numbers = np.stack([_numbers(where, columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
     labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     return from_table(where, columns, range(len(numbers)), labels, numbers)
 
@@ -102,19 +104,17 @@ def _called(columns: Columns) -> tuple[str, str]:
     return label, columns.names[columns.time]
 
 
-def _numbers(name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
+def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
     """A column as finite float64; dates become seconds since the first of them."""
     if is_time and column.dtype.kind == "M":
         return (column - column[:1]) / np.timedelta64(1, "s")
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"DataFrame, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+        raise InputError(f"{where}, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
     if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
-        raise InputError(
-            f"DataFrame, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one"
-        )
+        raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
     bad = np.nonzero(~np.isfinite(found))[0]
     if len(bad):
-        raise InputError(f"DataFrame, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
+        raise InputError(f"{where}, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
     return found

@@ -11,6 +11,7 @@ from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
 from herglotz.training import Run
+from herglotz.training.summary import model_card
 
 WRITERS = {"pt2": export_pt2, "aoti": export_aoti, "onnx": export_onnx, "c": export_c}
 KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file, by the end of its name
@@ -47,6 +48,7 @@ def export_run(
         "time_unit": run.data.time_unit,
         "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
         "metrics": run.metrics,
+        "card": model_card(run, h_range or run.h_range),
         "h_range": list(h_range or run.h_range),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}

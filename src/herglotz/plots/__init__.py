@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
+from herglotz.plots.animation import save_animation
 from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.learned import plot_learned
@@ -17,6 +18,7 @@ from herglotz.plots.motion import plot_data, plot_trajectory
 from herglotz.plots.parachute import plot_fall, plot_printed_map
 from herglotz.plots.parachute_motion import physical_fall, printed_map
 from herglotz.plots.phase import plot_phase_portrait
+from herglotz.plots.plan import plot_plan
 from herglotz.plots.selection import plot_selection
 from herglotz.plots.style import save_figure
 from herglotz.plots.training import plot_training
@@ -30,6 +32,7 @@ FIGURES = {
     "phase_portrait": plot_phase_portrait,
     "learned": plot_learned,
     "training": plot_training,
+    "plan": plot_plan,
 }
 # Of S^k, which a model with forces does not have: identities that hold to rounding (`herglotz verify --plots`).
 IDENTITIES = {
@@ -81,14 +84,15 @@ def save_figures(
     Returns
     -------
     list of Path
-        In the order of `figures`. All figures are drawn before one is written.
+        In the order of `figures`, without the plan where the run holds none. All are drawn before one is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    drawn = {f"{name}.{form}": plot(run) for name, plot in figures.items()}
+    held = {name: plot for name, plot in figures.items() if name != "plan" or "plan" in run.metrics}
+    drawn = {f"{name}.{form}": plot(run) for name, plot in held.items()}
     folder = _made(folder)
     for name, figure in drawn.items():
         save_figure(figure, folder / name)
@@ -114,10 +118,12 @@ __all__ = [
     "plot_learned",
     "plot_momentum_vs_generating_function",
     "plot_phase_portrait",
+    "plot_plan",
     "plot_printed_map",
     "plot_selection",
     "plot_training",
     "plot_trajectory",
+    "save_animation",
     "save_figure",
     "save_figures",
     "save_theory_figures",

@@ -17,7 +17,10 @@ MOST_PANELS = 4
 
 
 def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
-    """Draw data − model against time, with the bands of the model's position and of a measured value."""
+    """Draw data − model against time, with the bands of the model's position and of a measured value.
+
+    At most four panels: coordinates of one trajectory, then of the next. Panels of one unit have one scale.
+    """
     data = run.data.unwrapped()
     inside, held = bands.inside(data.q, level), ~trained_mask(run)
     part, word = (held, "held-out ") if bool(held.any()) else (~held, "")
@@ -26,8 +29,8 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
     cells = [(b, i) for b in range(len(data)) for i in range(data.dof)][:MOST_PANELS]
     width = NormalDist().inv_cdf(0.5 + level / 2)
     with styled():
-        figure = new_figure(8.0, 1.2 + 1.8 * len(cells), title)
-        axes = figure.subplots(len(cells), 1, squeeze=False)[:, 0]
+        figure = new_figure(8.0, 1.2 + 1.9 * len(cells), title)
+        axes, reaches = figure.subplots(len(cells), 1, squeeze=False)[:, 0], []
         for (b, i), ax in zip(cells, axes, strict=True):
             rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
             t, residual = data.t[rows].cpu(), (data.q - bands.q)[rows, i].cpu()
@@ -41,9 +44,15 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
             ax.axhline(0.0, color=MUTED, lw=0.8, zorder=3)
             ax.plot(t[:trained], residual[:trained], ".", color=MODEL, ms=4, zorder=4)
             ax.plot(t[trained:], residual[trained:], ".", color=UNSEEN, ms=4, zorder=4)
-            reach = 1.5 * float(max(residual.abs().max(), measured.max()))
-            ax.set(xlim=(float(t[0]), float(t[-1])), ylim=(-reach, reach))
+            ax.set_xlim(float(t[0]), float(t[-1]))
+            reaches.append(float(max(residual.abs().max(), measured.max())))
+            if len(data) > 1:
+                ax.set_title(f"trajectory {b}")
             ax.set_ylabel(with_unit(f"residual of {data.names[i]}", data.units[i]))
+        units = [data.units[i] for _, i in cells]
+        for ax, unit in zip(axes, units, strict=True):  # one scale a unit: panels can be compared
+            alike = max(other for other, own in zip(reaches, units, strict=True) if own == unit)
+            ax.set_ylim(-1.5 * alike, 1.5 * alike)
         captions(axes[0], [("● training", MODEL), ("● held out", UNSEEN), ("dark: model, light: measurement", MUTED)])
         axes[-1].set_xlabel(with_unit("time", data.time_unit))
     return figure

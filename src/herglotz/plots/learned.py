@@ -1,4 +1,4 @@
-"""What the model has learned: potential, force and friction along each coordinate, with the support of the data."""
+"""What the model has learned: potential, force, friction and mass along each coordinate, with the data's support."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.models.terms import LinearDamping
 from herglotz.plots.fan import units
 from herglotz.plots.motion import trained_mask
-from herglotz.plots.style import MODEL, MUTED, SUPPORT, captions, new_figure, styled, with_unit
+from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, styled, with_unit
 from herglotz.stepping.field import FieldOf
 
 if TYPE_CHECKING:
@@ -21,14 +22,16 @@ if TYPE_CHECKING:
 MOST_COLUMNS, POINTS = 3, 161
 BEYOND = 0.25  # of the data's range, drawn on both sides of it
 STEP = 1e-4  # of a difference with respect to parameters, which are of size 1
+CONSTANT = 1e-6  # of the largest mass: entries that vary by less are rounding of float32
 Curves = list[Tensor]  # the curve and, with a posterior, its standard deviation, (POINTS,) each
 
 
 def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     """Draw V(q_i) and the force −∂V/∂q_i along each coordinate, the others at their median; and friction, if any.
 
-    The first mass is 1, so that forces are accelerations of the first coordinate. The range of the training data is
-    shaded: beyond it the model extrapolates.
+    Where the mass depends on position, its entries m_jk that do are drawn along each coordinate, too. The first mass
+    is 1, so that forces are accelerations of the first coordinate. The range of the training data is shaded: beyond
+    it the model extrapolates.
 
     Parameters
     ----------
@@ -38,12 +41,13 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
         Adds bands of two standard deviations.
     """
     columns = min(run.data.dof, MOST_COLUMNS)
-    rubs = run.model.friction is not None
+    rubs, entries = run.model.friction is not None, _moving_masses(run)
+    rows = 2 + rubs + bool(entries)
     momentum, _ = units(run)
     force = momentum + "²" if momentum and run.data.time_unit not in ("", "1") else ""  # rad/s, rad/s²
     with styled():
-        figure = new_figure(1.2 + 3.9 * columns, 2.3 * (2 + rubs) + 0.5, "What the model has learned, mass 1")
-        axes = figure.subplots(2 + rubs, columns, squeeze=False)
+        figure = new_figure(1.2 + 3.9 * columns, 2.3 * rows + 0.5, "What the model has learned, mass 1")
+        axes = figure.subplots(rows, columns, squeeze=False)
         for i in range(columns):
             x, low, high = _range(run.states.q[trained_mask(run), i])
             name = with_unit(run.data.names[i], run.data.units[i])
@@ -56,9 +60,15 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
                 _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))
                 axes[2, i].set(xlabel=with_unit(f"velocity of {run.data.names[i]}", momentum))
                 axes[2, i].set_ylabel(with_unit("friction", force))
+            for (j, k), color in zip(entries, SERIES, strict=False):
+                _panel(axes[-1, i], x, _curves(posterior, _mass(run, i, x, (j, k))), (low, high), color)
+                axes[-1, i].set(xlabel=name, ylabel="mass")
         band = [] if posterior is None else [("band: ±2 standard deviations", MODEL)]
         captions(axes[0, 0], [("shaded: where the data are", "#666666"), *band])
         axes[0, 0].margins(y=0.3)
+        if entries:
+            captions(axes[-1, 0], [(f"m{j + 1}{k + 1}", c) for (j, k), c in zip(entries, SERIES, strict=False)])
+            axes[-1, 0].margins(y=0.3)
     return figure
 
 
@@ -99,16 +109,41 @@ def _force(run: Run, i: int, x: Tensor) -> Callable[[], Tensor]:
 
 
 def _friction(run: Run, i: int, v: Tensor) -> Callable[[], Tensor]:
-    friction = run.model.friction
+    """The force against the velocity of coordinate i: −γ m v of the contact term, and that of the friction."""
+    friction, damping = run.model.friction, run.model.damping
+    m = _masses(run, _line(run, i, run.states.q[:1, i]))[..., 0]
     speeds = torch.zeros(len(v), run.data.dof, dtype=run.states.q.dtype)
     speeds[:, i] = v.to(speeds)
 
     def f() -> Tensor:
         assert friction is not None
         smooth = friction.force(speeds, None).value
-        return (smooth - friction.grip(speeds)[0] * speeds.sign() if friction.sticking else smooth)[:, i]
+        held = friction.grip(speeds)[0] * speeds.sign() if friction.sticking else 0.0
+        contact = damping.rate * speeds @ m if isinstance(damping, LinearDamping) else 0.0
+        return (smooth - held - contact)[:, i]
 
     return f
+
+
+def _mass(run: Run, i: int, x: Tensor, entry: tuple[int, int]) -> Callable[[], Tensor]:
+    q = _line(run, i, x)
+    return lambda: _masses(run, q)[entry]
+
+
+def _masses(run: Run, q: Tensor) -> Tensor:
+    """m(q) = −h ∂²K/∂q₀∂q₁ at rest, (n, n, POINTS), q (POINTS, n)."""
+    n, h = run.data.dof, torch.full(q.shape[:1], run.h, dtype=q.dtype)
+    K = run.model.terms(q, q, h, 2).K
+    return q.new_zeros(n, n, len(q)) if K is None else -run.h * K.hessian()[:n, n:].movedim(-1, 2)
+
+
+@torch.no_grad()
+def _moving_masses(run: Run) -> list[tuple[int, int]]:
+    """The entries of the mass, on and above the diagonal, that depend on position where the data are."""
+    q = run.states.q[torch.isfinite(run.states.q).all(-1)]
+    m = _masses(run, q)
+    spread = m.amax(-1) - m.amin(-1) > CONSTANT * m.abs().amax()
+    return [(j, k) for j in range(len(m)) for k in range(j, len(m)) if bool(spread[j, k])]
 
 
 def _curves(posterior: Laplace | None, curve: Callable[[], Tensor]) -> Curves:
@@ -135,11 +170,11 @@ def _curves(posterior: Laplace | None, curve: Callable[[], Tensor]) -> Curves:
     return [*found, variance.sqrt()]
 
 
-def _panel(ax: Axes, x: Tensor, curves: Curves, support: tuple[float, float]) -> None:
+def _panel(ax: Axes, x: Tensor, curves: Curves, support: tuple[float, float], color: str = MODEL) -> None:
     ax.axvspan(*support, color=SUPPORT, lw=0, zorder=0)
     ax.axhline(0.0, color=MUTED, lw=0.6, zorder=1)
     if len(curves) > 1:
         spread = 2 * curves[1]
-        ax.fill_between(x, curves[0] - spread, curves[0] + spread, color=MODEL, alpha=0.25, lw=0, zorder=2)
-    ax.plot(x, curves[0], color=MODEL, zorder=3)
+        ax.fill_between(x, curves[0] - spread, curves[0] + spread, color=color, alpha=0.25, lw=0, zorder=2)
+    ax.plot(x, curves[0], color=color, zorder=3)
     ax.set_xlim(float(x[0]), float(x[-1]))

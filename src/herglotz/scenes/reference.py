@@ -138,21 +138,28 @@ def _integrate(f: Derivative, x: Tensor, span: Tensor, substeps: int) -> Tensor:
 
 def _extrapolated_step(f: Derivative, x: Tensor, h: Tensor) -> Tensor:
     """One step of order 12, by the Aitken–Neville scheme in the squared step."""
-    slope = f(x)
     row: list[Tensor] = []
-    for j, count in enumerate(SEQUENCE):
-        new = [_modified_midpoint(f, x, slope, h, count)]
+    for j, first in enumerate(_modified_midpoints(f, x, h)):
+        new = [first]
         for k in range(j):
-            ratio = (count / SEQUENCE[j - 1 - k]) ** 2
+            ratio = (SEQUENCE[j] / SEQUENCE[j - 1 - k]) ** 2
             new.append(new[k] + (new[k] - row[k]) / (ratio - 1.0))
         row = new
     return x + row[-1]
 
 
-def _modified_midpoint(f: Derivative, x: Tensor, slope: Tensor, h: Tensor, count: int) -> Tensor:
-    """Increment of x after `count` (even) leapfrog steps of h/count that start with an Euler step."""
-    d = h / count
-    before, now = torch.zeros_like(x), d * slope
-    for _ in range(count - 1):
+def _modified_midpoints(f: Derivative, x: Tensor, h: Tensor) -> list[Tensor]:
+    """Increments of x after each number of leapfrog steps of `SEQUENCE`, which start with an Euler step.
+
+    The columns are one batch, from which the finished ones leave: f is called 12 times instead of 37.
+    """
+    counts = torch.tensor(SEQUENCE, dtype=x.dtype, device=x.device)
+    d = h / counts.reshape(-1, *(1,) * x.ndim)
+    now = d * f(x)
+    before, found = torch.zeros_like(now), []
+    for k in range(2, SEQUENCE[-1] + 1):
         before, now = now, before + 2.0 * d * f(x + now)
-    return now
+        if k == SEQUENCE[len(found)]:
+            found.append(now[0])
+            before, now, d = before[1:], now[1:], d[1:]
+    return found

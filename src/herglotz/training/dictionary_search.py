@@ -3,32 +3,31 @@
 The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
 trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
-leave. Model steps are halved while that changes the motion by as much as the data miss it.
+leave. That criterion takes residuals for white noise. Where they are none, because a force or the rule's accuracy is
+missing, any term may take over some of it: there terms stay only if held-out blocks of time ask for them as well. Model
+steps are halved while that changes the motion by as much as the data miss it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
-from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smooth_triples, smoothed
-from herglotz.models.jet import pairs
+from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.cross_validation import MARGIN
+from herglotz.training.linear_terms import LinearTerms
 from herglotz.training.named_terms import (
-    DRAG,
     DRY,
-    MOVING,
-    STILL,
     NamedTerms,
     candidates,
-    own_terms,
     places,
     settings_of,
     started,
@@ -44,7 +43,7 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
-ROWS = 4000  # triples in the linear problem
+COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
 LOWER = 0.99  # share of the misfit that is left where halved steps are kept
@@ -71,6 +70,20 @@ class Found:
         """Misfit of the data, in units of q."""
         return self.fit.noise
 
+    @cached_property
+    def held_out(self) -> Tensor:
+        """RMS over held-out blocks of time, (FOLDS,)."""
+        return self.fit.held_out_errors()
+
+    @property
+    def coloured(self) -> bool:
+        """Whether the misfit goes on from sample to sample, by its autocorrelation: white noise has 0 ± 1/√N."""
+        problem = self.fit.problem
+        r = problem.misfit(self.fit.path)[problem.grid.sample.argsort()]
+        together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
+        with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
+        return float(with_next) > COLOURED / r.numel() ** 0.5
+
 
 class DictionarySearch:
     """See the head of this module.
@@ -89,7 +102,6 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
-        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
         self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
@@ -98,23 +110,23 @@ class DictionarySearch:
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
         local = local_polynomials(self.data)
-        linear = None if local is None else self._linear(local)
+        linear = None if local is None else LinearTerms(self.data, self.base, self.all).start(local)
         if linear is None or local is None:
             return None
         terms, values = linear
         found = self._grown(terms, values, 1, smoothed(self.data, local))
         if found is None:
             return None
-        found = self._finer(self._held(found))
+        found = self._finer(self._held(self._simpler(found)))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
-            if more is None or not more.rms < found.rms:
+            if more is None or not more.rms < found.rms or (found.coloured and not self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._pruned(found)
+        return self._last_terms(self._pruned(found))
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
@@ -122,72 +134,6 @@ class DictionarySearch:
             return found
         other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
         return found if other is None or not other.rms < found.rms else self._longer(other)
-
-    def _linear(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
-        """Terms and values of the linear problem, pruned."""
-        t, u = smooth_triples(self.data, local)
-        rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
-        if len(t) > ROWS:
-            t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed, u)
-        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
-        columns = self._columns(fit)
-        x = fit.solve(columns)
-        if float(x[0]) == 0:
-            return None
-        x = x / x[0]
-        r = fit.errors(x)
-        if not bool(torch.isfinite(r).all()):
-            return None
-        X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
-        size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
-        overlap = max(1.0, local.width / 2)
-        A = X.T @ X / size / overlap
-        place = self._linear_places(fit, columns)
-        free = torch.tensor([i for own in place.values() for i in own])
-        kept, _ = prune(A, x[columns][1:], free, max(3, int(r.numel() / overlap)))
-        stay = set(kept.tolist())
-        terms = self.all.only([name for name, own in place.items() if stay & set(own)])
-        left = columns.clone()
-        at = columns.nonzero()[1:, 0]
-        for name, own in place.items():
-            if name not in terms.names:
-                left[at[own]] = False
-        start = fit.start(fit.solve(left))
-        if start is None:
-            return None
-        values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
-        for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            values |= zip(names, values.pop(parameter, ()), strict=True)
-        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
-        return terms, values
-
-    @property
-    def _still(self) -> list[str]:
-        return [x for x in self.all.features if "v" not in x and x not in self.own]
-
-    @property
-    def _moving(self) -> list[str]:
-        return [x for x in self.all.features if "v" in x]
-
-    def _columns(self, fit: LinearFit) -> Tensor:
-        """All columns for joints; no mass or friction between lengths."""
-        if any(self.data.angles):
-            return torch.ones(len(fit.names), dtype=torch.bool)
-        i, j = pairs(self.data.dof, torch.device("cpu"))
-        diagonal = iter((i == j).tolist())
-        return torch.tensor([next(diagonal) if x == "mass" else x != "coupling.viscous" for x in fit.names])
-
-    def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
-        """Columns of each term among those that are used, the first mass not counted."""
-        names = [x for x, used in zip(fit.names, columns.tolist(), strict=True) if used][1:]
-        at: dict[str, list[int]] = {}
-        for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            own = [i for i, x in enumerate(names) if x == parameter]
-            at |= {term: [i] for term, i in zip(terms, own, strict=True)}
-        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
-        at[DRY] = [i for i, x in enumerate(names) if x == DRY]
-        return at
 
     def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
@@ -207,6 +153,7 @@ class DictionarySearch:
     def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
         stages = self._stages(terms, values, substeps, self.config.sticking)
+        stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
         return None if first is None else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
@@ -239,7 +186,7 @@ class DictionarySearch:
         """The fit with other terms or steps, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps)
         states = found.fit.problem.states_at(found.fit.path, problem.grid.start_sample)
-        fit = stages.optimise(problem, problem.parameters.get(), states, "terms")
+        fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
     def _missing(self, found: Found) -> str | None:
@@ -268,36 +215,77 @@ class DictionarySearch:
         return next(name for name in names if int(others[best]) in at[name])
 
     def _pruned(self, found: Found) -> Found:
-        """Without the terms that the fit does not lose by."""
+        """Without the terms that the fit does not lose by, were residuals white noise."""
+        count = self.data.q.numel()
+        terms = self._needed(found, math.log(count))
+        less = None if terms == found.terms else self._refit(found, terms)
+        allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
+        return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+
+    def _simpler(self, found: Found) -> Found:
+        """Without terms that make up for steps that are too long, where residuals are no noise."""
+        count = self.data.q.numel()
+        for worth in (
+            4**self.order * count,
+            count,
+        ):  # as much as halved steps may bring, then twice the misfit
+            terms = self._needed(found, worth)
+            less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
+            if less is not None and (self._too_long(less) or self._as_good(less, found)):
+                return less
+        return found
+
+    def _last_terms(self, found: Found) -> Found:
+        """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
+        while found.terms.names and found.coloured:
+            terms = self._needed(found, 4**self.order * self.data.q.numel(), one_less=True)
+            less = None if terms == found.terms else self._refit(found, terms)
+            less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
+            if less is None or not self._as_good(less, found):
+                break
+            found = less
+        return found
+
+    def _as_good(self, less: Found, found: Found) -> bool:
+        """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
+        return less.rms <= 2**0.5 * max(found.rms, self.floor) and not self._beaten(less, found)
+
+    def _beaten(self, found: Found, other: Found) -> bool:
+        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding.
+
+        Their spread has no say: it is wide where errors grow with time, as on an axis without a spring.
+        """
+        own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
+        return not own <= MARGIN * its
+
+    def _needed(self, found: Found, worth: float, *, one_less: bool = False) -> NamedTerms:
+        """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least."""
         problem = found.fit.problem
         at = places(problem.parameters, found.terms)
         if not at:
-            return found
+            return found.terms
         x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])
         _, A, _ = problem.normal_equations(x)
         A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
         free = torch.tensor([i for own in at.values() for i in own])
-        kept, _ = prune(A, x, free, self.data.q.numel())
-        stay = set(kept.tolist())
-        terms = found.terms.only([name for name, own in at.items() if stay & set(own)])
-        if terms == found.terms:
-            return found
-        less = self._refit(found, terms)
-        allowed = (1 + len(at) * math.log(self.data.q.numel()) / self.data.q.numel()) ** 0.5
-        return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0)[0].tolist())
+        return found.terms.only([name for name, own in at.items() if stay & set(own)])
 
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
-        while True:
-            m = found.config.substeps
-            if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
-                return found
-            if self._change(found, 2 * m) <= max(FINER * found.rms, self.floor):
-                return found
-            other = self._refit(found, found.terms, 2 * m)
+        while self._too_long(found):
+            other = self._refit(found, found.terms, 2 * found.config.substeps)
             if other is None or not other.rms < LOWER * found.rms:
-                return found  # other values of the parameters make up for the longer steps
+                break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
+        return found
+
+    def _too_long(self, found: Found) -> bool:
+        """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
+        m = found.config.substeps
+        if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
+            return False
+        return self._change(found, 2 * m) > max(FINER * found.rms, self.floor)
 
     def _change(self, found: Found, substeps: int) -> float:
         """RMS change of the fitted motion by so many model steps in a recorded one."""

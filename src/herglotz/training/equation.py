@@ -65,7 +65,10 @@ class Term:
 
 @dataclass(frozen=True)
 class Equation:
-    """The learned equation; `str` gives lines of at most 80 columns, without terms that the data do not tell from 0."""
+    """The learned equation; `str` gives lines of at most 80 columns, without terms that the data do not tell from 0.
+
+    Where they tell none of a line's terms, all of them are shown, with their deviations.
+    """
 
     terms: tuple[Term, ...]
     lefts: tuple[str, ...]  # what stands on the left of each line, with its mass
@@ -75,8 +78,9 @@ class Equation:
     def __str__(self) -> str:
         lines = []
         for left in self.lefts:
-            own = [str(term) for term in self.terms if term.left == left and term.shown]
-            right = " ".join(own) or "0"
+            every = [term for term in self.terms if term.left == left]
+            own = [term for term in every if term.shown] or every
+            right = " ".join(map(str, own)) or "0"
             right = right.removeprefix("+ ").replace("− ", "−", 1) if right.startswith(("+", "−")) else right
             lines += textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
         if self.network:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from dataclasses import replace
 from typing import Any
@@ -15,11 +16,11 @@ from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.stepping import State, Stepper
+from herglotz.training.free_run import states_everywhere
 from herglotz.training.inputs import step_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
 from herglotz.training.plan import Plan
-from herglotz.training.problems.grid import substeps
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.run import Run, box_of
@@ -34,9 +35,10 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
     dropped = seen.spikes.clone()
     if fitted.used is not None:
         dropped[~dropped] = ~fitted.used
-    states, status = _states_everywhere(fitted, data, train.lengths, task.base.model_step)
-    metrics = _errors(fitted, task, seen, dropped, states)
-    metrics |= judged(task, seen, fitted, metrics)
+    states, status = states_everywhere(fitted, data, train.lengths, task.base.model_step)
+    metrics, free = _errors(fitted, task, seen, dropped, states)
+    everywhere = torch.cat([states.q, states.p, states.s[:, None]], -1)
+    metrics |= judged(task, seen, fitted, everywhere, free, metrics)
     metrics |= {
         "extrapolation_status": status,
         "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
@@ -57,6 +59,15 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
     return Run(fitted.model, config, metrics, data, train.lengths, states, h, box, task.stages.history)
 
 
+def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
+    """RMS error of the free run over the unseen part, in units of q, without single spikes; inf where it breaks off."""
+    fitted = replace(fitted, states=_with_dropped(fitted, seen.train, seen.spikes))
+    states, _ = states_everywhere(fitted, seen.data, seen.train.lengths, task.base.model_step)
+    _, free = _errors(fitted, task, seen, seen.spikes, states)
+    found = None if free is None else _rms(free)
+    return math.inf if found is None else found
+
+
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
     """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
     n, u = train.dof, step_inputs(fitted.model, train)
@@ -72,44 +83,10 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
     return out
 
 
-def _states_everywhere(
-    fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
-) -> tuple[State, str]:
-    """Return states at every sample: fitted ones on the training part, then a free run from the last of them."""
-    known, n, driven = fitted.states, data.dof, step_inputs(fitted.model, data) is not None
-    out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
-    stepper, status, done = Stepper(fitted.model), "ok", 0
-    for first, length, trained in zip(data.offsets, data.lengths, train_lengths, strict=True):
-        out[first : first + trained] = known[done : done + trained]
-        done += trained
-        if trained == length:
-            continue
-        h, stops, row, part = _fine_steps(data.t[first + trained - 1 : first + length], max_step)
-        start = out[first + trained - 1]
-        inputs = data.inputs_of_steps(first + trained - 1 + row, part) if driven else None
-        with torch.no_grad():
-            run = stepper.rollout(start[:n], start[n : 2 * n], start[2 * n], h=h, inputs=inputs)
-        after = torch.cat([run.q, run.p, run.s[:, None]], -1)[stops]
-        out[first + trained : first + length] = after
-        if not bool(run.ok.all()):
-            status = f"a step failed after t = {float(data.t[first + trained - 1]):g}; nothing is predicted beyond it"
-    return State(out[:, :n], out[:, n : 2 * n], out[:, 2 * n]), status
-
-
-def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Model steps that cover the recorded times; the node that reaches each of them; each step's row, and its middle.
-
-    The middle is a number from 0 to 1, of the recorded step that starts at the row.
-    """
-    counts = torch.tensor([substeps(h, max_step) for h in t.diff().tolist()], device=t.device)
-    row = torch.arange(len(counts), device=t.device).repeat_interleave(counts)
-    ends = counts.cumsum(0)
-    part = (torch.arange(len(row), device=t.device) - (ends - counts)[row] + 0.5) / counts[row]
-    return (t.diff() / counts).repeat_interleave(counts), ends, row, part.to(t.dtype)
-
-
-def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State) -> dict[str, Any]:
-    """Return RMS errors in units of q; None where no sample can be measured or the prediction failed."""
+def _errors(
+    fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: State
+) -> tuple[dict[str, Any], Tensor | None]:
+    """RMS errors in units of q, None where none can be measured, and (M, n) errors of the free run where unseen."""
     data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
     training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
     for first, trained in zip(data.offsets, train.lengths, strict=True):
@@ -130,13 +107,14 @@ def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: Sta
     unmoved = triples.q2 - triples.q1 - ratio * (triples.q1 - triples.q0)
     stepped = len(triples) and base.model_step == base.max_step  # a recorded step is one of the model's
     rate = getattr(fitted.model.damping, "rate", None)
-    return {
+    free = None if seen.unseen is None else error[beyond]
+    numbers = {
         "one_step_rms": _rms(problem.residuals(x)) if stepped else None,
         "one_step_rms_constant_velocity": _rms(unmoved) if len(triples) else None,
         "train_rms": _rms(error[used]),
         "outliers": int(dropped.sum()),
         "outliers_unseen": int((~training).sum() - beyond.sum()),
-        "extrapolation_rms": None if seen.unseen is None else _rms(error[beyond]),
+        "extrapolation_rms": None if free is None else _rms(free),
         "spread": _rms(data.q - data.q.mean(0)),
         "objective": fitted.objective,
         "sigma": fitted.sigma,
@@ -144,6 +122,7 @@ def _errors(fitted: Fitted, task: Task, seen: Look, dropped: Tensor, states: Sta
         "parameters": sum(p.numel() for p in fitted.model.parameters()),
         **fitted.notes,
     }
+    return numbers, free
 
 
 def _rms(x: Tensor) -> float | None:

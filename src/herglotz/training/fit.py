@@ -4,32 +4,30 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
 from contextlib import nullcontext, suppress
-from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
+from herglotz.data.units import DEGREES
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.evaluate import evaluate
-from herglotz.training.look import Look, look
+from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
+from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
-from herglotz.training.stages import Stages
+from herglotz.training.stages import Progress, Stages
 from herglotz.training.task import Task
 from herglotz.training.uncertainty import laplace
-
-INNER = 0.75  # of the training part that rivals are fitted to; they run free over the rest
 
 
 @one_thread()
@@ -39,7 +37,7 @@ def fit(
     *,
     plan: Plan | None = None,
     out: str | Path | None = None,
-    progress: bool | Literal["lines"] | None = None,
+    progress: Progress = None,
     resume: bool = False,
     **settings: Any,
 ) -> Run:
@@ -60,7 +58,8 @@ def fit(
     out
         Folder for the checkpoint (`checkpoint.pt`); nothing is written without it. Use `save_run` for the result.
     progress
-        Show progress bars; None: on a terminal only; "lines": one line on stderr after every stage.
+        Show one bar; None: on a terminal only; "lines": one line on stderr after every stage; "iterations": after every
+        iteration, too.
     resume
         Go on from the checkpoint in `out`, if there is one.
     **settings
@@ -97,19 +96,22 @@ def _fit(
     config: FitConfig,
     plan: Plan | None,
     out: str | Path | None,
-    progress: bool | Literal["lines"] | None,
+    progress: Progress,
     resume: bool,
 ) -> Run:
     started = time.perf_counter()
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
-    seen = look(data, config, stages, plan)
-    if plan is None and seen.found is not None and seen.found.doubt:
-        seen, plan = held_out_winner(data, config, stages, seen)
-    plan = plan or choose(seen, config)
-    task = Task(seen.kept, seen.base, seen.settings, stages)
-    run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
+    with stages.bar:
+        seen = look(data, config, stages, plan)
+        if plan is None and seen.found is not None and seen.found.doubt:
+            seen, plan = held_out_winner(data, config, stages, seen)
+        plan = plan or choose(seen, config)
+        task = Task(seen.kept, seen.base, seen.settings, stages)
+        run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
     run.metrics["equation"] = _equation(run, plan).as_dict()
+    if degrees := [name for name, _, unit in data.columns if name in data.names and unit in DEGREES]:
+        run.metrics["degrees"] = degrees  # the model has radians; errors are told in degrees too
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 
@@ -122,24 +124,6 @@ def _equation(run: Run, plan: Plan) -> Equation:
             posterior = laplace(run)
             covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
     return equation_of(run, covariance)
-
-
-def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
-    """Named terms or networks: the plan whose free run over the last quarter of the training part errs less."""
-    other = look(data, config, stages, named=False)
-    plans = [choose(seen, config), choose(other, config)]
-
-    def errors() -> dict[str, Any]:
-        inner = replace(config, train_fraction=INNER)
-        runs = [fit(seen.train, inner, plan=plan, progress=False) for plan in plans]
-        return {"rms": [run.metrics["extrapolation_rms"] for run in runs]}
-
-    rms = [math.inf if x is None else x for x in stages.keep("held-out free runs", errors)["rms"]]
-    best = rms.index(min(rms))
-    why = f"free runs over the last quarter of the training part miss {rms[0]:.2g} with named terms, {rms[1]:.2g} with "
-    why += f"networks ({plans[1].objective})"
-    plan = replace(plans[best], reasons={**plans[best].reasons, "objective": why, "network": why})
-    return (seen, other)[best], plan
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:

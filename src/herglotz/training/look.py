@@ -85,12 +85,8 @@ def look(
         If the data cannot be used, or do not suit the settings.
     """
     settings = user_settings.resolved(data)
-    if not settings.use_inputs:
-        data = replace(data, u=None)
-    data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
-    seen = data if settings.train_fraction == 1 else data.split_time(settings.train_fraction)[0]
-    data, why_hold = with_hold(data, "" if plan is None else plan.hold, seen)
-    train, unseen = (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
+    data, why_hold = _read(data, settings, "" if plan is None else plan.hold)
+    train, unseen = _split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
     kept, drag = without(train, dropped), drag_starts_the_fit(settings)
@@ -99,37 +95,61 @@ def look(
     settings = settings if plan is None else plan.applied(settings)
     settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
-    structure, found = None, None
-    if plan is not None:
-        base = plan.started(base)
-    elif structure_is_free(kept, user_settings):
-        plain, first = settings, base
-        of = kept_structure("structure", lambda: structured(kept, first, plain), base, settings, stages)
-        settings, base, structure = of.config, of.base, of.reason
-    elif settings.features:
-        base = start_of_features(kept, base, settings)
-    motion = None
-    if plan is None or plan.network == "covered":
-        motion = _baseline_motion(Task(kept, base, settings, stages))
-    if plan is None and named and not settings.features and terms_are_free(kept, user_settings):
-        if motion is None or _fine(base):
-            # "not found" by the linear rule leaves it to the search; a user's "no" does not
-            sticks = settings.sticking or user_settings.sticking
-            plain, first = replace(settings, sticking=sticks), base
-            found = kept_structure(
-                "terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages
-            )
-            structure = found.reason
-        if found is not None and found.sigma is not None:
-            settings, base, motion = found.config, found.base, None
     task = Task(kept, base, settings, stages)
-    wanted = plan.continues_probe if plan is not None else settings.objective == "auto" and motion is None
+    terms = _Terms(settings, plan.started(base)) if plan is not None else _terms(task, user_settings, outliers, named)
+    task = replace(task, base=terms.base, config=terms.settings)
+    if plan is not None and plan.network == "covered":
+        terms = replace(terms, motion=_baseline_motion(task))
+    wanted = plan.continues_probe if plan is not None else terms.settings.objective == "auto" and terms.motion is None
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
-        friction=why_friction, noise=roughness(kept), settings=settings, base=base, structure=structure, found=found,
-        baseline_motion=motion, probe=probe,
+        friction=why_friction, noise=roughness(kept), settings=terms.settings, base=terms.base,
+        structure=terms.structure, found=terms.found, baseline_motion=terms.motion, probe=probe,
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """What the terms of the model are to be."""
+
+    settings: FitConfig
+    base: Baseline
+    structure: str | None = None
+    found: Structure | None = None
+    motion: tuple[Triples, float] | None = None
+
+
+def _read(data: Trajectories, settings: FitConfig, hold: str) -> tuple[Trajectories, str]:
+    """The data as a fit takes them, with what their inputs do between samples, and why."""
+    data = data if settings.use_inputs else replace(data, u=None)
+    data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
+    return with_hold(data, hold, _split(data, settings)[0])
+
+
+def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:
+    return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
+
+
+def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) -> _Terms:
+    """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
+    kept, base, settings, stages = task.data, task.base, task.config, task.stages
+    terms = _Terms(settings, base)
+    if structure_is_free(kept, user_settings):
+        of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)
+        terms = _Terms(of.config, of.base, of.reason)
+    elif settings.features:
+        terms = _Terms(settings, start_of_features(kept, base, settings))
+    terms = replace(terms, motion=_baseline_motion(replace(task, base=terms.base, config=terms.settings)))
+    told = not named or bool(terms.settings.features) or not terms_are_free(kept, user_settings)
+    at_one_step = not (_fine(terms.base) or kept.irregular)  # a network may learn what the rule misses at this step
+    if told or (terms.motion is not None and at_one_step):
+        return terms
+    # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
+    first, plain = terms.base, replace(settings, sticking=settings.sticking or user_settings.sticking)
+    found = kept_structure("terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages)
+    terms = replace(terms, structure=found.reason, found=found)
+    return terms if found.sigma is None else replace(terms, settings=found.config, base=found.base, motion=None)
 
 
 def _with_friction(

@@ -34,6 +34,7 @@ class Plan:
     outliers: bool  # the first one-step fit takes Student's t
     continues_probe: bool  # the one-step fit goes on from the short one that measured the noise
     sigma: float | None  # noise of q that the first stage assumes; None: a one-step fit measures it
+    known: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
     reasons: dict[str, str] = field(default_factory=dict)
@@ -51,15 +52,21 @@ class Plan:
         rest = {name: values for name, values in self.start.items() if name not in STARTS}
         return replace(base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest)
 
-    def table(self, width: int = 120) -> str:
-        """One decision a line with its reason, for people."""
-        rows = [(name, show(getattr(self, name)), self.reasons.get(name, "")) for name in DECISIONS]
-        left, middle = max(len(row[0]) for row in rows), min(24, max(len(row[1]) for row in rows))
+    def by_reason(self) -> list[tuple[list[str], str]]:
+        """Decisions in words (`order: 2`) with the reason that they share, in the order of `DECISIONS`."""
+        found: dict[str, list[str]] = {}
+        for name in DECISIONS:
+            words = f"{name.replace('_', ' ')}: {show(getattr(self, name))}"
+            found.setdefault(self.reasons.get(name, ""), []).append(words)
+        return [(decisions, reason) for reason, decisions in found.items()]
+
+    def table(self, width: int = 80) -> str:
+        """The decisions, those of one reason together, and the reason below them, for people."""
         lines = []
-        for name, value, reason in rows:
-            head = f"  {name:<{left}}  {textwrap.shorten(value, middle, placeholder=' …'):<{middle}}  "
-            lines.append(textwrap.fill(reason, width, initial_indent=head, subsequent_indent=" " * len(head)))
-        return "\n".join(lines)
+        for decisions, reason in self.by_reason():
+            lines.append(textwrap.fill("; ".join(decisions), width, initial_indent="  ", subsequent_indent="  "))
+            lines.append(textwrap.fill(reason, width, initial_indent="      ", subsequent_indent="      "))
+        return "\n".join(filter(None, lines))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
@@ -87,4 +94,6 @@ def show(value: Any) -> str:
         return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
     if value is None:
         return "to be measured"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     return f"{value:.3g}" if isinstance(value, float) else str(value) or "none"

@@ -13,6 +13,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
+from herglotz.training.free_run import near_data
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
@@ -254,13 +255,15 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     if not len(known):
         return grid
     u = grid_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    with torch.no_grad():
-        out = stepper.rollout(
-            start[known, :n], start[known, n : 2 * n], start[known, 2 * n], h=grid.h[known],
-            inputs=None if u is None else u[known],
-        )  # fmt: skip
-    nodes = states.new_full((len(spans), grid.longest + 1, 2 * n + 1), torch.nan)
-    nodes[known] = torch.cat([out.q, out.p, out.s[..., None]], -1)
+    nodes = near_data(stepper.L_d, rest, grid, start, u) if len(known) == len(spans) else None  # type: ignore[arg-type]
+    if nodes is None:
+        with torch.no_grad():
+            out = stepper.rollout(
+                start[known, :n], start[known, n : 2 * n], start[known, 2 * n], h=grid.h[known],
+                inputs=None if u is None else u[known],
+            )  # fmt: skip
+        nodes = states.new_full((len(spans), grid.longest + 1, 2 * n + 1), torch.nan)
+        nodes[known] = torch.cat([out.q, out.p, out.s[..., None]], -1)
     states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
     return grid
 

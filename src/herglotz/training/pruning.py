@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 from torch import Tensor
 
@@ -12,25 +10,26 @@ def prune(
     A: Tensor,  # (P, P) JᵀJ at the fit, residuals over their RMS
     x: Tensor,  # (P,) the fit
     candidates: Tensor,  # indices of the coefficients that may be left out
-    residuals: int,
+    worth: float,  # twice the cost above which a coefficient stays; log N by the Bayesian information criterion
+    least: int = 0,  # how many stay whatever they cost
 ) -> tuple[Tensor, Tensor]:
     """(kept, x): the candidates that stay, and the parameters moved to where the others' absence sends them.
 
     Leaving out coefficient i costs ½ x_i² / (A⁻¹)_ii in the quadratic model of the fit; the one that costs least goes
-    while that is less than ½ log N, N the number of residuals: backward elimination by the Bayesian information
-    criterion (Schwarz 1978), without fitting again.
+    while that is less than ½ `worth`: backward elimination without fitting again (Schwarz 1978 for log N, N the number
+    of residuals).
     """
     keep = torch.ones(len(x), dtype=torch.bool, device=x.device)
     out, x = torch.zeros_like(keep), x.clone()
     out[candidates] = True
     scale = A.diagonal().clamp_min(1e-300).sqrt()
     S, y = A / scale[:, None] / scale, x * scale
-    while bool((out & keep).any()):
+    while int((out & keep).sum()) > least:
         rows = keep.nonzero()[:, 0]
         C = torch.linalg.pinv(S[rows][:, rows], hermitian=True)
         cost = torch.where(out[rows], y[rows].square() / C.diagonal().clamp_min(1e-300), torch.inf)
         i = int(cost.argmin())
-        if float(cost[i]) > math.log(residuals):
+        if float(cost[i]) > worth:
             break
         y[rows] = y[rows] - C[:, i] / C[i, i] * y[rows[i]]
         y[rows[i]] = 0.0

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 import hashlib
 import json
-from io import BytesIO
+from io import BytesIO, StringIO
 from pathlib import Path
 from typing import Any, TypedDict
 
@@ -72,7 +73,7 @@ class Metrics(TypedDict, total=False):
 
 
 def save_run(run: Run, folder: str | Path) -> None:
-    """Write model.pt, config.json, metrics.json, fit.npz and, last, manifest.json with the sha256 of these four.
+    """Write model.pt, config.json, metrics.json, fit.npz, manifest.json with the sha256 of these, and history.csv.
 
     Each file appears whole or not at all; a folder whose writing was interrupted does not fit its manifest.
     """
@@ -99,6 +100,7 @@ def save_run(run: Run, folder: str | Path) -> None:
     }
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     contents[MANIFEST] = _json_bytes({"format": FORMAT, "herglotz": herglotz.__version__, "files": digests})
+    contents["history.csv"] = _log(run.history)  # for people; nothing reads it back
     for name, content in contents.items():
         write_atomically(folder / name, content)
 
@@ -177,6 +179,15 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
     sizes = {f"{name}_{end}": 1 if name == "s" else n for name in "qps" for end in ("low", "high")}
     if {name: len(x) for name, x in run.box.items()} != sizes or not run.h > 0:
         raise InputError(f"{path}: box and h are not those of a model with {n} coordinate(s); {REMEDY}")
+
+
+def _log(history: list[dict[str, Any]]) -> bytes:
+    """Stage, iteration and cost as csv."""
+    buffer = StringIO()
+    writer = csv.DictWriter(buffer, ("stage", "iteration", "cost"), extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(history)
+    return buffer.getvalue().encode()
 
 
 def _json_bytes(values: dict[str, Any]) -> bytes:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import torch
@@ -20,7 +22,9 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
+from herglotz.training.stages import Progress
 from herglotz.training.structure import structure_is_free
+from herglotz.training.summary import COLUMNS
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
@@ -89,22 +93,18 @@ class Selection:
         return self.chosen.best
 
     def table(self) -> str:
-        """Level × held-out error × spread × parameters × cost, for people."""
-        head = (
-            f"{'level':<14}{'held-out RMS':>13}{'seeds (min … max)':>24}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"
-        )
-        lines = [head]
+        """Level × held-out error × spread × parameters × cost, for people, in 80 columns; → marks the chosen level."""
+        lines = [f"  {'level':<13}{'held-out RMS':>12}{'min … max':>20}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"]
         for c in self.candidates:
             low, high = float(c.of_seeds.min()), float(c.of_seeds.max())
             seconds = sum(run.metrics["seconds"] for run in c.runs) / len(c.runs)
-            mark = "  <- chosen" if c is self.chosen else ""
-            spread = f"{low:.3g} … {high:.3g}"
+            mark, spread = "→" if c is self.chosen else " ", f"{low:.3g} … {high:.3g}"
             lines.append(
-                f"{c.level:<14}{c.error:>13.3g}{spread:>24}{c.parameters:>12}{c.step_us:>9.0f}{seconds:>8.1f}{mark}"
+                f"{mark} {c.level:<13}{c.error:>12.3g}{spread:>20}{c.parameters:>12}{c.step_us:>9.0f}{seconds:>8.1f}"
             )
         verdict = self.run.metrics.get("verdict", "")
         if verdict.startswith("does not fit"):
-            lines.append(f"Warning: the chosen level {verdict}")
+            lines.append(fill(f"Warning: the chosen level {verdict}", COLUMNS))
         return "\n".join(lines)
 
     def to_json(self) -> str:
@@ -121,7 +121,7 @@ def select(
     config: FitConfig | None = None,
     *,
     out: str | Path | None = None,
-    progress: bool | None = None,
+    progress: Progress = None,
     resume: bool = False,
     **reading: Any,
 ) -> Selection:
@@ -164,8 +164,9 @@ def select(
         raise InputError(f"seeds must be >= 1, got {seeds}")
     if config.train_fraction == 1:
         raise InputError("train fraction 1 holds nothing out to compare levels on; use 0.667, say")
-    candidates = []
-    for level in (level for level in LADDER if level in levels):
+    candidates, ladder = [], [level for level in LADDER if level in levels]
+    told = _Told(len(ladder) * seeds, progress)
+    for level in ladder:
         runs = []
         for seed in range(config.seed, config.seed + seeds):
             folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
@@ -173,9 +174,28 @@ def select(
                 folder.mkdir(parents=True, exist_ok=True)
             settings = replace(config, level=level, seed=seed)
             runs.append(fit(data, settings, out=folder, progress=progress, resume=resume))
+            told(runs[-1])
         errors = torch.stack([block_errors(run) for run in runs])
         candidates.append(Candidate(level, tuple(runs), errors, _step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))
+
+
+class _Told:
+    """One line on stderr after every fit, with the time that the fits to come will take at the pace so far."""
+
+    def __init__(self, total: int, progress: Progress):
+        self.total, self.done, self.began = total, 0, time.monotonic()
+        self.silent = progress is False or (progress is None and not sys.stderr.isatty())
+
+    def __call__(self, run: Run) -> None:
+        self.done += 1
+        if self.silent:
+            return
+        took, rms = time.monotonic() - self.began, run.metrics.get("extrapolation_rms")
+        left = took / self.done * (self.total - self.done)
+        error = "fails" if rms is None else f"{rms:.3g}"
+        text = f"fit {self.done} of {self.total}: {run.config.level}, seed {run.config.seed}: held-out RMS {error}"
+        print(f"{text}; about {left:.0f} s left", file=sys.stderr, flush=True)
 
 
 def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:

@@ -22,6 +22,7 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remin
 
 FORMAT = 2  # 2 holds all that a search goes on from
 REMEDY = "delete it and fit from the start"
+Progress = bool | Literal["lines", "iterations"] | None
 EVERY = 25  # iterations between two checkpoints inside a stage
 
 
@@ -37,15 +38,24 @@ class _Stored(TypedDict):
 class Callback:
     """What a stage's optimiser reports to; it shows progress and stores the search."""
 
-    def __init__(self, bar: Any, store: Callable[[dict[str, Any]], None], resumed: dict[str, Any] | None):
-        self.bar, self.store, self.resumed = bar, store, resumed
+    def __init__(
+        self,
+        bar: Any,
+        store: Callable[[dict[str, Any]], None],
+        resumed: dict[str, Any] | None,
+        named: str = "",  # begins a line on stderr for every iteration; "": no lines
+    ):
+        self.bar, self.store, self.resumed, self.named = bar, store, resumed, named
         self.start: float | None = None  # the first cost
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""
         self.bar.update(1)
         self.start = cost if self.start is None else self.start
-        self.bar.set_postfix_str(f"cost {cost / self.start:.3g} of its start" if self.start else "", refresh=False)
+        share = f"cost {cost / self.start:.3g} of its start" if self.start else ""
+        self.bar.set_postfix_str(share, refresh=False)
+        if self.named:
+            print(f"{self.named}, iteration {iteration}: {share}", file=sys.stderr, flush=True)
         if iteration % EVERY == 0:
             self.store(search())
 
@@ -60,7 +70,8 @@ class Stages:
     Parameters
     ----------
     progress
-        Show progress bars; None shows them on a terminal only; "lines" prints one line on stderr after every stage.
+        Show one bar over all stages, whose remaining time is at most that of the stages begun; None shows it on a
+        terminal only; "lines" prints one line on stderr after every stage, "iterations" one after every iteration too.
     checkpoint
         File to write, or None.
     key
@@ -69,9 +80,11 @@ class Stages:
         Read the checkpoint if there is one.
     """
 
-    def __init__(self, progress: bool | Literal["lines"] | None, checkpoint: Path | None, key: str, resume: bool):
-        self.lines = progress == "lines" and is_first()
-        self.disable = (None if progress is None else self.lines or not progress) if is_first() else True
+    def __init__(self, progress: Progress, checkpoint: Path | None, key: str, resume: bool):
+        self.lines = progress in ("lines", "iterations") and is_first()
+        self.verbose = progress == "iterations" and is_first()
+        disable = (None if progress is None else self.lines or not progress) if is_first() else True
+        self.bar = tqdm(total=0, desc="fit", disable=disable, leave=False, dynamic_ncols=True)
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
@@ -109,15 +122,16 @@ class Stages:
             result = OptimiserResult(stored["x"].to(x), **kept)
             remind(problem, result.memory)
         else:
-            with tqdm(total=total, desc=name, disable=self.disable, leave=False) as bar:
-                resumed = None if stored is None else stored["search"]
+            self.bar.total = self.bar.n + total  # most stages end before their bound
+            self.bar.set_description(name)
+            resumed = None if stored is None else stored["search"]
 
-                def store(search: dict[str, Any]) -> None:
-                    self.done[name] = {"done": False, "search": search}
-                    self._write()
+            def store(search: dict[str, Any]) -> None:
+                self.done[name] = {"done": False, "search": search}
+                self._write()
 
-                began = time.monotonic()
-                result = optimise(x, Callback(bar, store, resumed))
+            began = time.monotonic()
+            result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else ""))
             if self.lines:
                 took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
                 print(f"{name}: {took}", file=sys.stderr, flush=True)

@@ -256,7 +256,7 @@ def _short_fit(
     features = [name for name in config.features if "v" not in name] + _moving(config.features)
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
-    kept, x = prune(relative, result.x, torch.cat([still, moving]), r.numel())
+    kept, x = prune(relative, result.x, torch.cat([still, moving]), math.log(r.numel()))
     values = {name: tuple(x[problem.parameters.index(name)].tolist()) for name in problem.parameters.names}
     own = values[POTENTIAL][: 2 * n]  # −k, b of each angle; k/2, b of the others
     turn = [-1.0 if angle else 2.0 for angle in data.angles]

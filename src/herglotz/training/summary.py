@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from html import escape
 from textwrap import fill
 from typing import Any, Protocol
@@ -22,6 +23,8 @@ class Judged(Protocol):
     @property
     def data(self) -> Trajectories: ...  # noqa: D102
     @property
+    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
+    @property
     def train_lengths(self) -> tuple[int, ...]: ...  # noqa: D102
 
 
@@ -29,14 +32,15 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
     unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
+    degrees = bool(m.get("degrees")) and unit == "rad"  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", data.summary()),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
         ("features", features_in_words(run.config.features)),
-        ("extrapolation RMS", show(m.get("extrapolation_rms"), unit, "  free run over the unseen samples")),
-        ("training RMS", show(m.get("train_rms"), unit)),
-        ("one-step RMS", show(m.get("one_step_rms"), unit)),
+        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
+        ("training RMS", _error(m.get("train_rms"), unit, degrees)),
+        ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
         ("damping rate", show(m.get("rate"), f"per {per}")),
         ("time", show(m.get("seconds"), "s")),
     ]
@@ -77,6 +81,26 @@ def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
     """What the model is made of beside its terms, told or found; "" without."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
+
+
+def model_card(run: Judged, h_range: tuple[float, float]) -> str:
+    """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
+    ends = [run.box[f"q_{end}"] for end in ("low", "high")]
+    ranges = ", ".join(
+        f"{name} {low:.4g} to {high:.4g}" + ("" if unit == "1" else f" {unit}")
+        for name, unit, low, high in zip(run.data.names, run.data.units, *ends, strict=True)
+    )
+    low, high = h_range
+    return "\n".join([
+        f"Model of {run.data.source or 'a recording'} (sha256 {run.data.digest()[:16]})", summary(run),
+        f"For steps of {low:.4g} to {high:.4g} {run.data.time_unit}, and positions {ranges}.",
+        "Outside of these the model extrapolates. The first coordinate's mass is 1.",
+    ])  # fmt: skip
+
+
+def _error(value: float | None, unit: str, degrees: bool, after: str = "") -> str:
+    also = f" = {math.degrees(value):.3g} deg" if degrees and value is not None else ""
+    return show(value, unit, also + after)
 
 
 def show(value: Any, unit: str, after: str = "") -> str:

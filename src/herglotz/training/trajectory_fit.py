@@ -14,7 +14,7 @@ from herglotz.data.roughness import precision
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
-from herglotz.training.first_states import first_states
+from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.prior import prior_of
@@ -33,6 +33,7 @@ WIDER = (30.0, 900.0)  # times weaker priors: the next ranges start where the de
 HALVED = 2.0  # factor by which a weaker prior has to lower the error of the shortest segments
 SMALL = 1e-2  # of the largest |q|: shortest segments that miss less lack no force as large as the baseline's
 NOT_THE_NOISE = 1.5  # times the data's precision; as in the verdict
+FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration: steps are Newton's near the minimum
 STAGE = 40  # iterations of a stage at most: a start near the optimum needs fewer, and a poor one is left by the next
 
 
@@ -120,6 +121,7 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
+        self.hurried = False  # stages before the last end where they gain less than 1 %
 
     def fit(
         self,
@@ -143,21 +145,26 @@ class SegmentStages:
         if before is None:
             start = problem.parameters.get()
             states = first_states(problem, start, begin)
+            problem.guess_from_states(states_of_pairs(self.model, begin or task.data))
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
         return self.optimise(problem, start, states, name)
 
-    def optimise(self, problem: ShootingProblem, theta: Tensor, states: Tensor, name: str) -> TrajectoryFit | None:
-        """Minimise from these parameters and segment states; None where no path is found."""
+    def optimise(
+        self, problem: ShootingProblem, theta: Tensor, states: Tensor, name: str, *, near: bool = False
+    ) -> TrajectoryFit | None:
+        """Minimise from these parameters and segment states, `near` the minimum or not; None where no path is found."""
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
-        total = min(self.task.config.iterations, STAGE)
+        total, last = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
+        rtol, patience = (1e-2, 1) if self.hurried and not last else (1e-4, 3)
         result = self.task.stages.run(
             name + self.label, x, total,
             lambda x, callback: levenberg_marquardt(
-                target, x, max_iterations=total, rtol=1e-4, patience=3, callback=callback
+                target, x, max_iterations=total, rtol=rtol, patience=patience, damping=NEAR if near else FAR_OFF,
+                callback=callback,
             ),
             problem,
         )  # fmt: skip
@@ -170,15 +177,17 @@ class SegmentStages:
         """The shortest segments, from the samples."""
         return self.fit(self.lengths[0], sigma, FREEDOM if self.task.config.robust == "on" else None, None)
 
-    def robust_or_not(self, first: TrajectoryFit) -> TrajectoryFit:
+    def robust_or_not(self, first: TrajectoryFit, *, known: bool = False) -> TrajectoryFit:
         """The shortest segments, with Student's t or without the outliers where the data have any.
 
         With `robust` "auto" they are fitted with Student's t as well. Where that shows outliers, and they are few, they
         are left out and least squares go on with the rest; where the rest has outliers still, or they are many,
-        Student's t is the loss of all further stages (`problems.robust`).
+        Student's t is the loss of all further stages (`problems.robust`). Where the model is `known` already, outliers
+        cannot hide in a poor fit: they show in its residuals.
         """
         length = self.lengths[0]
-        if self.task.config.robust != "auto":
+        plain = first.noise < FLOOR * self.task.size or not heavy_tailed(first.misfit)
+        if self.task.config.robust != "auto" or (known and plain):
             return first
         trial = self.fit(length, max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
         if trial is None or not heavy_tailed(trial.misfit):
@@ -186,11 +195,11 @@ class SegmentStages:
         rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
         return trial if rest is None else rest
 
-    def whole(self, first: TrajectoryFit) -> TrajectoryFit | None:
-        """Whole trajectories at once, from parameters that are known well; None where that misses far more."""
+    def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
+        """Whole trajectories at once, from parameters that are known well; None where that misses far more than σ."""
         used = None if bool(first.problem.used.all()) else first.problem.used
         found = self.fit(self.lengths[-1], first.noise, first.problem.freedom, first, used)
-        most = LOST * max(first.noise, FLOOR * self.task.size)
+        most = LOST * max(first.noise, sigma, FLOOR * self.task.size)
         return None if found is None or found.noise > most else found
 
     def grow(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit:
@@ -219,13 +228,15 @@ def fit_states(task: Task, model: ContactLagrangian, sigma: float, s: Tensor | N
     return None if first is None else stages.grow(first, sigma)
 
 
-def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[TrajectoryFit] | None:
+def fit_trajectories(
+    task: Task, model: ContactLagrangian, sigma: float, *, known: bool = False
+) -> Chosen[TrajectoryFit] | None:
     """Fit parameters and states to positions.
 
     Segments grow from 20 steps to whole trajectories, or as long as the model follows the data, each stage started from
     the states of the one before. Then every prior strength is fitted in turn, the weakest first: its residuals give the
     noise that all strengths are fitted with. The strongest prior whose held-out error is not beaten beyond its spread
-    wins.
+    wins. A model that is `known` from an earlier fit needs no growing: whole trajectories follow the shortest segments.
 
     Returns
     -------
@@ -238,11 +249,11 @@ def fit_trajectories(task: Task, model: ContactLagrangian, sigma: float) -> Chos
     if first is None:
         return None
     departures = stages.task.config.departures
-    first = stages.robust_or_not(first)
+    first = stages.robust_or_not(first, known=known)
     if model.potential.network is None:  # no prior to choose
-        last = stages.whole(first) or stages.grow(first, sigma)
+        last = stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma)
         return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
-    last = stages.grow(first, sigma)
+    last = (stages.whole(first, sigma) if known else None) or stages.grow(first, sigma)
     previous, noise = last, last.noise
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:

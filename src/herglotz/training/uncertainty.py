@@ -85,17 +85,18 @@ class Laplace:
         rows = leading_rows(data, run.train_lengths)
         out = torch.zeros(data.samples, dtype=torch.bool)
         out[run.metrics.get("outlier_samples", [])] = True
+        states = torch.cat([run.states.q, run.states.p, run.states.s[:, None]], -1)[rows]
         train, out = _first(data, run.train_lengths), out[rows]
         if run.config.robust != "off":
             lone = spikes(train)
-            train, out = without(train, lone), out[~lone]
+            train, out, states = without(train, lone), out[~lone], states[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
         self.base = estimate_baseline(train, outliers=found, substeps=run.config.substeps)
         self.sigma = float(run.metrics["sigma"])
         departure = run.metrics.get("departure") or run.config.departures[-1]
         self.prior = prior_of(run.model, self.base, departure)
-        self.problem, self.path = self._solved(train, _starts(run), ~out)
+        self.problem, self.path = self._solved(train, _starts(run), ~out, guess=states)
         self.theta = self.problem.parameters.get()
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         _, A, _ = self.problem.normal_equations(x)
@@ -103,7 +104,7 @@ class Laplace:
         held_out = float(errors.square().mean().sqrt())
         self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
         self.information = A.double()  # prior included
-        self.covariance = _inverse(self.information) * self.inflation**2
+        self.covariance = inverse_of(self.information) * self.inflation**2
 
     @one_thread()
     def bands(self) -> Bands:
@@ -205,20 +206,24 @@ class Laplace:
             found.append(Direction(float(reductions[k].clamp(0, 1).sqrt()), parts))
         return found
 
-    def _solved(self, data: Trajectories, start: Tensor, used: Tensor | None = None) -> tuple[ShootingProblem, Path]:
-        """Each trajectory as one segment, solved from its start state (B, 2n+1)."""
+    def _solved(
+        self, data: Trajectories, start: Tensor, used: Tensor | None = None, guess: Tensor | None = None
+    ) -> tuple[ShootingProblem, Path]:
+        """Each trajectory as one segment, solved from its start state (B, 2n+1), near the states `guess` (N, 2n+1)."""
         grid = segment_grid(data, max(data.lengths), self.base.model_step)
         problem = ShootingProblem(
             self.run.model, data, grid, sigma=self.sigma, prior=self.prior, freedom=self.freedom, used=used
         )
         theta = problem.parameters.get()
+        if guess is not None:
+            problem.guess_from_states(guess)
         path = problem.solve(problem.pack(theta, start[:, : problem.d]))
         if path is None:
             raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")
         return problem, path
 
 
-def _inverse(A: Tensor) -> Tensor:
+def inverse_of(A: Tensor) -> Tensor:
     """A⁻¹ of a matrix that may have null directions: very large along them, where a pseudo-inverse would have 0.
 
     Scaled to a unit diagonal, so that no unit decides what is a null direction.

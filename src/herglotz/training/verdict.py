@@ -6,13 +6,15 @@ Three errors are compared with the precision of the data, which is estimated fro
 * the same over the unseen part, from states that are fitted there with the parameters held;
 * the one free run over the whole unseen part, `extrapolation_rms`.
 
-Chaotic motion leaves every model in the long run, so the last one alone rejects nothing that is finite.
+A free run that is lost rejects a model, unless what the data leave open of its start explains that: chaotic motion
+leaves every model in the long run. What the data leave open of the model itself (`foresight`) rejects it too: a
+recording that is too short fits many models. Errors of several coordinates are over the spread of each.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -22,11 +24,12 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
 from herglotz.data.spikes import without
 from herglotz.stepping import Stepper
+from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import segment_grid
-from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.problems.robust import FREEDOM, scale_of
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import FIRST_SEGMENT, SegmentStages
@@ -50,47 +53,103 @@ def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories
     return out.q.flatten(0, 1)[grid.node] - data.q[grid.sample]
 
 
-def unseen_window_rms(task: Task, fitted: Fitted, data: Trajectories) -> float:
-    """RMS of such errors where the fit has not been, from states that are fitted there; inf where a step fails."""
+def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:
+    """Such errors where the fit has not been, from states that are fitted there; inf where a step fails."""
     silent, config = Stages(False, None, "", resume=False), replace(task.config, iterations=STATE_ITERATIONS)
     stages = SegmentStages(replace(task, data=data, config=config, stages=silent), fitted.model, frozen=True)
     found = stages.fit(stages.lengths[0], fitted.sigma, FREEDOM if task.config.robust != "off" else None, None)
-    return math.inf if found is None else found.noise
+    if found is None:
+        return data.q.new_full((1, data.dof), torch.inf)
+    miss = found.misfit
+    return miss if found.problem.freedom is None else miss * (scale_of(miss) / miss.square().mean().sqrt())
 
 
-def judged(task: Task, seen: Look, fitted: Fitted, metrics: dict[str, Any]) -> dict[str, Any]:
-    """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say."""
+@dataclass(frozen=True)
+class Errors:
+    """What a verdict rests on: RMS errors and sizes, all in one unit."""
+
+    windows: float
+    unseen: float | None  # None: nothing was held out
+    free: float | None
+    noise: float  # precision of the data; inf: not known
+    spread: float
+
+    @property
+    def limit(self) -> float:
+        """What can be asked of a fit."""
+        return max(self.noise if math.isfinite(self.noise) else 0.0, EXACT_ENOUGH * self.spread)
+
+    @property
+    def lost(self) -> float:
+        """Where an error is no longer one of a model that follows the motion."""
+        return max(LOST * self.spread, BURIED * self.limit)
+
+    def __str__(self) -> str:
+        held_out = "" if self.unseen is None else f", unseen ones {self.unseen:.2g}, the free run {self.free:.2g}"
+        sizes = f"the data's precision is {self.limit:.2g}, their spread {self.spread:.2g}"
+        return f"windows of {FIRST_SEGMENT} steps miss {self.windows:.2g}{held_out}; {sizes}"
+
+
+def judged(
+    task: Task, seen: Look, fitted: Fitted, everywhere: Tensor, free: Tensor | None, metrics: dict[str, Any]
+) -> dict[str, Any]:
+    """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say.
+
+    Parameters
+    ----------
+    task, seen, fitted
+        A finished fit.
+    everywhere
+        (N, 2n+1) states at all samples.
+    free
+        (M, n) errors of the free run over the unseen part; None: nothing was held out.
+    metrics
+        What is known of the fit already.
+    """
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
-    kept = without(task.data, ~used)
-    spread = float((kept.q - kept.q.mean(0)).square().mean().sqrt())
-    windows = _rms(window_errors(task, fitted, fitted.states[~seen.spikes][used], kept))
-    unseen, free = None, None
-    if seen.unseen is not None:
-        unseen, free = unseen_window_rms(task, fitted, seen.unseen), metrics["extrapolation_rms"]
-        free = math.inf if free is None else free
-    noise = precision(kept)
-    text = in_words(windows, unseen, free, noise, spread, metrics)
-    numbers = {"window_rms": windows, "unseen_window_rms": unseen, "precision": noise}
-    return {"verdict": text} | {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
+    kept, states = without(task.data, ~used), fitted.states[~seen.spikes]
+    windows = window_errors(task, fitted, states[used], kept)
+    unseen = None if seen.unseen is None else unseen_window_errors(task, fitted, seen.unseen)
+    unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
+    scaled = replace(kept, q=kept.q / unit)
+    in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
+    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), _rms(scaled.q - scaled.q.mean(0)))
+    ahead = foresee(task, fitted, seen, everywhere)
+    numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
+    numbers["precision"] = precision(kept)
+    kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
+    return {"verdict": in_words(errors, ahead, metrics)} | kept_numbers
 
 
-def in_words(
-    windows: float, unseen: float | None, free: float | None, noise: float, spread: float, metrics: dict[str, Any]
-) -> str:
+def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -> str:
     """One of the three verdicts, with numbers and, where the model does not fit, what to try."""
-    limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * spread)
-    worst = max(windows, unseen or 0.0)
-    lost = max(LOST * spread, BURIED * limit)
-    told = f"windows of {FIRST_SEGMENT} steps miss {windows:.2g}"
-    told += "" if unseen is None else f", unseen ones {unseen:.2g}, the free run {free:.2g}"
-    told += f"; the data's precision is {limit:.2g}, their spread {spread:.2g}"
-    broken = free is not None and not math.isfinite(free)
-    if broken or not metrics.get("follows_data", True) or not worst <= lost:
-        return f"{FAILS}: {told}. Try {_remedy(metrics, windows > lost)}"
-    error = max(worst, free or 0.0)
-    if error <= AT_THE_NOISE * limit:
-        return f"{FITS}: {told}"
-    return f"{WORSE} by a factor of {error / limit:.2g}: {told}"
+    worst, free = max(errors.windows, errors.unseen or 0.0), errors.free or 0.0
+    follows = metrics.get("follows_data", True) and worst <= errors.lost
+    if not follows or not math.isfinite(free):
+        return f"{FAILS}: {errors}. Try {_remedy(metrics, errors.windows > errors.lost)}"
+    chance = 0.0 if ahead is None else BURIED * ahead.start * errors.spread
+    if free > max(errors.lost, chance):
+        return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
+    if ahead is not None and ahead.open > LOST:
+        return f"{FAILS} for certain: {errors}. {_left_open(ahead)}"
+    error = max(worst, free)
+    if error <= AT_THE_NOISE * errors.limit:
+        return f"{FITS}: {errors}"
+    return f"{WORSE} by a factor of {error / errors.limit:.2g}: {errors}"
+
+
+def _left_open(ahead: Foresight) -> str:
+    """What the data do not determine, and what to record."""
+    over = f"over the next {ahead.horizon:.3g} units of time"
+    if not ahead.reached:
+        return f"The model's own motion breaks off {over}. Try a longer recording"
+    what, size = f"a force too small to be seen ({ahead.name})", ahead.hidden
+    if ahead.parameters >= ahead.hidden:
+        what, size = "the uncertainty of the parameters", ahead.parameters
+    return (
+        f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * size:.2g} % of its spread. Try a longer "
+        + ("recording, or several from other starts")
+    )
 
 
 def _remedy(metrics: dict[str, Any], training: bool) -> str:

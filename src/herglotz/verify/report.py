@@ -5,7 +5,10 @@ from __future__ import annotations
 import math
 import unicodedata
 from dataclasses import dataclass, field
+from textwrap import fill
 from typing import Any
+
+COLUMNS = 80
 
 
 @dataclass(frozen=True)
@@ -92,8 +95,9 @@ class Report:
         ]
         if self.missing:
             lines.append(f"  could not be judged: {', '.join(self.missing)}")
-        lines += [f"  [{i}] {note}" for i, note in enumerate(notes, 1)]
-        lines += [f"  Not judged: {self.details['not_judged']}"] if "not_judged" in self.details else []
+        words = [f"[{i}] {note}" for i, note in enumerate(notes, 1)]
+        words += [f"Not judged: {self.details['not_judged']}"] if "not_judged" in self.details else []
+        lines += [fill(text, COLUMNS, initial_indent="  ", subsequent_indent="      ") for text in words]
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:

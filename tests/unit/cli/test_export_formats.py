@@ -8,6 +8,7 @@ import torch
 
 from herglotz.cli import main
 from herglotz.data import load
+from herglotz.export import load_exported
 from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
@@ -32,6 +33,15 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, capsys):
     assert found["against"]["same_weights"] is True
     assert main(["verify", "damped_oscillator", "--against", str(tiny_run)]) == 2
     assert "is no file" in capsys.readouterr().err
+
+
+def test_the_file_holds_a_model_card(tiny_onnx, tiny_run):
+    # fails if the file does not say what it is a model of, how well it fits, and where it was fitted
+    card = load_exported(tiny_onnx).metadata["card"]
+    run = load_run(tiny_run)
+    assert card.startswith("Model of tiny.csv (sha256 ")
+    assert run.summary() in card
+    assert "For steps of 0.2 to 0.2 s, and positions theta " in card
 
 
 def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):

@@ -1,5 +1,6 @@
 """Each subcommand end to end on tiny data."""
 
+import argparse
 import json
 import re
 import shutil
@@ -12,9 +13,8 @@ import torch
 
 import herglotz
 import herglotz.cli
-import herglotz.cli.fit
-import herglotz.cli.flags
 import herglotz.cli.plot
+import herglotz.cli.settings
 import herglotz.cli.simulate
 from herglotz.cli import main
 from herglotz.cli.parser import build_parser
@@ -66,14 +66,42 @@ def test_python_dash_m(tmp_path):  # fails if __main__ does not pass the exit co
 
 
 def test_choices_are_the_packages_own():  # fails if a level is added there but not offered here
-    fit, flags = herglotz.cli.fit, herglotz.cli.flags
-    assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (fit.LEVELS, fit.OBJECTIVES, fit.OPTIMISERS, flags.DTYPES)
-    assert (ROBUST, SUPERVISION, HOLDS) == (fit.ROBUST, fit.SUPERVISION, fit.HOLDS)
-    assert FitConfig().departures == fit.DEPARTURES
-    assert build_parser().parse_args(["fit", "a", "--out", "b"]).iterations == FitConfig().iterations
+    own = herglotz.cli.settings
+    assert (LEVELS, OBJECTIVES, OPTIMISERS, tuple(DTYPES)) == (own.LEVELS, own.OBJECTIVES, own.OPTIMISERS, own.DTYPES)
+    assert (ROBUST, SUPERVISION, HOLDS) == (own.ROBUST, own.SUPERVISION, own.HOLDS)
     assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
         assert name in herglotz.cli.simulate.DESCRIPTION
+
+
+def test_the_help_of_fit_tells_the_packages_defaults():  # fails if a default changes and the help has the old one
+    parser = build_parser()._subparsers._group_actions[0].choices["fit"]  # pyright: ignore
+    settings = [action for action in parser._actions if action.default == argparse.SUPPRESS and action.dest != "help"]
+    told = {a.dest: m[1] for a in settings if (m := re.search(r"\(default ([\w.]+)\)", a.help or ""))}
+    assert {"level", "train_fraction", "seed", "iterations", "order", "dtype"} <= set(told)
+    assert {name: str(getattr(FitConfig(), name)) for name in told} == told
+    assert {action.dest for action in settings} <= set(FitConfig().to_dict())  # else a flag would set nothing
+
+
+def test_settings_of_another_run(tmp_path):
+    # fails if --config is ignored, a flag that was not given overrides it, or one that was given does not
+    other = FitConfig(level="affine", seed=5, known=("-9.81 cos(q1)",), potential_width=3, use_inputs=False)
+    (tmp_path / "config.json").write_text(json.dumps(other.to_dict()))
+
+    def settings(*flags):
+        return herglotz.cli.settings.settings_of(build_parser().parse_args(["fit", "a", "--out", "b", *flags]))
+
+    assert settings() == FitConfig()
+    assert settings("--config", str(tmp_path)) == other
+    found = settings("--config", str(tmp_path / "config.json"), "--seed", "0", "--feature", "q1^4", "--feature", "q1^3")
+    assert (found.level, found.seed, found.features) == ("affine", 0, ("q1^4", "q1^3"))
+    assert settings("--ignore-inputs", "--term", "x", "--departures", "1e-3") == FitConfig(
+        use_inputs=False, terms=("x",), departures=(1e-3,)
+    )
+    for text, message in (("[]", "config.json"), ('{"levle": 1}', "levle"), ("{", "config.json")):
+        (tmp_path / "config.json").write_text(text)
+        with pytest.raises(herglotz.InputError, match=message):
+            settings("--config", str(tmp_path))
 
 
 def test_simulate(tmp_path, capsys):  # fails if an option does not reach the data, or the seed does not decide them
@@ -100,7 +128,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "\r" not in err  # no bar where there is no terminal, but a line a stage
     assert re.search(r"^segments of 20: \d+ iterations, [\d.]+ s$", err, re.M)
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
-    assert len(list(folder.glob("*.png"))) == 4
+    assert len(list(folder.glob("*.png"))) == 5
     run = load_run(folder)
     assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
 
@@ -216,9 +244,17 @@ def test_plot(tiny_csv, tiny_run, tmp_path, capsys):  # fails if a figure is mis
     assert main(["plot", str(tiny_csv), "--out", str(tmp_path)]) == 0
     assert main(["plot", str(tiny_run), "--out", str(tmp_path / "figures")]) == 0
     written = capsys.readouterr().out.split()
-    assert len(written) == 5
+    assert len(written) == 6
     for path in written:
         assert Path(path).read_bytes().startswith(b"\x89PNG")
+
+
+def test_animate(monkeypatch, tiny_csv, tiny_run, tmp_path, capsys):  # fails if the flag draws nothing, or takes data
+    monkeypatch.setattr("herglotz.plots.animation.FRAMES", 2)
+    assert main(["plot", str(tiny_run), "--animate", "--out", str(tmp_path)]) == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["animation.gif"]
+    assert main(["plot", str(tiny_csv), "--animate", "--out", str(tmp_path)]) == 2
+    assert "--animate draws a run" in capsys.readouterr().err
 
 
 def test_identities_are_drawn_by_verify(tiny_run, tmp_path, capsys):  # fails if they are lost, or drawn of a scene

@@ -105,7 +105,7 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
 
 def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning
     np.savez(tmp_path / "a.npz", t=np.arange(4.0), q=np.arange(4.0))
-    with pytest.raises(InputError, match=r"columns are chosen in a csv table; this is arrays t, q"):
+    with pytest.raises(InputError, match=r"columns are chosen in a table, such as a csv file; this is arrays t, q"):
         load(tmp_path / "a.npz", drop="q")
 
 

@@ -16,7 +16,7 @@ needs_compiler = pytest.mark.skipif(
     not any(map(shutil.which, ("cc", "gcc", "clang"))), reason="no C compiler in the PATH"
 )
 FORMATS = [
-    "pt2",
+    pytest.param("pt2", marks=pytest.mark.slow),  # 10 s to write; test_pt2.py has wrong states
     "onnx",
     pytest.param("h", marks=needs_compiler),
     pytest.param("compile", marks=needs_compiler),

@@ -6,8 +6,15 @@ from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.training import FitConfig, Run
+from herglotz.training import FitConfig, Plan, Run
 from herglotz.training.run import box_of
+
+TERMS, TRIED = "cos(q1) explains the data to 0.01", "held-out blocks of time choose among them"
+PLAN = Plan(
+    "linear", "trajectory", "none", 2, ("cos(q1)",), "", (), 1, {"alike": True}, {}, False, False, 0.01, 1,
+    (2e-4, 6e-4, 2e-3, 6e-3),
+    {"level": TERMS, "objective": "the data are noisy", "features": TERMS, "outliers": "", "departures": TRIED},
+)  # fmt: skip
 
 
 def fake_run(
@@ -45,4 +52,6 @@ def fake_run(
     history += [{"stage": "whole trajectory", "iteration": 22 + k, "cost": 40 * 0.3**k + 4} for k in range(8)]
     model, data, states = model.to(dtype), data.to(dtype), State(*(x.to(dtype) for x in states))
     box = box_of(*(x.double() for x in states))
-    return Run(model, FitConfig(level=level), {}, data, (count,) * trajectories, states, h, box, history)
+    return Run(
+        model, FitConfig(level=level), {"plan": PLAN.to_dict()}, data, (count,) * trajectories, states, h, box, history
+    )

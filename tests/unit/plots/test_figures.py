@@ -5,30 +5,37 @@ import struct
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
-from fake_run import fake_run
+from fake_run import TERMS, TRIED, fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from PIL import Image
 
 from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.plots import (
     FIGURES,
     IDENTITIES,
+    plot_bands,
     plot_data,
     plot_learned,
     plot_momentum_vs_generating_function,
     plot_phase_portrait,
+    plot_plan,
     plot_training,
     plot_trajectory,
+    save_animation,
     save_figure,
     save_figures,
 )
 from herglotz.stepping import State
+from herglotz.training import Bands
 
 KINDS = {
     "one": {},
@@ -72,8 +79,69 @@ def test_save_figures_writes_all_and_nothing_else(tmp_path):
     assert save_figures(fake_run(steps=20), folder) == [folder / f"{name}.png" for name in FIGURES]
     assert sorted(x.name for x in folder.iterdir()) == sorted(f"{name}.png" for name in FIGURES)
     assert (set(FIGURES), set(IDENTITIES)) == (
-        {"trajectory", "phase_portrait", "learned", "training"}, {"momentum_vs_dS", "hj_residual"}
+        {"trajectory", "phase_portrait", "learned", "training", "plan"}, {"momentum_vs_dS", "hj_residual"}
     )  # fmt: skip
+
+
+def test_the_plan_has_a_box_for_every_reason():
+    # fails if a decision is lost, a reason comes twice, or a decision without a reason is drawn
+    figure = plot_plan(fake_run(steps=12))
+    texts = [text.get_text() for text in figure.axes[0].texts if text.get_text()]
+    assert texts == [
+        "level: linear\nfeatures: cos(q1)", TERMS, "objective: trajectory", "the data are noisy",
+        "departures: 0.0002,\n0.0006, 0.002, 0.006", TRIED,
+    ]  # fmt: skip
+    with pytest.raises(InputError, match="holds no plan"):
+        plot_plan(replace(fake_run(steps=12), metrics={}))
+
+
+def test_a_mass_that_depends_on_position_is_drawn():
+    # fails if the mass is not m(q), an entry that is constant is drawn, or a constant mass gets a row
+    run = fake_run(dof=2, steps=20)
+    assert len(plot_learned(run).axes) == 2 * 2
+    one = (1.0, 1.0)
+    config = ModelConfig((True, True), "linear", one, one, one, (0.0, 0.0), potential_width=0,
+                         known=("0.3 cos(q1 - q2) v1 v2",))  # fmt: skip
+    figure = plot_learned(replace(run, model=ContactLagrangian(config)))
+    assert len(figure.axes) == 3 * 2
+    drawn = figure.axes[4].lines  # the line at 0, and m12 = 0.3 cos(q1 − q2) with q2 at its median
+    assert len(drawn) == 2
+    q1, m12 = drawn[1].get_xdata(), np.asarray(drawn[1].get_ydata())
+    q2 = float(run.states.q[:, 1].median())
+    np.testing.assert_allclose(m12, 0.3 * np.cos(np.asarray(q1) - q2), atol=1e-12)
+
+
+def test_bands_of_one_unit_share_their_scale():  # fails if a panel of small residuals looks like one of large ones
+    run = fake_run(trajectories=3, steps=20)
+    q = run.data.q.clone()
+    q[: run.data.lengths[0]] += 0.5
+    run = replace(run, data=replace(run.data, q=q))
+    figure = plot_bands(run, Bands(run.states.q, torch.full_like(q, 0.01), 0.01))
+    assert len({ax.get_ylim() for ax in figure.axes}) == 1
+    assert [ax.get_title(loc="left") for ax in figure.axes] == [f"trajectory {b}" for b in range(3)]
+
+
+@pytest.mark.parametrize("angles", [(True,), (False,), (True, True), (False, False), (False, True), (False,) * 3])
+def test_animation(tmp_path, angles, monkeypatch):
+    # fails if a kind of system cannot be drawn, the picture stands still, or a damaged file stays
+    monkeypatch.setattr("herglotz.plots.animation.FRAMES", 5)
+    run, n = fake_run(trajectories=2, steps=20), len(angles)
+    names, units = tuple("abc"[:n]), tuple("rad" if angle else "m" for angle in angles)
+    data = replace(run.data, q=run.data.q.repeat(1, n), names=names, units=units, angles=angles)
+    states = State(run.states.q.repeat(1, n), run.states.p.repeat(1, n), run.states.s)
+    save_animation(replace(run, data=data, states=states), tmp_path / "a.gif", trajectory=1)
+    with Image.open(tmp_path / "a.gif") as image:
+        assert image.n_frames == 5  # pyright: ignore[reportAttributeAccessIssue]
+        frames = []
+        for k in range(5):
+            image.seek(k)
+            frames.append(np.asarray(image.convert("RGB")).copy())
+    assert all((a != b).any() for a, b in pairwise(frames))
+    assert [x.name for x in tmp_path.iterdir()] == ["a.gif"]
+    with pytest.raises(InputError, match=r"must end in \.gif"):
+        save_animation(run, tmp_path / "a.png")
+    with pytest.raises(InputError, match="no trajectory 2"):
+        save_animation(run, tmp_path / "b.gif", trajectory=2)
 
 
 def test_formats(tmp_path):  # fails if a file holds another format than its name says, or a wrong name is written

@@ -47,6 +47,9 @@ def test_words_are_short():  # fails if a run, data or a prediction fill the scr
     assert max(map(len, (repr(run), repr(run.data)))) < 200
     assert "<th style='text-align:left'>training RMS</th>" in run._repr_html_()
     assert "Verdict: fits to the noise" in run.summary()
+    degrees = replace(run, metrics={**run.metrics, "train_rms": 0.01, "degrees": ["theta"]})
+    assert "0.01 rad = 0.573 deg" in degrees.summary()  # fails if data in degrees are told in rad alone
+    assert "deg" not in run.summary()
     assert max(map(len, run.summary().splitlines())) <= 80
     data = Trajectories.of(run.data.t, run.data.q, names=("theta",), angles=(True,))
     assert len(repr(run.predict(data))) < 100

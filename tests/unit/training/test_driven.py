@@ -190,7 +190,7 @@ def test_figures_of_a_driven_run(exact_run, tmp_path, capsys):
     assert main(["plot", str(tmp_path / "run")]) == 0
     assert "error" not in capsys.readouterr().err
     drawn = {path.name for path in (tmp_path / "run").glob("*.png")}
-    assert drawn == {"trajectory.png", "phase_portrait.png", "learned.png", "training.png"}
+    assert drawn == {"trajectory.png", "phase_portrait.png", "learned.png", "training.png", "plan.png"}
 
 
 @pytest.mark.parametrize(

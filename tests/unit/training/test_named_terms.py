@@ -11,7 +11,7 @@ from herglotz.errors import InputError
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
 from herglotz.training import fit
-from herglotz.training.equation import Equation
+from herglotz.training.equation import Equation, Term
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
 
@@ -43,6 +43,14 @@ def test_the_equation_is_printed_with_deviations(duffing):
     assert max(map(len, text.splitlines())) <= 78
     stored = json.loads(json.dumps(duffing.metrics["equation"]))
     assert str(Equation.from_dict(stored)) == text
+
+
+def test_an_equation_is_never_empty():
+    # fails if deviations that are all too wide leave x″ = 0, which is another equation
+    wide = Equation((Term("x″", "x", -2.0, 5.0, "1/s²"), Term("x″", "x′", -0.1, 1.0, "1/s")), ("x″",), "x in m", None)
+    assert str(wide).startswith("x″ = −2(5) x − 0.1")
+    clear = Equation((Term("x″", "x", -2.0, 0.5, "1/s²"), Term("x″", "x′", -0.1, 1.0, "1/s")), ("x″",), "x in m", None)
+    assert str(clear).splitlines()[0] == "x″ = −2.0(5) x"
 
 
 @pytest.mark.slow  # 8 s

@@ -66,8 +66,8 @@ def test_every_decision_has_a_reason(noise):
     assert set(plan.reasons) == {*DECISIONS, "start"}
     assert all(plan.reasons.values())
     table = plan.table()
-    assert all(f"  {name}" in table for name in DECISIONS)
-    assert max(map(len, table.splitlines())) <= 120
+    assert all(f"{name.replace('_', ' ')}: " in table for name in DECISIONS)
+    assert max(map(len, table.splitlines())) <= 80
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """The structure of joints, found from positions without a word about it."""
 
+import math
 import sys
 from dataclasses import replace
 from functools import cache
@@ -226,7 +227,7 @@ def test_pruning_leaves_out_what_is_noise():
     truth = torch.tensor([1.0, 0.0, 2.0, 0.0, 0.0], dtype=torch.float64)
     y = J @ truth + torch.randn(400, generator=make, dtype=torch.float64)
     A = J.T @ J
-    kept, x = prune(A, torch.linalg.solve(A, J.T @ y), torch.arange(5), 400)
+    kept, x = prune(A, torch.linalg.solve(A, J.T @ y), torch.arange(5), math.log(400))
     assert len(kept) == 2
     assert 2 in kept
     again = torch.linalg.lstsq(J[:, kept], y[:, None]).solution[:, 0]

@@ -10,35 +10,45 @@ from herglotz.data import Trajectories, simulate
 from herglotz.data.roughness import precision
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
-from herglotz.training.verdict import AT_THE_NOISE, in_words
+from herglotz.training.foresight import Foresight
+from herglotz.training.verdict import AT_THE_NOISE, Errors, in_words
 
 GOOD = {"follows_data": True, "objective": "trajectory"}
 
 
+KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=7.0, reached=True)
+
+
 @pytest.mark.parametrize(
-    ("windows", "unseen", "free", "verdict"),
+    ("windows", "unseen", "free", "ahead", "verdict"),
     [
-        (0.011, 0.012, 0.013, "fits to the noise"),
-        (0.011, None, None, "fits to the noise"),
-        (0.011, 0.012, 0.02, "fits, worse than the noise by a factor of 2:"),
-        (0.011, 0.012, 5.0, "fits, worse than the noise by a factor of 5e+02:"),  # chaos: it rejects nothing
-        (0.2, 0.012, 0.013, "does not fit"),
-        (0.011, 0.2, 0.013, "does not fit"),
-        (0.011, 0.012, math.inf, "does not fit"),
-        (math.nan, 0.012, 0.013, "does not fit"),
-        (math.inf, 0.012, 0.013, "does not fit"),
+        (0.011, 0.012, 0.013, KNOWN, "fits to the noise"),
+        (0.011, None, None, None, "fits to the noise"),
+        (0.011, 0.012, 0.02, KNOWN, "fits, worse than the noise by a factor of 2:"),
+        (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 1.2e+02:"),  # chaos
+        (0.011, 0.012, 1.2, KNOWN, "does not fit beyond the recording"),
+        (0.011, 0.012, 1.2, None, "does not fit beyond the recording"),
+        (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit for certain"),
+        (0.011, 0.012, 0.013, replace(KNOWN, hidden=0.2), "does not fit for certain"),
+        (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit for certain"),
+        (0.2, 0.012, 0.013, KNOWN, "does not fit"),
+        (0.011, 0.2, 0.013, KNOWN, "does not fit"),
+        (0.011, 0.012, math.inf, KNOWN, "does not fit"),
+        (math.nan, 0.012, 0.013, KNOWN, "does not fit"),
+        (math.inf, 0.012, 0.013, KNOWN, "does not fit"),
     ],
 )
-def test_words(windows, unseen, free, verdict):
-    # fails if an error is left out of the comparison, a broken free run passes, or a NaN compares as small
-    text = in_words(windows, unseen, free, noise=0.01, spread=1.0, metrics=GOOD)
+def test_words(windows, unseen, free, ahead, verdict):
+    # fails if an error is left out of the comparison, a lost or broken free run passes without the excuse of its start,
+    # what the data leave open passes, or a NaN compares as small
+    text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
     assert text.startswith(verdict)
-    assert ("Try " in text) == (verdict == "does not fit")
+    assert ("Try " in text) == (verdict.startswith("does not fit"))
 
 
 def test_a_model_without_states_does_not_fit():
     # fails if a fit that says it follows no data is praised for its one-step errors
-    text = in_words(0.01, 0.01, 0.01, noise=0.01, spread=1.0, metrics={**GOOD, "follows_data": False})
+    text = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, {**GOOD, "follows_data": False})
     assert text.startswith("does not fit")
 
 

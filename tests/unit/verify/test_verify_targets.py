@@ -42,7 +42,8 @@ def test_a_stepper_with_states():
     assert report.details["samples"] == 8
 
 
-@pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
+# slow: 10 s to write the file; float32 files of other kinds are stepped in test_matrix.py and test_onnx.py
+@pytest.mark.parametrize("dtype", [torch.float64, pytest.param(torch.float32, marks=pytest.mark.slow)])
 def test_an_exported_file(tmp_path, dtype):
     # fails if a file, which has no L_d, cannot be judged by its map alone, or is not said to be
     model = ContactLagrangian(ModelConfig()).to(dtype)

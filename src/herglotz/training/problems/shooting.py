@@ -187,6 +187,17 @@ class ShootingProblem(StatesProblem):
             x[own] = known[at - 1] + share.clamp(0, 1) * (known[at] - known[at - 1])
         self.path = Path(x, path.A)
 
+    def guess_from_states(self, states: Tensor) -> None:
+        """Start the next solve from states (N, 2n+1) at the samples, with straight lines between them."""
+        data, times = self.data, self.grid.times(self.data)
+        owner, x = self.grid.start_trajectory(data), states.new_empty(*times.shape, states.shape[-1])
+        for b, (first, length) in enumerate(zip(data.offsets, data.lengths, strict=True)):
+            t, known, own = data.t[first : first + length].contiguous(), states[first : first + length], owner == b
+            at = torch.searchsorted(t, times[own].contiguous()).clamp(1, length - 1)
+            share = ((times[own] - t[at - 1]) / (t[at] - t[at - 1])).clamp(0, 1)[..., None]
+            x[own] = known[at - 1] + share * (known[at] - known[at - 1])
+        self.path = Path(x, x[..., None])
+
     def misfit(self, path: Path) -> Tensor:
         """q_model − q_data at every sample, (N', n), in units of q."""
         return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]

@@ -1,0 +1,124 @@
+"""Tables that other packages read: Parquet (pyarrow), HDF5 (h5py) and MATLAB (scipy; h5py for its version 7.3)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from herglotz.data.csv_columns import Wanted
+from herglotz.data.files import PathLike
+from herglotz.data.table import from_frame
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError
+
+INSTALL = "pip install 'herglotz[tables]'"
+HDF5 = b"\x89HDF\r\n\x1a\n"  # the first bytes of such a file, also of MATLAB's version 7.3
+
+
+class Table:
+    """Named columns of one length, as `herglotz.data.table.from_frame` takes them; a matrix gives a column a column."""
+
+    def __init__(self, path: Path, arrays: dict[str, np.ndarray]):
+        self.columns: dict[str, np.ndarray] = {}
+        for name, array in arrays.items():
+            matrix = array.reshape(-1, 1) if 1 in array.shape or array.ndim == 1 else array
+            if matrix.ndim != 2:
+                raise InputError(f"{path}: {name} has {array.ndim} dimensions; save vectors, or matrices (N, n)")
+            head, bracket, unit = name.partition("[")  # q[rad] of shape (N, 2) becomes q1[rad] and q2[rad]
+            for i, column in enumerate(matrix.T, 1):
+                self.columns[name if matrix.shape[1] == 1 else f"{head}{i}{bracket}{unit}"] = column
+        lengths = {name: len(column) for name, column in self.columns.items()}
+        if len(set(lengths.values())) > 1:
+            each = ", ".join(f"{name} {n}" for name, n in lengths.items())
+            raise InputError(f"{path}: columns of different lengths ({each}); save one sample a row in all of them")
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return self.columns[name]
+
+
+def read_parquet(path: PathLike, **columns: Any) -> Trajectories:
+    """Read a Parquet file like a csv file with the same header; `columns` are those of `read_csv`.
+
+    Raises
+    ------
+    InputError
+        If pyarrow is missing, the file is damaged, or as `read_csv`.
+    """
+    parquet = _package("pyarrow.parquet", path)
+    table = _opened(path, lambda: parquet.read_table(str(path)))
+    arrays = {name: table.column(name).to_numpy() for name in table.column_names}
+    return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+
+
+def read_hdf5(path: PathLike, **columns: Any) -> Trajectories:
+    """Read the datasets of an HDF5 file as columns, with their attribute `unit` or `units`; groups inside are opened.
+
+    Raises
+    ------
+    InputError
+        If h5py is missing, the file is damaged, datasets differ in length, or as `read_csv`.
+    """
+    return from_frame(Table(Path(path), _datasets(path)), Wanted(**columns), Path(path))
+
+
+def read_mat(path: PathLike, **columns: Any) -> Trajectories:
+    """Read the arrays of a MATLAB file as columns: vectors t, q, u, ... or matrices (N, n). Structs are left aside.
+
+    Raises
+    ------
+    InputError
+        If scipy (or h5py, for version 7.3) is missing, the file is damaged, or as `read_csv`.
+    """
+    with Path(path).open("rb") as file:
+        if HDF5 in file.read(520):  # version 7.3: matrices are stored transposed
+            arrays = {name: array.T for name, array in _datasets(path).items()}
+            return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+    scipy_io = _package("scipy.io", path)
+    stored = _opened(path, lambda: scipy_io.loadmat(str(path), struct_as_record=True))
+    arrays = {name: x for name, x in stored.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiub" and x.size}
+    return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+
+
+def _datasets(path: PathLike) -> dict[str, np.ndarray]:
+    """Every dataset of numbers, by the last part of its name, with its unit in brackets."""
+    h5py = _package("h5py", path)
+    found: dict[str, np.ndarray] = {}
+
+    def take(name: str, item: Any) -> None:
+        if not isinstance(item, h5py.Dataset) or item.dtype.kind not in "fiub" or not item.shape:
+            return
+        unit = item.attrs.get("unit", item.attrs.get("units", ""))
+        unit = unit.decode() if isinstance(unit, bytes) else str(unit)
+        own = name.rsplit("/", 1)[-1]
+        key = f"{own}[{unit}]" if unit and "[" not in own else own
+        if key in found:
+            raise InputError(f"{path}: two datasets are called {own}; save each recording in a file of its own")
+        found[key] = np.asarray(item)
+
+    def read() -> None:
+        with h5py.File(str(path), "r") as file:
+            file.visititems(take)
+
+    _opened(path, read)
+    return found
+
+
+def _package(name: str, path: PathLike) -> Any:
+    try:
+        return import_module(name)
+    except ImportError:
+        raise InputError(f"{path}: reading it needs {name.split('.')[0]}; install it with {INSTALL}") from None
+
+
+def _opened(path: PathLike, read: Callable[[], Any]) -> Any:
+    try:
+        return read()
+    except InputError:
+        raise
+    except Exception as error:  # the packages raise many kinds for a damaged file
+        line = " ".join(str(error).split())[:160]
+        raise InputError(f"{path}: cannot be read ({type(error).__name__}: {line}); write the file again") from None

@@ -1,0 +1,136 @@
+"""A moving picture of data and model: pendulums and arms as links, chains as beads, two lengths as a moving point."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from PIL import Image
+
+from herglotz.data.files import PathLike, write_atomically
+from herglotz.errors import InputError
+from herglotz.plots.motion import DATA
+from herglotz.plots.style import DPI, INK, MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, styled, with_unit
+
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+FRAMES, PER_SECOND, COLOURS = 120, 20, 64  # a file of six seconds and below 1 MB
+MOST_PANELS = 3
+Shape = tuple[np.ndarray, np.ndarray]  # x and y of the joints, (points,) each
+
+
+def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
+    """Write a GIF of one trajectory: the recording in grey beside the model's free run, and both against time.
+
+    Where all coordinates are angles, links of equal length hang from a point, each angle measured from the vertical;
+    where angles follow one length, they hang from a cart. Two lengths of one unit are a point in the plane; other
+    lengths are beads side by side, each displaced by its coordinate. Time is stretched to six seconds.
+
+    Raises
+    ------
+    InputError
+        If the name does not end in .gif, or there is no such trajectory.
+    """
+    data = run.data.unwrapped()
+    if Path(path).suffix.lower() != ".gif":
+        raise InputError(f"{path}: an animation's name must end in .gif")
+    if not 0 <= trajectory < len(data):
+        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
+    rows = slice(data.offsets[trajectory], data.offsets[trajectory] + data.lengths[trajectory])
+    t, q, model = (x[rows].detach().double().cpu().numpy() for x in (data.t, data.q, run.prediction))
+    boundary = t[max(min(run.train_lengths[trajectory], len(t)) - 1, 0)]
+    frames = np.linspace(t[0], t[-1], min(FRAMES, max(len(t), 2)))
+    scene = _Scene(run, np.r_[q, model[np.isfinite(model).all(1)]])
+    with styled():
+        figure = new_figure(8.0, 3.6, f"{data.source or 'data'} and the model's free run")
+        left, right = figure.subplots(1, 2, width_ratios=[1, 1.3])
+        scene.frame(left)
+        captions(left, [("data", "#777777"), ("fit", MODEL), ("free run", UNSEEN)])
+        recorded = left.plot([], [], "o-", color=DATA, lw=3, ms=9)[0]
+        moving = left.plot([], [], "o-", lw=1.4, ms=5)[0]
+        cursor = _series(right, run, (t, q, model), boundary)
+        figure.set_dpi(DPI // 2)
+        artists = (recorded, moving, cursor)
+        for artist in artists:
+            artist.set_animated(True)
+        canvas, images = FigureCanvasAgg(figure), []
+        canvas.draw()
+        still = canvas.copy_from_bbox(figure.bbox)  # all but the artists: drawn once
+        for time in frames:
+            recorded.set_data(*scene.shape(_at(time, t, q)))
+            moving.set_data(*scene.shape(_at(time, t, model)))
+            moving.set_color(MODEL if time <= boundary else UNSEEN)
+            cursor.set_xdata([time, time])
+            canvas.restore_region(still)
+            for artist in artists:
+                artist.axes.draw_artist(artist)
+            images.append(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS))
+    write_atomically(path, _gif(images))
+
+
+def _gif(images: list[Image.Image]) -> bytes:
+    buffer = io.BytesIO()
+    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=1000 // PER_SECOND, loop=0)
+    return buffer.getvalue()
+
+
+def _at(time: float, t: np.ndarray, q: np.ndarray) -> np.ndarray:
+    """Positions (n,) at a time between samples."""
+    return np.array([np.interp(time, t, column) for column in q.T])
+
+
+def _series(ax: Axes, run: Run, motion: tuple[np.ndarray, np.ndarray, np.ndarray], boundary: float):
+    """Draw the coordinates against time; return the line that moves."""
+    (t, q, model), seen = motion, motion[0] <= boundary
+    for i in range(min(q.shape[1], MOST_PANELS)):
+        ax.plot(t, q[:, i], ".", color=DATA, ms=5)
+        ax.plot(t[seen], model[seen, i], color=MODEL, lw=1)
+        ax.plot(t[t >= boundary], model[t >= boundary, i], color=UNSEEN, lw=1)
+    if boundary < t[-1]:
+        ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
+    ax.set(xlim=(t[0], t[-1]), xlabel=with_unit("time", run.data.time_unit))
+    names = run.data.names[:MOST_PANELS]
+    ax.set_ylabel(", ".join(with_unit(name, unit) for name, unit in zip(names, run.data.units, strict=False)))
+    return ax.axvline(t[0], color=INK, lw=1)
+
+
+class _Scene:
+    """What positions look like, by the kinds of the coordinates."""
+
+    def __init__(self, run: Run, positions: np.ndarray):
+        angles, n = run.data.angles, run.data.dof
+        self.plane = n == 2 and not any(angles) and len(set(run.data.units)) == 1
+        self.links = n if all(angles) else n - 1 if n > 1 and not angles[0] and all(angles[1:]) else 0
+        reach = positions[:, 0] if self.links < n and self.links else np.zeros(1)
+        self.length = 1.0 if self.links == n else 0.5 * max(float(np.ptp(reach)), 1e-12)
+        shapes = [self.shape(row) for row in positions[:: max(len(positions) // 200, 1)]]
+        x, y = (np.concatenate(part) for part in zip(*shapes, strict=True))
+        room = 0.12 * max(float(np.ptp(x)), float(np.ptp(y)), 1e-12)
+        self.x, self.y = (x.min() - room, x.max() + room), (y.min() - room, y.max() + 2.5 * room)
+
+    def shape(self, q: np.ndarray) -> Shape:
+        """Joints of one position (n,)."""
+        if self.links:
+            own = q[len(q) - self.links :]
+            base = 0.0 if self.links == len(q) else q[0]
+            x, y = self.length * np.sin(own).cumsum(), -self.length * np.cos(own).cumsum()
+            return np.r_[base, base + x], np.r_[0.0, y]
+        if self.plane:
+            return q[:1], q[1:]
+        return (q, np.zeros(1)) if len(q) == 1 else (np.arange(len(q)) * 1.0, q)
+
+    def frame(self, ax: Axes) -> None:
+        """Limits and what stands still."""
+        ax.set(xlim=self.x, ylim=self.y)
+        if self.links or self.plane:
+            ax.set_aspect("equal")
+        if self.links:
+            ax.plot(*((0.0, 0.0) if self.length == 1.0 else (self.x, (0.0, 0.0))), color=MUTED, marker="+", lw=0.8)
+        elif not self.plane:
+            ax.axhline(0.0, color=MUTED, lw=0.8)
+        ax.tick_params(labelsize=8)

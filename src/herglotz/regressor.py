@@ -1,0 +1,168 @@
+"""`HerglotzRegressor`: a fit behind scikit-learn's interface. Extra: `herglotz[sklearn]`.
+
+>>> from herglotz.regressor import HerglotzRegressor
+>>> model = HerglotzRegressor().fit(t[:300], q[:300])
+>>> model.predict(t[300:])  # positions at later times
+>>> model.score(t[300:], q[300:])  # R²
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.stepping import State
+from herglotz.threads import one_thread
+from herglotz.training import FitConfig, fit
+
+try:
+    from sklearn.base import BaseEstimator, RegressorMixin
+    from sklearn.utils.validation import check_is_fitted
+except ImportError:
+    raise ImportError("HerglotzRegressor needs scikit-learn; install it: pip install 'herglotz[sklearn]'") from None
+
+SAME = 1e-9  # of a step: times closer than this are the same
+
+
+class HerglotzRegressor(RegressorMixin, BaseEstimator):
+    """Positions as a function of time, and of inputs where X has more columns.
+
+    X is (N,) or (N, 1 + m): increasing times, then inputs, each of which acts from its row's time on. y is (N,) or
+    (N, n): positions. One fit has one motion; `predict` continues it from its first sample to any later time. With
+    inputs, it takes times from the last fitted one on, at steps like those of the data.
+
+    Parameters
+    ----------
+    level, objective, seed
+        As in `FitConfig`.
+    angles
+        Whether every coordinate is an angle in rad.
+    train_fraction
+        Part of the samples that is trained on; the default is all, as scikit-learn holds out by itself.
+    settings
+        Further settings of `FitConfig`, by name.
+
+    Attributes
+    ----------
+    run_
+        The `Run`: `run_.equation()`, `run_.verify()`, `run_.export(...)`.
+    n_features_in_
+        Columns of X.
+
+    Raises
+    ------
+    InputError
+        If X or y cannot be used, times do not increase, or a step fails; the message names the time. It is a
+        `ValueError`, as scikit-learn asks.
+    """
+
+    def __init__(
+        self,
+        level: str = "auto",
+        objective: str = "auto",
+        seed: int = 0,
+        angles: bool = False,
+        train_fraction: float = 1.0,
+        settings: dict[str, Any] | None = None,
+    ):
+        self.level = level
+        self.objective = objective
+        self.seed = seed
+        self.angles = angles
+        self.train_fraction = train_fraction
+        self.settings = settings
+
+    def fit(self, X: Any, y: Any) -> HerglotzRegressor:
+        """Fit a model to positions y at the times X[:, 0]."""
+        X, q = _matrix("X", X), _matrix("y", y)
+        if len(X) != len(q):
+            raise InputError(f"X has {len(X)} rows and y {len(q)}; give one position a time")
+        n = q.shape[1]
+        u = X[:, 1:] if X.shape[1] > 1 else None
+        data = Trajectories.of(X[:, 0], q, u=u, angles=(self.angles,) * n, source="X", hold="" if u is None else "zero")
+        config = FitConfig(
+            level=self.level, objective=self.objective, seed=self.seed, train_fraction=self.train_fraction
+        )
+        self.run_ = fit(data, config.changed(self.settings or {}), progress=False)
+        self.n_features_in_, self._flat = X.shape[1], np.ndim(y) == 1
+        return self
+
+    @one_thread()
+    def predict(self, X: Any) -> np.ndarray:
+        """Positions at the times X[:, 0], in any order without inputs; the shape is that of y."""
+        check_is_fitted(self, "run_")
+        X = _matrix("X", X)
+        if X.shape[1] != self.n_features_in_:
+            raise InputError(f"X has {X.shape[1]} columns, the fit had {self.n_features_in_}; give the same")
+        with torch.no_grad():
+            q = self._free(X[:, 0]) if X.shape[1] == 1 else self._driven(X)
+        if not np.isfinite(q).all():
+            at = X[int((~np.isfinite(q)).any(1).argmax()), 0]
+            raise InputError(f"the free run fails before t = {at:g}; predict earlier times, or fit more data")
+        return q[:, 0] if self._flat else q
+
+    def _free(self, times: np.ndarray) -> np.ndarray:
+        """From the last fitted sample before each time, whole steps of the model and a part of one."""
+        run = self.run_
+        nodes = run.data.t.double().numpy()[: run.train_lengths[0]]
+        if times.min() < nodes[0] - SAME * run.h:
+            raise InputError(f"t = {times.min():g} is before the first fitted sample, {nodes[0]:g}; take later times")
+        found = np.empty((len(times), run.data.dof))
+        origin = np.searchsorted(nodes, times + SAME * run.h, side="right") - 1
+        for k in np.unique(origin):  # one motion from each sample that is needed
+            start = State(*(x[int(k)].detach() for x in run.states))
+            asked = np.flatnonzero(origin == k)
+            found[asked] = self._from(start, times[asked] - nodes[k])
+        return found
+
+    def _from(self, start: State, spans: np.ndarray) -> np.ndarray:
+        """Positions at the times `spans` ≥ 0 after a state."""
+        run, order = self.run_, np.argsort(spans)
+        found, state, now, stepper = np.empty((len(spans), run.data.dof)), start, 0.0, None
+        regular = np.allclose(spans[order], run.h * np.round(spans[order] / run.h), atol=1e-6 * run.h, rtol=1e-9)
+        for i in order:
+            while regular and spans[i] - now > 0.5 * run.h:
+                state, now = run.stepper.step(state, run.h).state, now + run.h
+            if not regular and spans[i] - now > SAME * run.h:
+                stepper = stepper or run.at_step(run.h_range[0] / 2)  # which has steps of any length
+                state, now = stepper.step(state, float(spans[i] - now)).state, float(spans[i])
+            found[i] = state.q.double().numpy()
+        return found
+
+    def _driven(self, X: np.ndarray) -> np.ndarray:
+        """From the last fitted sample on; the input of a row acts from its time to the next row's."""
+        run = self.run_
+        state, now = run.last_fitted()
+        last = run.data.offsets[0] + run.train_lengths[0] - 1
+        u, (low, high) = run.data.u, run.h_range
+        assert u is not None  # the fit had inputs
+        acts, found = u[last], np.empty((len(X), run.data.dof))
+        for i, (t, *row) in enumerate(X.tolist()):
+            step = t - now
+            if step > SAME * run.h:
+                if not low <= step <= high:
+                    raise InputError(f"row {i} of X: a step of {step:g}, the data had {low:g} to {high:g}; resample X")
+                state = run.stepper.step(state, step, u=acts).state
+            elif step < -SAME * run.h:
+                raise InputError(f"row {i} of X: t = {t:g} is before {now:g}; with inputs, times increase from the fit")
+            acts, now = u.new_tensor(row), max(t, now)
+            found[i] = state.q.double().numpy()
+        return found
+
+
+def _matrix(name: str, x: Any) -> np.ndarray:
+    """(N,) or (N, m) finite numbers as (N, m) float64."""
+    try:
+        found = np.asarray(x, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: not numbers ({error})") from None
+    found = found[:, None] if found.ndim == 1 else found
+    if found.ndim != 2 or not found.size:
+        raise InputError(f"{name} must be (N,) or (N, m) with N ≥ 1, got shape {found.shape}")
+    if not np.isfinite(found).all():
+        raise InputError(f"{name}: row {int((~np.isfinite(found)).any(1).argmax())} is not finite; drop that row")
+    return found

@@ -1,0 +1,234 @@
+"""What the data leave open of free runs beyond them: the start, the parameters, and terms too small to be seen.
+
+Held-out time says nothing of motion that is longer than what was held out. Around the fit the cost is quadratic with
+A = JᵀJ: start states and parameters have the covariance A⁻¹, and a free run with sensitivities Z changes by Z δ. A term
+that the fit does not have may act all the same: the Bayesian information criterion keeps it out while the cost would
+fall by less than ½ log N, so by up to √(log N) of its standard deviations, which all other unknowns follow.
+
+Free runs go on from the end of the training part for `TURNS` turns of the motion or over the whole unseen part,
+whatever is longer, with the recorded inputs again where there are no more. Where their start alone makes them uncertain
+they are chaotic, and where they leave the recorded range nothing is known: neither says anything of the model.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import Stepper
+from herglotz.training.baseline import Baseline
+from herglotz.training.inputs import grid_inputs
+from herglotz.training.look import Look
+from herglotz.training.named_terms import DRY, NamedTerms, candidates, places, settings_of, started, values_of
+from herglotz.training.objectives import Fitted
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.prior import NETWORKS, prior_of
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.structure import MOST
+from herglotz.training.task import Task, build_model, with_sticking
+from herglotz.training.trajectory_fit import FIRST_SEGMENT
+from herglotz.training.uncertainty import inverse_of
+
+UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless; as `LOST` of the verdict
+TURNS = 2.0  # a turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation
+LONGEST = 10  # times the recorded time: no free run is followed for longer
+ALIKE = 1e-9  # of a term's own information: what less is left of, others do as well; it changes nothing
+RUNS = 4  # trajectories that are followed on
+
+
+@dataclass(frozen=True)
+class Foresight:
+    """How uncertain free runs are, as RMS over their samples of what is open over the spread of each coordinate."""
+
+    start: float  # over the unseen part, by what the data leave open of the state it starts from
+    parameters: float  # over the horizon, by what they leave open of the parameters
+    hidden: float  # the largest change by a term that the fit does not have
+    name: str  # of this term
+    horizon: float  # time beyond the training part
+    reached: bool  # whether all steps were solved
+
+    @property
+    def open(self) -> float:
+        """The larger of what parameters and hidden terms leave open; inf where the model cannot run so far."""
+        return max(self.parameters, self.hidden) if self.reached else math.inf
+
+
+def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight | None:
+    """See the head of this module; None where the model does not follow the data.
+
+    Parameters
+    ----------
+    task, fitted, seen
+        A finished fit.
+    states
+        (N, 2n+1) its states at all samples of `seen.data`, those of the unseen part by a free run.
+    """
+    if not fitted.notes.get("follows_data", True) or not bool(torch.isfinite(states).all()):
+        return None
+    model, base, absent = _with_absent_terms(task, fitted.model)
+    length = fitted.notes.get("segment_steps", FIRST_SEGMENT * task.config.substeps) // task.config.substeps
+    problem = ShootingProblem(
+        model, task.data, segment_grid(task.data, max(length, 1), base.model_step), sigma=fitted.sigma,
+        prior=prior_of(model, base, fitted.notes.get("departure")), used=fitted.used,
+        freedom=FREEDOM if fitted.notes.get("robust") else None,
+    )  # fmt: skip
+    known = fitted.states[~seen.spikes]
+    theta, x = problem.parameters.get(), known[problem.grid.start_sample]
+    problem.guess_from_states(known)
+    cost, A, _ = problem.normal_equations(problem.pack(theta, x[:, : problem.d]))
+    if not math.isfinite(float(cost)):
+        return None
+    runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
+    ahead = ShootingProblem(
+        model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step), sigma=problem.sigma
+    )
+    guess = runs.stepped_on(fitted.model, states, base.model_step)
+    if guess is not None:
+        ahead.guess_from_states(guess)
+    path = None if guess is None else ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
+    if path is None:
+        return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
+    spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
+    order = ahead.grid.sample.argsort()
+    Z = ahead.sensitivities(theta, path)[..., : problem.n, :].flatten(0, 1)[ahead.grid.node] / spread[:, None]
+    q = path.x[..., : problem.n].flatten(0, 1)[ahead.grid.node][order]
+    inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
+    runs = replace(runs, beyond=runs.beyond & inside)
+    return _summary(A.double(), Z[order].double(), problem, runs, absent)
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    """Times and inputs of free runs, each from the start of the last segment of a trajectory."""
+
+    data: Trajectories  # their positions are nothing
+    rows: Tensor  # (N,) the same samples in all data; −1 beyond them
+    segments: list[int]  # that they start from
+    beyond: Tensor  # (N,) bool: after the training part, and in the recorded range
+    unseen: Tensor  # (N,) bool: in the unseen part
+    horizon: float
+
+    @classmethod
+    def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
+        """Runs over the rest of the data, and on for two turns of the motion."""
+        owner, step, parts = problem.grid.start_trajectory(train), data.typical_step, []
+        for b in torch.linspace(0, len(data) - 1, min(RUNS, len(data))).round().long().tolist():
+            segment = int((owner == b).nonzero()[-1])
+            rows = torch.arange(data.offsets[b], data.offsets[b] + data.lengths[b])
+            t = data.t[rows].cpu()
+            last = float(train.t[train.offsets[b] + train.lengths[b] - 1])
+            wanted = min(TURNS * turn, LONGEST * float(t[-1] - t[0]))
+            more = max(0, math.ceil((last + wanted - float(t[-1])) / step))
+            own = rows[t >= float(train.t[problem.grid.start_sample[segment]])]
+            again = rows[torch.arange(more) % len(rows)]
+            times = torch.cat([data.t[own], data.t[own[-1]] + step * torch.arange(1, more + 1).to(data.t)])
+            u = None if data.u is None else torch.cat([data.u[own], data.u[again]])
+            unseen = (times > last) & (times <= data.t[own[-1]])
+            parts.append((times, u, segment, times > last, unseen, torch.cat([own, torch.full((more,), -1)])))
+        t, beyond, unseen, rows = (torch.cat([part[k] for part in parts]) for k in (0, 3, 4, 5))
+        u = None if data.u is None else torch.cat([part[1] for part in parts])
+        lengths = tuple(len(part[0]) for part in parts)
+        made = replace(data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths)
+        horizon = max(float(part[0][-1] - part[0][~part[3]][-1]) for part in parts)
+        return cls(made, rows, [part[2] for part in parts], beyond, unseen, horizon)
+
+    def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor | None:
+        """States at all samples of these runs, known ones and those of the model's steps; None where a step fails.
+
+        They are the fitted model's own, which steps quicker than one with all terms.
+        """
+        n, known, stepper = self.data.dof, states[self.rows], Stepper(model)
+        for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
+            own = torch.arange(first, first + length)
+            last = int((self.rows[own] >= 0).nonzero()[-1])
+            if last == length - 1:
+                continue
+            u = None if self.data.u is None else self.data.u[own[last:]]
+            t, q = self.data.t[own[last:]], self.data.q[own[last:]]
+            rest = replace(self.data, t=t, q=q, u=u, lengths=(length - last,))
+            grid, x = segment_grid(rest, length, max_step), known[first + last]
+            u = grid_inputs(model, rest, grid)
+            with torch.no_grad():
+                out = stepper.rollout(x[:n], x[n : 2 * n], x[2 * n], h=grid.h[0], inputs=None if u is None else u[0])
+            if not bool(out.ok.all()):
+                return None
+            known[own[last:]] = torch.cat([out.q, out.p, out.s[:, None]], -1)[grid.node]
+        return known
+
+
+def _turn(data: Trajectories, states: Tensor) -> float:
+    """The longest turn of the coordinates' motion."""
+    steps, q = data.steps(), states[:, : data.dof]
+    v = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
+    return float((2 * math.pi * q.std(0) / v.square().mean(0).sqrt().clamp_min(1e-300)).max())
+
+
+def _with_absent_terms(
+    task: Task, model: ContactLagrangian
+) -> tuple[ContactLagrangian, Baseline, dict[str, list[int]]]:
+    """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
+    c, data, parameters = task.config, task.data, ParameterVector(model)
+    plain = not any(name.startswith(NETWORKS) for name in parameters.names) and c.objective == "trajectory"
+    if not plain or c.level not in ("linear", "forced") or c.known or c.terms or c.input_map or data.dof > MOST:
+        return model, task.base, {}
+    every, own = candidates(data), NamedTerms(c.features, c.drag, c.coulomb)
+    if not set(own.names) <= set(every.names):
+        return model, task.base, {}
+    values = values_of(parameters, parameters.get(), c, data.angles)
+    full = replace(settings_of(every, data, c, c.order, c.substeps), sticking=c.sticking)
+    base = started(task.base, data, values, full)
+    more = build_model(base, full, "none")
+    more = with_sticking(more) if full.sticking else more
+    at = places(ParameterVector(more), every)
+    return more, base, {name: where for name, where in at.items() if name not in own.names}
+
+
+def _summary(A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]]) -> Foresight:
+    """The variances of free runs from A of all unknowns and their sensitivities Z, (N, n, P + d), over the spread."""
+    P, d = problem.P, problem.d
+    names = [name for name, at in absent.items() for _ in at]
+    C, follow = _open(A, absent, problem)
+    start, parameters, hidden = [], [], []
+    for segment, z in zip(runs.segments, Z.split(list(runs.data.lengths)), strict=True):
+        own = torch.cat([torch.arange(P), torch.arange(P + segment * d, P + (segment + 1) * d)])
+        state = inverse_of(A[own[P:]][:, own[P:]])
+        start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))
+        parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))
+        hidden.append((z @ follow[own]).square().mean(1))
+    of_start, of_all, by_term = torch.cat(start), torch.cat(parameters), torch.cat(hidden)
+    told = runs.beyond & (of_start.sqrt() < UNCERTAIN)
+    by_term = by_term[told].sum(0) / max(1, int(told.sum()))
+    worst = int(by_term.argmax()) if names else -1
+    return Foresight(
+        start=_root(of_start[runs.unseen]), parameters=_root(of_all[told]), horizon=runs.horizon, reached=True,
+        hidden=float(by_term[worst].sqrt()) if names else 0.0, name=names[worst] if names else "",
+    )  # fmt: skip
+
+
+def _open(A: Tensor, absent: dict[str, list[int]], problem: ShootingProblem) -> tuple[Tensor, Tensor]:
+    """Covariance of the unknowns that the fit has, and how all unknowns move with each absent term at its limit."""
+    others = torch.tensor([i for at in absent.values() for i in at], dtype=torch.long)
+    held = torch.zeros(len(A), dtype=torch.bool)
+    held[others] = True
+    if DRY in absent:  # what shapes a force of 0 has no effect
+        for shape in ("friction.breakaway", "friction.log"):
+            held[problem.parameters.index(shape)] = True
+    free = (~held).nonzero()[:, 0]
+    C = torch.zeros_like(A)
+    C[free[:, None], free] = inverse_of(A[free][:, free])
+    follow = -C @ A[:, others]
+    left = A[others, others] + (A[:, others] * follow).sum(0)
+    follow[others, torch.arange(len(others))] = 1.0
+    most, apart = math.log(problem.data.q.numel()), left > ALIKE * A[others, others]
+    return C, follow * torch.where(apart, most / left, 0.0).sqrt()
+
+
+def _root(variances: Tensor) -> float:
+    return float(variances.mean().sqrt()) if len(variances) else 0.0

@@ -1,0 +1,103 @@
+"""The states of a fit at every sample: fitted ones on the training part, a free run over the rest."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State, Stepper
+from herglotz.training.first_states import states_of_pairs
+from herglotz.training.inputs import step_inputs
+from herglotz.training.objectives import Fitted
+from herglotz.training.problems.grid import SegmentGrid, segment_grid, substeps
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.lifted_newton import solve_path
+
+
+def states_everywhere(
+    fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
+) -> tuple[State, str]:
+    """States at every sample, those of the training part and a free run from the last of them; and "ok", or why not.
+
+    A model that follows the data has its free run near them: all steps are then solved at once, from the data. Else one
+    after the other.
+    """
+    n, ends = data.dof, torch.tensor(data.offsets) + torch.tensor(train_lengths)
+    out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
+    trained = torch.arange(data.samples) < ends[data.trajectory.cpu()]
+    out[trained] = fitted.states
+    if bool(trained.all()):
+        return State(out[:, :n], out[:, n : 2 * n], out[:, 2 * n]), "ok"
+    found, status = _at_once(fitted, data, out, ends, max_step), "ok"
+    if found is None:
+        found, status = _stepped(fitted, data, out, ends, max_step)
+    return State(found[:, :n], found[:, n : 2 * n], found[:, 2 * n]), status
+
+
+def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> Tensor | None:
+    """`out` with the free runs, solved together from the recorded positions; None where that does not converge."""
+    index = torch.arange(data.samples)
+    rows = index[index >= ends[data.trajectory.cpu()] - 1]
+    lengths = tuple((torch.tensor(data.offsets) + torch.tensor(data.lengths) - ends + 1).tolist())
+    if min(lengths) < 2:
+        return None
+    u = None if data.u is None else data.u[rows]
+    rest = replace(data, t=data.t[rows], q=data.q[rows], u=u, s=None, p=None, lengths=lengths)
+    grid = segment_grid(rest, rest.samples, max_step)
+    inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
+    nodes = near_data(fitted.model, rest, grid, out[rows[grid.start_sample]], inputs)
+    if nodes is None:
+        return None
+    out = out.clone()
+    out[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
+    return out
+
+
+def near_data(
+    model: ContactLagrangian, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None
+) -> Tensor | None:
+    """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1), all steps solved at once.
+
+    Newton's iteration starts from the recorded positions; None where that does not converge: the runs are elsewhere.
+    """
+    problem = ShootingProblem(model, data, grid, sigma=1.0)
+    with torch.no_grad():
+        problem.guess_from_states(states_of_pairs(model, data))
+        assert problem.path is not None
+        tol = 64 * torch.finfo(start.dtype).eps
+        path = solve_path(problem.parameters, problem.parameters.get(), start, grid.h, problem.path.x, tol, u=u)
+    return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
+
+
+def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> tuple[Tensor, str]:
+    """`out` with the free runs, one step after the other, and "ok" or why it ends; NaN from a failed step on."""
+    n, driven = data.dof, step_inputs(fitted.model, data) is not None
+    stepper, status = Stepper(fitted.model), "ok"
+    for first, length, end in zip(data.offsets, data.lengths, ends.tolist(), strict=True):
+        if end == first + length:
+            continue
+        h, stops, row, part = _fine_steps(data.t[end - 1 : first + length], max_step)
+        start = out[end - 1]
+        inputs = data.inputs_of_steps(end - 1 + row, part) if driven else None
+        with torch.no_grad():
+            run = stepper.rollout(start[:n], start[n : 2 * n], start[2 * n], h=h, inputs=inputs)
+        out[end : first + length] = torch.cat([run.q, run.p, run.s[:, None]], -1)[stops]
+        if not bool(run.ok.all()):
+            status = f"a step failed after t = {float(data.t[end - 1]):g}; nothing is predicted beyond it"
+    return out, status
+
+
+def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Model steps that cover the recorded times; the node that reaches each of them; each step's row, and its middle.
+
+    The middle is a number from 0 to 1, of the recorded step that starts at the row.
+    """
+    counts = torch.tensor([substeps(h, max_step) for h in t.diff().tolist()], device=t.device)
+    row = torch.arange(len(counts), device=t.device).repeat_interleave(counts)
+    ends = counts.cumsum(0)
+    part = (torch.arange(len(row), device=t.device) - (ends - counts)[row] + 0.5) / counts[row]
+    return (t.diff() / counts).repeat_interleave(counts), ends, row, part.to(t.dtype)

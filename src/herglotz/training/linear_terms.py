@@ -1,0 +1,100 @@
+"""The linear problem that a search for named terms starts from: smoothed positions, every candidate, then pruned."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.smoothing import LocalPolynomials, smooth_triples
+from herglotz.models.jet import pairs
+from herglotz.training.baseline import Baseline
+from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, own_terms
+from herglotz.training.pruning import prune
+
+ROWS = 4000  # triples in the linear problem
+
+
+class LinearTerms:
+    """Terms and starting values from smoothed positions.
+
+    Parameters
+    ----------
+    data, base
+        What is trained on, and the first look at it.
+    every
+        The candidates.
+    """
+
+    def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms):
+        self.data, self.base, self.all = data, base, every
+        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
+
+    def start(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
+        """Terms and values of the linear problem, pruned."""
+        t, u = smooth_triples(self.data, local)
+        rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
+        if len(t) > ROWS:
+            t, u = t.spread_out(ROWS), None if u is None else u[rows]
+        forces = NamedForces(self.all.drag, self.base.speed, u)
+        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
+        columns = self._columns(fit)
+        x = fit.solve(columns)
+        if float(x[0]) == 0:
+            return None
+        x = x / x[0]
+        r = fit.errors(x)
+        if not bool(torch.isfinite(r).all()):
+            return None
+        X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
+        size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
+        overlap = max(1.0, local.width / 2)
+        A = X.T @ X / size / overlap
+        place = self._linear_places(fit, columns)
+        free = torch.tensor([i for own in place.values() for i in own])
+        kept, _ = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
+        stay = set(kept.tolist())
+        terms = self.all.only([name for name, own in place.items() if stay & set(own)])
+        left = columns.clone()
+        at = columns.nonzero()[1:, 0]
+        for name, own in place.items():
+            if name not in terms.names:
+                left[at[own]] = False
+        start = fit.start(fit.solve(left))
+        if start is None:
+            return None
+        values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
+        for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
+            values |= zip(names, values.pop(parameter, ()), strict=True)
+        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
+        return terms, values
+
+    @property
+    def _still(self) -> list[str]:
+        return [x for x in self.all.features if "v" not in x and x not in self.own]
+
+    @property
+    def _moving(self) -> list[str]:
+        return [x for x in self.all.features if "v" in x]
+
+    def _columns(self, fit: LinearFit) -> Tensor:
+        """All columns for joints; no mass or friction between lengths."""
+        if any(self.data.angles):
+            return torch.ones(len(fit.names), dtype=torch.bool)
+        i, j = pairs(self.data.dof, torch.device("cpu"))
+        diagonal = iter((i == j).tolist())
+        return torch.tensor([next(diagonal) if x == "mass" else x != "coupling.viscous" for x in fit.names])
+
+    def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
+        """Columns of each term among those that are used, the first mass not counted."""
+        names = [x for x, used in zip(fit.names, columns.tolist(), strict=True) if used][1:]
+        at: dict[str, list[int]] = {}
+        for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
+            own = [i for i, x in enumerate(names) if x == parameter]
+            at |= {term: [i] for term, i in zip(terms, own, strict=True)}
+        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
+        at[DRY] = [i for i, x in enumerate(names) if x == DRY]
+        return at

@@ -1,0 +1,120 @@
+"""scikit-learn's interface: fit, predict and score of one motion; scikit-learn's own checks where it is installed."""
+
+import importlib
+import importlib.util
+import sys
+import types
+from importlib.machinery import ModuleSpec
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import State, Stepper
+from herglotz.training import FitConfig, Run
+from herglotz.training.run import box_of
+
+INSTALLED = importlib.util.find_spec("sklearn") is not None
+H = 0.2
+
+
+class Base:
+    """Stands in for BaseEstimator and RegressorMixin."""
+
+    def score(self, X, y):
+        return 1 - np.sum((self.predict(X) - y) ** 2) / np.sum((y - np.mean(y)) ** 2)  # pyright: ignore
+
+
+@pytest.fixture
+def regressor(monkeypatch):
+    if not INSTALLED:
+        base, validation = types.ModuleType("sklearn.base"), types.ModuleType("sklearn.utils.validation")
+        base.BaseEstimator, base.RegressorMixin = type("Mixin", (), {}), Base  # pyright: ignore
+        validation.check_is_fitted = lambda model, name: getattr(model, name)  # pyright: ignore
+        for one in (types.ModuleType("sklearn"), types.ModuleType("sklearn.utils"), base, validation):
+            one.__spec__ = ModuleSpec(one.__name__, None)  # torch asks for it
+            monkeypatch.setitem(sys.modules, one.__name__, one)
+    monkeypatch.delitem(sys.modules, "herglotz.regressor", raising=False)
+    return importlib.import_module("herglotz.regressor").HerglotzRegressor
+
+
+def oscillator(**options):
+    """x″ = −x − 0.1 x′ (+ u)."""
+    one = (1.0,)
+    return ContactLagrangian(ModelConfig((False,), **options, scale=one, speed=one, stiffness=one, tilt=(0.0,),
+                                         rate=0.1, potential_width=0))  # fmt: skip
+
+
+def known(monkeypatch, regressor, model, motion):
+    """Let `fit` find this model and this motion of it."""
+
+    def fit(data, config, progress):
+        assert (config, progress) == (FitConfig(level="auto", seed=7, train_fraction=1.0), False)
+        n = data.samples
+        states = State(*(x[:n] for x in (motion.q, motion.p, motion.s)))
+        torch.testing.assert_close(data.q, states.q)
+        return Run(model, config, {}, data, (n,), states, H, box_of(*states), [])
+
+    monkeypatch.setattr(sys.modules[regressor.__module__], "fit", fit)
+    return regressor(seed=7)
+
+
+@torch.no_grad()
+def test_fit_predict_score(regressor, monkeypatch):
+    # fails if the motion does not go on from the fit, times are taken in the wrong order, or a part of a step is lost
+    model = oscillator(level="linear")
+    start = torch.tensor([1.0]).double(), torch.tensor([0.0]).double(), torch.tensor(0.0).double()
+    motion = Stepper(model).rollout(*start, h=H, steps=60)
+    t, q = H * np.arange(61), motion.q[:, 0].numpy()
+    found = known(monkeypatch, regressor, model, motion).fit(t[:40], q[:40])
+    assert found.score(t[40:], q[40:]) == pytest.approx(1, abs=1e-12)
+    np.testing.assert_allclose(found.predict(t[[50, 3]]), q[[50, 3]], atol=1e-12)
+    # Between samples: the motion of the rule, whose frequency is off by h²/24; measured 4e-3, a step is 0.2.
+    between = np.array([9.13, 2.05])
+    free = np.exp(-0.05 * between) * (np.cos(between) + 0.05 * np.sin(between))
+    np.testing.assert_allclose(found.predict(between), free, atol=2e-2)
+    assert found.predict(t[:3, None]).shape == (3,)
+    with pytest.raises(InputError, match="before the first fitted sample"):
+        found.predict([-1.0])
+
+
+@torch.no_grad()
+def test_inputs_drive_the_prediction(regressor, monkeypatch):
+    # fails if an input acts a row too late, or not at all
+    model, u = oscillator(level="forced", inputs=1, input_map=(1.0,)), np.random.default_rng(0).normal(size=41)
+    start = torch.tensor([1.0]).double(), torch.tensor([0.0]).double(), torch.tensor(0.0).double()
+    motion = Stepper(model).rollout(*start, h=H, steps=40, inputs=torch.from_numpy(u[:40, None]))
+    X, q = np.stack([H * np.arange(41), u], 1), motion.q.numpy()
+    found = known(monkeypatch, regressor, model, motion).fit(X[:20], q[:20])
+    np.testing.assert_allclose(found.predict(X[19:]), q[19:], atol=1e-12)
+    with pytest.raises(InputError, match="row 1 of X: a step of"):
+        found.predict(X[[20, 30]])
+    with pytest.raises(InputError, match="X has 1 columns"):
+        found.predict(X[20:, :1])
+
+
+def test_a_missing_package_is_named(monkeypatch):  # fails if a newcomer sees a ModuleNotFoundError without a remedy
+    monkeypatch.setitem(sys.modules, "sklearn.base", None)
+    monkeypatch.delitem(sys.modules, "herglotz.regressor", raising=False)
+    with pytest.raises(ImportError, match=r"pip install 'herglotz\[sklearn\]'"):
+        importlib.import_module("herglotz.regressor")
+
+
+@pytest.mark.skipif(not INSTALLED, reason="scikit-learn is an extra")
+def test_the_checks_of_scikit_learn_that_apply(regressor):
+    # fails if a parameter is changed by the constructor, or an unfitted model predicts. The checks that fit X of
+    # several random columns do not apply: the first column is time.
+    from sklearn.base import clone  # pyright: ignore[reportMissingImports]
+    from sklearn.exceptions import NotFittedError  # pyright: ignore[reportMissingImports]
+    from sklearn.utils import estimator_checks as checks  # pyright: ignore[reportMissingImports]
+
+    model = regressor(seed=3)
+    for name in ("no_attributes_set_in_init", "parameters_default_constructible", "get_params_invariance",
+                 "set_params", "estimator_cloneable", "estimator_repr"):  # fmt: skip
+        check = getattr(checks, f"check_{name}")
+        check("HerglotzRegressor", model if name in ("estimator_cloneable", "estimator_repr") else regressor())
+    assert clone(model).get_params() == model.get_params()
+    with pytest.raises(NotFittedError):
+        model.predict([0.0])

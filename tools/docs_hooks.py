@@ -1,0 +1,38 @@
+"""What `make docs` does to a page before mkdocs sees it: the help of the commands, and links that leave docs/."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "src")]
+
+from tools.readme import elsewhere  # noqa: E402
+
+
+def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
+    """Called by mkdocs for every page."""
+    if "{{ help }}" in markdown:
+        return markdown.replace("{{ help }}", helps())
+    folder = (ROOT / "docs" / page.file.src_uri).parent
+    outside = lambda target: not (folder / target).resolve().is_relative_to(ROOT / "docs")  # noqa: E731
+    return elsewhere(markdown, folder, outside)
+
+
+def helps() -> str:
+    """The help of every command."""
+    from herglotz.cli.parser import build_parser
+    from herglotz.cli.simulate import __getattr__ as scenes
+
+    os.environ["COLUMNS"] = "80"
+    parser = build_parser()
+    action = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
+    action.choices["simulate"].description = scenes("DESCRIPTION")
+    parts = [f"```text\n{parser.format_help().rstrip()}\n```"]
+    for name, command in action.choices.items():
+        parts.append(f"## herglotz {name}\n\n```text\n{command.format_help().rstrip()}\n```")
+    return "\n\n".join(parts)
