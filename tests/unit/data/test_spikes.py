@@ -65,3 +65,12 @@ def test_every_mth_sample():
         data.thinned(0)
     with pytest.raises(InputError, match="at least 3 are needed"):
         data.thinned(2)
+
+
+@pytest.mark.parametrize("width", [0.1, 0.2, 0.3])
+def test_a_short_fast_motion_is_none(width):
+    # fails if a sample is judged by the noise of the whole record alone, and not by its neighbours: a smooth pulse in
+    # slow motion then lost 9 to 24 samples
+    t = torch.arange(300, dtype=torch.float64) * 0.05
+    data = Trajectories.of(t, torch.sin(t) + torch.exp(-(((t - 7.01) / width) ** 2)))
+    assert not spikes(data).any()

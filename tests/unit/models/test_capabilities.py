@@ -1,6 +1,7 @@
 """What a model says of itself; `test_model_contract.py` holds that steps behave accordingly."""
 
 import pytest
+import torch
 
 from herglotz.models import ContactLagrangian, ModelConfig, capabilities
 
@@ -32,3 +33,14 @@ def test_how_a_step_is_made_follows_from_the_terms(config, step):
 def test_nothing_is_known_of_what_is_no_model():
     # fails if a discrete Lagrangian that is not a sum of these terms is stepped as if it were one
     assert capabilities(lambda q0, q1, s0, h: (q1 - q0).square().sum(-1) / h - s0) is None
+
+
+def test_the_typical_increment_is_that_of_the_fastest_coordinate():
+    # fails if it is that of the slowest: a step then iterates for digits that the fast coordinate does not have
+    one = (1.0, 1.0)
+    config = ModelConfig((False, False), "linear", one, (0.5, 3.0), one, (0.0, 0.0), potential_width=0)
+    model = ContactLagrangian(config)
+    assert float(model.typical_increment(torch.tensor(0.1, dtype=torch.float64))) == pytest.approx(
+        0.1 * max(config.speed)
+    )
+    assert min(config.speed) < max(config.speed)
