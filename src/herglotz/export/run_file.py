@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,8 @@ def export_run(
     kind
         "pt2", "aoti", "onnx" or "c"; None: by the end of the name.
     h_range
-        Steps that the file is for; None: those of the data.
+        Steps that the file is for; None: those of the data. An end that agrees with the run's own step to six digits
+        is taken for it: recorded times carry rounding, and 0.2 means a step of 0.2000000000000002 too.
 
     Raises
     ------
@@ -43,13 +45,14 @@ def export_run(
     if kind not in WRITERS:
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
     (q, p, s), t = run.last_fitted()
+    span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or run.h_range]
     metadata = {
         "names": list(run.data.names),
         "time_unit": run.data.time_unit,
         "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
         "metrics": run.metrics,
-        "card": model_card(run, h_range or run.h_range),
-        "h_range": list(h_range or run.h_range),
+        "card": model_card(run, (span[0], span[-1])),
+        "h_range": span,
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind == "c":

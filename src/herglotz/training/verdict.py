@@ -131,7 +131,7 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
     if ahead is not None and ahead.open > LOST:
-        return f"{FAILS} for certain: {errors}. {_left_open(ahead)}"
+        return f"{FAILS}: too little was recorded to tell; {errors}. {_left_open(ahead)}"
     error = max(worst, free)
     if error <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"

@@ -12,21 +12,10 @@ from herglotz.cli import main
 
 @pytest.fixture(scope="session")
 def tiny_csv(tmp_path_factory) -> Path:
-    """One pendulum motion of 31 samples."""
+    """One pendulum motion of 61 samples, two periods: of one period a fit says that too little was recorded."""
     path = tmp_path_factory.mktemp("cli_data") / "tiny.csv"
-    arguments = [
-        "simulate",
-        "damped_pendulum",
-        "--out",
-        str(path),
-        "--trajectories",
-        "1",
-        "--steps",
-        "30",
-        "--h",
-        "0.2",
-    ]
-    assert main([*arguments, "--seed", "4", "--noise", "0.005"]) == 0
+    size = ["--trajectories", "1", "--steps", "60", "--h", "0.2", "--seed", "4", "--noise", "0.005"]
+    assert main(["simulate", "damped_pendulum", "--out", str(path), *size]) == 0
     return path
 
 

@@ -130,7 +130,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert {"model.pt", "metrics.json", "config.json", "fit.npz"} <= {x.name for x in folder.iterdir()}
     assert len(list(folder.glob("*.png"))) == 5
     run = load_run(folder)
-    assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (25,))
+    assert (run.config.train_fraction, run.config.seed, run.train_lengths) == (0.8, 3, (49,))
 
 
 def test_fit_says_what_it_found(tmp_path, capsys):

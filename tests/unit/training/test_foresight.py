@@ -7,7 +7,7 @@ from herglotz.scenes import scene
 from herglotz.training import fit
 
 
-@pytest.mark.parametrize(("steps", "verdict"), [(40, "does not fit for certain"), (300, "fits to the noise")])
+@pytest.mark.parametrize(("steps", "verdict"), [(40, "does not fit: too little"), (300, "fits to the noise")])
 def test_a_recording_that_is_too_short_says_so(steps, verdict):
     # fails if what the data leave open is not looked at (0.4 of a period fits to the noise and tells nothing of the
     # next one), is not carried to longer times, or is asked of terms that a longer recording excludes

@@ -28,9 +28,9 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, 0.012, 1.2, replace(KNOWN, start=0.5), "fits, worse than the noise by a factor of 1.2e+02:"),  # chaos
         (0.011, 0.012, 1.2, KNOWN, "does not fit beyond the recording"),
         (0.011, 0.012, 1.2, None, "does not fit beyond the recording"),
-        (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit for certain"),
-        (0.011, 0.012, 0.013, replace(KNOWN, hidden=0.2), "does not fit for certain"),
-        (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit for certain"),
+        (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit: too little was recorded"),
+        (0.011, 0.012, 0.013, replace(KNOWN, hidden=0.2), "does not fit: too little was recorded"),
+        (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit: too little was recorded"),
         (0.2, 0.012, 0.013, KNOWN, "does not fit"),
         (0.011, 0.2, 0.013, KNOWN, "does not fit"),
         (0.011, 0.012, math.inf, KNOWN, "does not fit"),
