@@ -139,9 +139,9 @@ def check(
 
 
 def _check_open(q: Tensor) -> None:
-    if q.ndim != 2 or len(q) <= q.shape[-1]:
+    if q.ndim != 2 or not len(q):
         raise InputError(
-            f"q needs shape (B, n) with more points than coordinates, got {tuple(q.shape)}; "
+            f"q needs shape (B, n) with B > 0, got {tuple(q.shape)}; "
             "give points of an open set, e.g. torch.rand(20, n, dtype=torch.float64)"
         )
     spread = torch.linalg.svdvals(q - q.mean(0))

@@ -154,11 +154,6 @@ class ContinuousEquation:
         """The estimated error of X̃, (...), relative to the move to the next iterate: two orders differ by so much."""
         return self._sum(State(q, p, s), 0.0, 1)[1]
 
-    def between(self, state: State, theta: float) -> tuple[State, Tensor, Tensor]:
-        """Φ̃^θ(state) for 0 ≤ θ ≤ 1, its conformal factor, and the estimated error."""
-        x, error = self._sum(state, theta, 0)
-        return State(*split(x[..., :-1])), x[..., -1].exp(), error
-
     def _sum(self, state: State, theta: float, derivative: int) -> tuple[Tensor, Tensor]:
         return _summed(_Iterates(self, state), 0, theta, derivative)
 

@@ -95,7 +95,10 @@ def test_a_point_source_and_a_caustic():
     assert not check(OSCILLATOR, source, Propagated(OSCILLATOR, source, 0.1, 40), points, h=0.1).passed
 
 
-@pytest.mark.parametrize("points", [Q1[:1], Q1[:, 0], torch.ones(5, 1).double(), f64(0, 0, 1, 1, 2, 2).reshape(3, 2)])
+LINE = f64(0, 0, 1, 1, 2, 2).reshape(3, 2)
+
+
+@pytest.mark.parametrize("points", [Q1[:0], Q1[:1], Q1[:, 0], torch.ones(5, 1).double(), LINE])
 def test_what_is_no_open_set_is_refused(points):
     # fails if a single trajectory, on which every S solves both equations, is taken for a proof (E7)
     with pytest.raises(InputError, match=r"open set|spread in every direction"):
