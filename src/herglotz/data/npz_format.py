@@ -90,6 +90,8 @@ def _arrays(path: Path, content: bytes) -> dict[str, np.ndarray]:
             _check_size(path, archive.zip)
             for name in archive.files:  # only what is used is inflated: an archive can hold gigabytes of zeros
                 arrays[name] = np.asarray(archive[name]) if name in USED else np.empty(0)
+    except InputError:
+        raise
     except DAMAGE as error:
         if "allow_pickle" in str(error):
             raise InputError(

@@ -22,7 +22,7 @@ def test_shared_and_per_coordinate_ranges_draw_the_same_states():
 def test_every_coordinate_keeps_to_its_own_range():
     # fails if one coordinate's range is used for all, or low and high are exchanged with the coordinates
     shared = scene("damped_oscillator")  # isotropic: its L_d takes any n
-    two = replace(shared, dof=2, q_range=((0.0, 5.0), (1.0, 6.0)), v_range=((-1.0, 2.0), (-0.5, 2.5)))
+    two = replace(shared, coordinates=("x", "y"), q_range=((0.0, 5.0), (1.0, 6.0)), v_range=((-1.0, 2.0), (-0.5, 2.5)))
     states = subject(two, None, 200, 0).states
     assert states.q.shape == (200, 2)
     for x, low, high in ((states.q, (0.0, 5.0), (1.0, 6.0)), (states.p, (-1.0, 2.0), (-0.5, 2.5))):
