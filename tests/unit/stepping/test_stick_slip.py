@@ -96,10 +96,10 @@ def test_a_joint_stands_still_until_it_is_pushed_off():
 
 
 def test_motion_comes_to_rest_and_stays():
-    # fails if sticking ends without a force: a spring within the dead band
+    # fails if sticking ends without a force: a spring within the dead band; all rest after 414 steps
     model, (q, p) = joints(2, seed=3), starts(50, 2)
     with torch.no_grad():
-        run = Stepper(model).rollout(3 * q, p, h=H, steps=1500)
+        run = Stepper(model).rollout(3 * q, p, h=H, steps=700)
     assert bool(run.ok.all())
     assert bool((run.q[:, -1] == run.q[:, -200]).all())
 
@@ -109,7 +109,7 @@ def test_no_status_but_converged_at_reversals(dtype):
     # fails if an iteration cycles between sticking and sliding: pushed to and fro, 3 joints, steps of three sizes
     model, (q, p) = joints(3, seed=1).to(dtype), starts(40, 3)
     make = torch.Generator().manual_seed(0)
-    u = 4 * torch.randn(40, 80, 1, generator=make, dtype=torch.float64).to(dtype)
+    u = 4 * torch.randn(40, 40, 1, generator=make, dtype=torch.float64).to(dtype)
     with torch.no_grad():
         for h in (1e-3, 0.05, 0.5):
             run = Stepper(model).rollout(q.to(dtype), p.to(dtype), h=h, inputs=u)
@@ -118,7 +118,7 @@ def test_no_status_but_converged_at_reversals(dtype):
 
 def test_alone_as_in_a_batch():
     # fails if one sample's sticking decides another's
-    model, (q, p) = joints(2, seed=5), starts(20, 2)
+    model, (q, p) = joints(2, seed=5), starts(6, 2)
     with torch.no_grad():
         together = Stepper(model).rollout(q, p, h=H, steps=30)
         alone = [Stepper(model).rollout(a, b, h=H, steps=30).q for a, b in zip(q, p, strict=True)]
