@@ -75,7 +75,7 @@ def _draw(ax: Axes, number: int, stage: Stage) -> None:
 
 
 def _title(stages: list[Stage], shown: int) -> str:
-    count, plural = sum(len(cost) for _, cost in stages), "" if len(stages) == 1 else "s"
+    count, plural = sum(len(cost) - 1 for _, cost in stages), "" if len(stages) == 1 else "s"
     last = f", the last {shown} shown" if shown < len(stages) else ""
     end = ": the last one has settled" if settled(stages[-1][1]) else ""
     return f"{count} iterations in {len(stages)} stage{plural}{last}{end}"

@@ -102,7 +102,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
         start={**own, **base.start},
-        outliers=seen.outliers, continues_probe=continues, sigma=sigma, known=named, restarts=restarts,
+        outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures,
         reasons={
             "level": _level_reason(seen, user_settings),
@@ -118,7 +118,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
             "sigma": "what the search for terms left" if named else _sigma_reason(seen, one_step, sigma),
-            "known": "the search for terms fitted whole trajectories" if named else "a first fit",
+            "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
             "restarts": _restart_reason(user_settings, covered),
             "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
         },

@@ -55,8 +55,9 @@ def friction_holds(train: Trajectories) -> tuple[bool, str]:
     clear = float(gain.mean() / gain.std().clamp_min(torch.finfo(gain.dtype).tiny)) * BLOCKS**0.5
     brakes = bool((x[-train.dof :] < 0).all())
     less = 1 - float((-gain.mean() / 2).exp())
-    numbers = f"the sign of the velocity lowers the error of held-out accelerations by {100 * less:.2g} %"
-    return float(gain.mean()) > WORTH and clear > CLEARLY and brakes, f"{numbers} ({clear:.1f} standard errors)"
+    verb = "lowers" if less >= 0 else "raises"
+    numbers = f"the sign of the velocity {verb} the error of held-out accelerations by {abs(100 * less):.2g} %"
+    return float(gain.mean()) > WORTH and clear > CLEARLY and brakes, f"{numbers} ({abs(clear):.1f} standard errors)"
 
 
 def _held_out(columns: Tensor, a: Tensor) -> tuple[Tensor, Tensor]:

@@ -34,7 +34,7 @@ class Plan:
     outliers: bool  # the first one-step fit takes Student's t
     continues_probe: bool  # the one-step fit goes on from the short one that measured the noise
     sigma: float | None  # noise of q that the first stage assumes; None: a one-step fit measures it
-    known: bool  # starting values and sigma are those of an earlier fit of the same model
+    fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
     reasons: dict[str, str] = field(default_factory=dict)

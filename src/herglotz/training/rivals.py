@@ -44,7 +44,8 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         start = {name: tuple(values) for name, values in second["start"].items()}
         networks = replace(
             networks, start={**networks.start, **start}, sigma=second["sigma"], departures=(second["departure"],),
-            known=True, reasons={**networks.reasons, "known": "fitted to three quarters of the training part"},
+            fitted_before=True,
+            reasons={**networks.reasons, "fitted_before": "to three quarters of the training part"},
         )  # fmt: skip
     return other, _reasoned(networks, why)
 

@@ -116,8 +116,8 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
         return Structure(config, base, "no dictionary of terms: its model cannot follow 20 steps")
     noise = precision(data)
     limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.spread)
-    named = ", ".join(found.terms.names) or "nothing"
-    words = f"beside mass, stiffness and friction of the first degree {named}: misses {found.rms:.2g}"
+    named = ", ".join(("mass, stiffness, viscous friction", *found.terms.names))
+    words = f"{named} miss {found.rms:.2g}"
     words += f" (precision {limit:.2g})" + ("" if found.whole else "; whole trajectories are not followed")
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
     return Structure(found.config, found.base, words, found.rms, doubt)

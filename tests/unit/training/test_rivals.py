@@ -19,7 +19,7 @@ def plan(network):
     return Plan(
         level="linear", objective="trajectory", network=network, order=2, features=(), hold="", drag=(), substeps=1,
         forces=plain, start={"stiffness": (1.0,), "tilt": (0.0,), "rate": (0.1,)}, outliers=False,
-        continues_probe=False, sigma=None, known=network == "none", restarts=1, departures=(2e-4, 6e-3),
+        continues_probe=False, sigma=None, fitted_before=network == "none", restarts=1, departures=(2e-4, 6e-3),
         reasons={"network": "", "objective": ""},
     )  # fmt: skip
 
@@ -64,7 +64,7 @@ def test_the_smaller_error_wins_and_networks_go_on_from_their_fit(held):
     second = {"rms": 3 * NOISE, "sigma": NOISE, "departure": 6e-3, "start": values}
     seen, chosen = held.winner({"rms": 5 * NOISE, "sigma": NOISE}, second)
     assert (seen.name, chosen.network) == ("networks", "potential")
-    assert chosen.known
+    assert chosen.fitted_before
     assert chosen.departures == (6e-3,)
     assert chosen.sigma == NOISE
     assert chosen.start["potential.network.weights.0"] == (0.5, 0.25)
