@@ -99,7 +99,7 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         if X.shape[1] != self.n_features_in_:
             raise InputError(f"X has {X.shape[1]} columns, the fit had {self.n_features_in_}; give the same")
         with torch.no_grad():
-            q = self._free(X[:, 0]) if X.shape[1] == 1 else self._driven(X)
+            q = self._free(X[:, 0]) if self.run_.data.u is None else self._driven(X)
         if not np.isfinite(q).all():
             at = X[int((~np.isfinite(q)).any(1).argmax()), 0]
             raise InputError(f"the free run fails before t = {at:g}; predict earlier times, or fit more data")
@@ -139,7 +139,7 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         state, now = run.last_fitted()
         last = run.data.offsets[0] + run.train_lengths[0] - 1
         u, (low, high) = run.data.u, run.h_range
-        assert u is not None  # the fit had inputs
+        assert u is not None  # `predict` asks
         acts, found = u[last], np.empty((len(X), run.data.dof))
         for i, (t, *row) in enumerate(X.tolist()):
             step = t - now

@@ -4,6 +4,7 @@ import importlib
 import importlib.util
 import sys
 import types
+from dataclasses import replace
 from importlib.machinery import ModuleSpec
 
 import numpy as np
@@ -93,6 +94,24 @@ def test_inputs_drive_the_prediction(regressor, monkeypatch):
         found.predict(X[[20, 30]])
     with pytest.raises(InputError, match="X has 1 columns"):
         found.predict(X[20:, :1])
+
+
+@torch.no_grad()
+def test_inputs_that_are_ignored_are_not_asked_for(regressor, monkeypatch):
+    # fails if settings={"use_inputs": False} ends in an AssertionError: X has inputs, the run has none
+    model = oscillator(level="linear")
+    start = torch.tensor([1.0]).double(), torch.tensor([0.0]).double(), torch.tensor(0.0).double()
+    motion = Stepper(model).rollout(*start, h=H, steps=40)
+    X, q = np.stack([H * np.arange(41), np.ones(41)], 1), motion.q.numpy()
+
+    def fit(data, config, progress):
+        assert (config.use_inputs, progress) == (False, False)
+        states = State(*(x[: data.samples] for x in (motion.q, motion.p, motion.s)))
+        return Run(model, config, {}, replace(data, u=None), (data.samples,), states, H, box_of(*states), [])
+
+    monkeypatch.setattr(sys.modules[regressor.__module__], "fit", fit)
+    found = regressor(settings={"use_inputs": False}).fit(X[:20], q[:20])
+    np.testing.assert_allclose(found.predict(X[19:]), q[19:], atol=1e-12)
 
 
 def test_a_missing_package_is_named(monkeypatch):  # fails if a newcomer sees a ModuleNotFoundError without a remedy

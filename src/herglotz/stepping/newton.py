@@ -9,6 +9,7 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solve
 from herglotz.mechanics.newton_one import newton_one, newton_step, norm
@@ -65,8 +66,14 @@ def solve_step(
     increments
         Take Δ = q1 − q0 for the unknown, for an L_d with `partials_increment`: no cancellation at small h.
         Convergence is then relative to the size of Δ.
+
+    Raises
+    ------
+    InputError
+        If `increments` is asked for and L_d has none.
     """
-    assert not increments or isinstance(L_d, Increments)
+    if increments and not isinstance(L_d, Increments):
+        raise InputError("this L_d has no partials_increment; leave increments=False, or use a model or a rule with it")
     equation = PartialsEquation(L_d, q0, p0, s0, h, order, increments)
     found = find_root(equation, q0, guess, tol, max_iterations, order, increments)
     P = found.point.rest

@@ -3,8 +3,10 @@
 import pytest
 import torch
 
+from herglotz.errors import InputError
 from herglotz.mechanics import autograd_partials, momentum_jacobian, momentum_residual, partials
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper, solve, solve_step
 
 LEVELS = {
@@ -236,3 +238,10 @@ def test_gradients_with_respect_to_h_and_the_state():
     h = torch.tensor([0.2, 0.3], dtype=torch.float64)
     step = lambda q, p, s, h: tuple(Stepper(model).step(State(q, p, s), h).state)  # noqa: E731
     assert torch.autograd.gradcheck(step, [x.requires_grad_() for x in (q, p, s, h)], atol=1e-8)
+
+
+def test_increments_need_an_L_d_that_has_them():
+    # fails if a user's L_d without `partials_increment` ends in an AssertionError
+    q, s = torch.zeros(1, 1, dtype=torch.float64), torch.zeros(1, dtype=torch.float64)
+    with pytest.raises(InputError, match="has no partials_increment"):
+        solve_step(scene("damped_oscillator").L_d, q, q, s, torch.tensor(0.1).double(), q, TOL, increments=True)
