@@ -12,7 +12,7 @@ MOST = 4000  # windows at most, evenly spread: more do not change an RMS
 
 
 def roughness(data: Trajectories, degree: int = DEGREE) -> float:
-    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q.
+    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q over its balance.
 
     Infinite where no trajectory has nine samples.
 
@@ -28,7 +28,7 @@ def roughness(data: Trajectories, degree: int = DEGREE) -> float:
         return float("inf")
     rows = torch.cat(firsts)
     rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
-    t, q = data.t[rows].double().cpu(), data.q[rows].double().cpu()
+    t, q = data.t[rows].double().cpu(), (data.q / data.balance)[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
     Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
     r = q - Q @ (Q.mT @ q)

@@ -60,11 +60,14 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
 
 
 def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
-    """RMS error of the free run over the unseen part, in units of q, without single spikes; inf where it breaks off."""
+    """RMS error of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
+
+    Single spikes are left out.
+    """
     fitted = replace(fitted, states=_with_dropped(fitted, seen.train, seen.spikes))
     states, _ = states_everywhere(fitted, seen.data, seen.train.lengths, task.base.model_step)
     _, free = _errors(fitted, task, seen, seen.spikes, states)
-    found = None if free is None else _rms(free)
+    found = None if free is None else _rms(free / seen.train.balance)
     return math.inf if found is None else found
 
 
