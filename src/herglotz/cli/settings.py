@@ -171,7 +171,7 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--hold", choices=HOLDS,
-        help="what the inputs do between samples: nothing, straight lines, or polynomials (default: what the file says, "
+        help="what the inputs do between samples: nothing, straight lines or polynomials (default: what the file says, "
         "or what explains the data best)",
     )  # fmt: skip
 
