@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
 from herglotz.data.holds import HOLDS, held
-from herglotz.data.splits import time_split, trajectory_split
+from herglotz.data.splits import liveliest_rows, time_split, trajectory_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
@@ -198,6 +198,11 @@ class Trajectories:
         (train, train_lengths), (test, test_lengths) = time_split(self.lengths, fraction, self.source)
         device = self.t.device
         return self._rows(train.to(device), train_lengths), self._rows(test.to(device), test_lengths)
+
+    def liveliest(self, most: int) -> Trajectories:
+        """Return at most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+        rows, lengths = liveliest_rows(self.q, self.lengths, most)
+        return self if len(rows) == self.samples else self._rows(rows.to(self.t.device), lengths)
 
     def split_trajectories(self, fraction: float, generator: torch.Generator) -> tuple[Trajectories, Trajectories]:
         """Draw `round(fraction * B)` whole trajectories for training; the others test."""
