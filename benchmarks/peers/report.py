@@ -62,7 +62,7 @@ def table(result: dict[str, Any]) -> str:
     for data in PROBLEMS:
         if rows := rows_of(result["cells"], data):
             lines += [f"## {data}", "", result["titles"][data] + ".", "", *_errors(rows), *_ahead(rows), ""]
-    return "\n".join([*lines, *_sources(result)])
+    return "\n".join(lines)
 
 
 def _errors(rows: Rows) -> list[str]:
@@ -98,19 +98,6 @@ def _ahead(rows: Rows) -> list[str]:
         found.append([PEERS[peer].title, *columns])
     words = "RMS of the elbow and the tip angle (rad), median of the seeds:"
     return ["", words, "", *lines_of(["peer", *(f"after {t}" for t in times)], found)]
-
-
-def _sources(result: dict[str, Any]) -> list[str]:
-    """Figures of the sources and ours."""
-    if not result.get("reproduced"):
-        return []
-    found = []
-    for one in result["reproduced"].values():
-        here = one["here"]
-        shown = f"{statistics.median(here):.2e} ({min(here):.1e} – {max(here):.1e})"
-        found.append([one["figure"], one["source"], shown, len(here), one["rule"], "yes" if one["agrees"] else "no"])
-    head = ("figure", "source", "here median (least – largest)", "seeds", "agrees if", "agrees")
-    return ["## Figures of the sources", "", *lines_of(head, found), "", result["reproduced_note"]]
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
