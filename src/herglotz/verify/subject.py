@@ -17,7 +17,7 @@ from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
 from herglotz.scenes import Scene, scene, scene_names
-from herglotz.stepping import State, Step, Stepper
+from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
 from herglotz.training import Run, load_run
 from herglotz.verify.draw import drawn_states
 
@@ -51,14 +51,22 @@ class Subject:
 
     def flow(self, k: int = 1) -> Flow:
         """Return the k-step map (q, p, s) → (q_k, p_k, s_k); a sample whose step failed is NaN."""
+        return lambda q, p, s: self.rollout(State(q, p, s), k).final
 
-        def flow_k(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            state = State(q, p, s)
-            for _ in range(k):
-                state = self.step(state, self.h).state
-            return state
+    def rollout(self, start: State, steps: int) -> Rollout:
+        """Steps of the map."""
+        return Map(self.step).rollout(*start, h=self.h, steps=steps)
 
-        return flow_k
+
+class Map(OneStepMethod):
+    """A step map as a stepper, for the one driver of rollouts."""
+
+    def __init__(self, one: Callable[[State, Any], Step]):
+        self.one = one
+
+    def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """One step."""
+        return self.one(state, h)
 
 
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
