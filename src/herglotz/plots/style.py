@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -110,6 +110,11 @@ def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left"
 def with_unit(name: str, unit: str) -> str:
     """Return an axis label: `theta (rad)`, or the name alone for a number without unit."""
     return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+def one_unit(units: Sequence[str]) -> str:
+    """Return the unit that all have, or none."""
+    return units[0] if len(set(units)) == 1 else ""
 
 
 def number(value: float, unit: str = "") -> str:
