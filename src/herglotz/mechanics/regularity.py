@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics.legendre import mixed_hessian, momentum_minus
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 
@@ -50,26 +49,6 @@ class Regularity:
             for index in self.lost(name).nonzero().tolist():
                 lines.append(f"{_where(index)}h = {float(self.h[tuple(index)])!r}: {statement}")
         return lines
-
-    def require(self, *names: str) -> None:
-        """Raise unless these conditions hold at every sample; the default is the conditions that a step needs.
-
-        Raises
-        ------
-        InputError
-            Naming the condition, the sample and the step.
-        """
-        names = names or ("finite", "c", "M", "pole")
-        lines = Regularity.report(self.only(*names))
-        if lines:
-            raise InputError(f"{'; '.join(lines[:3])}; take another h")
-
-    def only(self, *names: str) -> Regularity:
-        """The same with every other condition marked as undefined."""
-        margins = {
-            name: getattr(self, name) if name in names else torch.full_like(self.c, torch.nan) for name in CONDITIONS
-        }
-        return Regularity(**margins, h=self.h, tol=self.tol)
 
 
 def regularity(

@@ -41,7 +41,7 @@ class SampledRollout:
 
 def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     """Roll out from the subject's states and differentiate every step by autograd."""
-    held = _Held(subject.step)
+    held = _Held(subject.step, subject.h)
     with torch.no_grad():
         out = held.rollout(*subject.states, h=subject.h, steps=steps)
     _, D = flow_derivative(subject.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
@@ -52,13 +52,13 @@ def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
 class _Held(Map):
     """The map, where a sample whose step failed stays where it was: a batch needs finite inputs."""
 
-    def __init__(self, one: Callable[[State, Any], Step]):
-        super().__init__(one)
+    def __init__(self, one: Callable[[State, float], Step], h: float):
+        super().__init__(one, h)
         self.factors: list[Tensor] = []  # c of every step
 
     def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """One step; what is not finite has a status."""
-        step = self.one(state, h)
+        step = self.one(state, self.h)
         self.factors.append(step.c)
         good = torch.isfinite(torch.cat([*step.state[:2], step.state.s[:, None]], -1)).all(-1)
         status = torch.where(~good & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status)

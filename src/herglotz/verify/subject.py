@@ -55,18 +55,18 @@ class Subject:
 
     def rollout(self, start: State, steps: int) -> Rollout:
         """Steps of the map."""
-        return Map(self.step).rollout(*start, h=self.h, steps=steps)
+        return Map(self.step, self.h).rollout(*start, h=self.h, steps=steps)
 
 
 class Map(OneStepMethod):
-    """A step map as a stepper, for the one driver of rollouts."""
+    """A step map at one h, a number, as a stepper for the one driver of rollouts."""
 
-    def __init__(self, one: Callable[[State, Any], Step]):
-        self.one = one
+    def __init__(self, one: Callable[[State, float], Step], h: float):
+        self.one, self.h = one, h
 
     def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """One step."""
-        return self.one(state, h)
+        return self.one(state, self.h)
 
 
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
