@@ -34,7 +34,7 @@ FIGURES = {
     "training": plot_training,
     "plan": plot_plan,
 }
-# Of S^k, which a model with forces does not have: identities that hold to rounding (`herglotz verify --plots`).
+# Of S^k, which a model with forces does not have: identities that hold to rounding.
 IDENTITIES = {
     "momentum_vs_dS": plot_momentum_vs_generating_function,
     "hj_residual": plot_hamilton_jacobi_residual,
