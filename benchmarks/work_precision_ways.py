@@ -252,7 +252,7 @@ def motions_of(case: Case) -> State:
 
 ORDERS = {"left": 1, "right": 1, "midpoint": 2, "midpoint_heun": 2, "trapezoid_heun": 2, "strang": 2, "lobatto4": 4,
           "lobatto6": 6, "strang_exponential": 2}  # fmt: skip
-COMPOSED = ((yoshida, 4), (suzuki, 4), (kahan_li, 6))
+COMPOSED = ((yoshida, 4), (suzuki, 4), (kahan_li, 6))  # with their orders
 
 
 class Counted:

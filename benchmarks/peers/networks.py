@@ -15,7 +15,7 @@ from .rollouts import SUBSTEP, Flow
 from .samples import Motion, Samples
 
 WIDTH = 64  # units of each of two hidden layers, for every peer
-BATCH = 256
+BATCH = 256  # samples in a step of Adam, for every peer
 LEARNING_RATE = 3e-3  # of Adam, falling as a cosine
 ADAM_PART = 0.6  # of the budget; L-BFGS has the rest
 PATIENCE = 0.35  # part of the budget without a better validation loss after which a fit stops

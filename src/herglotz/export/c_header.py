@@ -27,7 +27,7 @@ from herglotz.models import ContactLagrangian
 MARK = "herglotz-metadata: "
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"  # of the prefix
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 30  # as of the eager stepper; a step from a good guess takes two to four
 MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
 MAX_WIDE = 24  # coordinates; with more, registers of n x n matrices outgrow the stack that some threads have
 

@@ -18,7 +18,7 @@ from herglotz.stepping import State
 from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 
 STEPS, SIZE = 8, 31
-NULL_STEPS = (1, 4, 8)
+NULL_STEPS = (1, 4, 8)  # first, middle and last of STEPS
 DISTANCES = np.logspace(-5, -0.5, 10)  # of p̂0 from the fan's solution, in widths of the fan
 ANCHOR = 7  # index of the distance through which the reference line of slope 2 is drawn
 BELOW = 1 / 200  # rounding errors at which a difference of exactly 0 is drawn
@@ -33,7 +33,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     Parameters
     ----------
     source
-        A run, a model alone (then from states drawn at random from its typical box), or what `verify` takes: a scene,
+        A run, a model alone (then from states drawn at random), or what `verify` takes: a scene,
         an L_d with h, a pair (L_d, states) with h.
     h
         Step; left out, the run's typical model step (or a tenth of the model's typical time).

@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from herglotz.training.predict import Prediction
 
 MOST_PANELS, DATA = 4, "#B5B5B5"
+# Shares that have a word.
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 

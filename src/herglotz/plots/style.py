@@ -16,7 +16,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 
-DPI = 150
+DPI = 150  # sharp on a screen at twice the size
 # Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
 INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", "#8A8A8A"
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")

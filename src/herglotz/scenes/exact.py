@@ -107,7 +107,7 @@ class NumericallyExact:
             solved: list[tuple[Tensor, Partials, Tensor]] = []
             for count in NODES:
                 problem = Collocation(self.motion, count, q0[left], q1[left], s0[left], h[left])
-                x, converged = problem.solve(guess, self.max_iterations)
+                x, converged = problem.nodes(guess, self.max_iterations)
                 finer = Collocation(self.motion, 2 * count - 1, q0[left], q1[left], s0[left], h[left])
                 guess = lobatto(count)[2].to(x) @ x
                 if not bool(converged.all()):

@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.stepping.state import Crossings, State, Status, Step
 
-MAX_TRIALS = 80
+MAX_TRIALS = 80  # bisection alone, every eighth trial, halves the bracket ten times
 
 
 @dataclass(frozen=True)

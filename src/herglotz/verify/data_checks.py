@@ -26,7 +26,7 @@ from herglotz.verify.report import Check
 ONE_STEP = 0.5
 # Bound of free runs over 20 recorded steps, over the spread; noise and a good model stay far below a tenth.
 FOLLOW = 0.1
-WINDOW = 20
+WINDOW = 20  # recorded steps: errors of one step have grown, chaos has not
 # Bound of the free run beyond training, over the spread: the mean of the unseen samples would give exactly 1.
 FREE_RUN = 1.0
 DECIDABLE = 2.0  # one step is judged where the null model's squared error exceeds this multiple of the noise's
