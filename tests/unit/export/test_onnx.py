@@ -130,7 +130,7 @@ def test_wrong_states_are_refused(written):
     exported = written[2]
     q, p, s = states_of(2, 4)
     with pytest.raises(InputError, match=r"q must be torch.float64, as the model is, got torch.float32"):
-        exported.step(State(q.float(), p, s), 0.1)
+        exported.step(State(q.float(), p.float(), s.float()), 0.1)
     with pytest.raises(InputError, match="need shapes"):
         exported.step(State(q, p[:3], s), 0.1)
     with pytest.raises(InputError, match="p must be finite"):

@@ -226,7 +226,7 @@ def test_wrong_states_are_refused(written):
     with pytest.raises(InputError, match="takes no inputs"):
         exported.step(State(q, p, s), 0.1, u=q)
     with pytest.raises(InputError, match=r"q must be torch.float64, as the model is, got torch.float32"):
-        exported.step(State(q.float(), p, s), 0.1)
+        exported.step(State(q.float(), p.float(), s.float()), 0.1)
     with pytest.raises(InputError, match="need shapes"):
         exported.step(State(q, p[:3], s), 0.1)
     with pytest.raises(InputError, match="p must be finite, got 8"):
