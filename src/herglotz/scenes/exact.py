@@ -123,7 +123,7 @@ class NumericallyExact:
                 if not len(left):
                     break
             rows, *found = (torch.cat(x) for x in zip(*solved, strict=True))
-            reason, *ends = (x[rows.argsort()].reshape(*shape, *x.shape[1:]) for x in found)
+            reason, *ends = (x[rows.argsort()].reshape(shape + x.shape[1:]) for x in found)
             P = _second(End(*ends))
             nan = torch.where(reason == Reason.NONE, 0.0, torch.nan)
             P = P.map(lambda x: x + nan.reshape(shape + (1,) * (x.ndim - len(shape))))
