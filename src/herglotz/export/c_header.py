@@ -156,7 +156,9 @@ def export_c(
     """
     path = Path(path)
     name = _identifier(path.stem) if name is None else name
-    entries = described(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
+    extra = dict(metadata or {})
+    extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
+    entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     content = sealed_text(c_source(model, entries, path.name)).encode()
     write_atomically(path, content)
     remember(content)
@@ -225,23 +227,13 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
 
 
 def described(
-    model: ContactLagrangian,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None,
-    units: Sequence[str],
-    name: str,
-    dtype: str,
-    h_range: tuple[float, float] | None,
-    tolerance: float | None,
-    extra: Mapping[str, Any],
+    model: ContactLagrangian, entries: dict[str, Any], name: str, dtype: str, tolerance: float | None
 ) -> dict[str, Any]:
-    """The checked entries of the comment at the top, from the arguments of `export_c`."""
+    """The checked entries of the comment at the top: those of any file, and those of C."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
         raise InputError(f"dtype must be 'float64' or 'float32', got {dtype!r}")
-    span = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
-    entries = describe(model, h, box, units, MAX_ITERATIONS, {**extra, "h_range": span})
     torch_dtype = getattr(torch, dtype)
     bad = [key for key, value in model.state_dict().items() if not bool(torch.isfinite(value.to(torch_dtype)).all())]
     if bad:
@@ -249,8 +241,7 @@ def described(
     least = TOLERANCE * torch.finfo(torch_dtype).eps
     if tolerance is not None and not least <= tolerance < 1:
         raise InputError(f"tolerance must be at least {least:.2g} in {dtype} and below 1, got {tolerance:g}")
-    entries |= {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
-    return entries
+    return entries | {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
 
 
 def _identifier(stem: str) -> str:
