@@ -247,7 +247,7 @@ def motions_of(case: Case) -> State:
         first.append(x + JITTER * size * (2 * torch.rand(x.shape, generator=make, dtype=torch.float64) - 1))
     anywhere = draw_starts(run, 40, case.seed + 5)
     starts = State(*(torch.cat([a.reshape(len(a), -1), b]) for a, b in zip(anywhere, first, strict=True)))
-    return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T, "own").states
+    return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T).states
 
 
 ORDERS = {"left": 1, "right": 1, "midpoint": 2, "midpoint_heun": 2, "trapezoid_heun": 2, "strang": 2, "lobatto4": 4,
