@@ -159,7 +159,7 @@ def test_a_smaller_correction_is_tried_at_the_own_step_and_a_larger_one_is_not(p
         ([], "either --max-error or --budget-us"),
         (["--max-error", "1e-3", "--widths", "8.5"], "--widths needs whole numbers"),
         (["--max-error", "1e-3", "--kicks", "2.5"], "--kicks needs whole numbers"),
-        (["--max-error", "1e-3", "--multiples", "a"], "--multiples needs numbers"),
+        (["--max-error", "1e-3", "--multiples", "a"], "--multiples needs whole numbers"),
         (["--max-error", "1e-3", "--starts", "9"], "take 59 or more"),
     ],
 )
