@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import simulate
+from herglotz.data.simulate import uniform
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_aoti, export_onnx, load_onnx, load_pt2
 from herglotz.scenes import scene
@@ -123,12 +124,8 @@ SETUPS = {
 
 def starts_of(system: Any, count: int, seed: int) -> State:
     """States uniform in the scene's ranges, s = 0."""
-    generator = torch.Generator().manual_seed(seed)
-    spans = []
-    for low, high in (system.q_range, system.v_range):
-        low, high = (torch.as_tensor(x, dtype=torch.float64).expand(count, system.dof) for x in (low, high))
-        spans.append(low + (high - low) * torch.rand(count, system.dof, generator=generator, dtype=torch.float64))
-    q, v = spans
+    make = torch.Generator().manual_seed(seed)
+    q, v = (uniform(name, getattr(system, name), (count, system.dof), make) for name in ("q_range", "v_range"))
     return State(q, system.momentum(q, v, torch.zeros_like(q[..., 0])), torch.zeros(count, dtype=torch.float64))
 
 

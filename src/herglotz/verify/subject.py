@@ -11,6 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from herglotz.data.simulate import uniform
 from herglotz.errors import InputError
 from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
@@ -163,14 +164,8 @@ def _step_size(h: float | None, default: float) -> float:
 
 
 def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
-    """Draw states uniformly; a range is two numbers for all coordinates, or (low, high) of n numbers each."""
-    shape = (samples, scene.dof)
-
-    def draw_from(limits: Any) -> Tensor:
-        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
-        return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=make)
-
-    q, v = draw_from(scene.q_range), draw_from(scene.v_range)
+    """Draw states uniformly in the ranges of a scene."""
+    q, v = (uniform(name, getattr(scene, name), (samples, scene.dof), make) for name in ("q_range", "v_range"))
     s = torch.empty(samples, dtype=torch.float64).uniform_(-1.0, 1.0, generator=make)
     return State(q, scene.momentum(q, v, s), s)
 
