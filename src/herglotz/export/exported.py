@@ -57,6 +57,7 @@ class ExportedStepper(OneStepMethod):
         self.inputs: int = metadata.get("inputs", 0)
         self.dtype: torch.dtype = getattr(torch, metadata["dtype"])
         self.h: float = metadata["h"]
+        self._like = torch.empty((), dtype=self.dtype)  # for what comes as a number
         self.loop = scanned(self.programs["rollout"]) if loop is None else loop
         self._idle: Tensor | None = None  # the inputs that do not act, for programs that want some
         if loop is None and self.inputs:
@@ -227,7 +228,7 @@ class ExportedStepper(OneStepMethod):
                 raise InputError(f"{message}; use a .pt2 file, or {name}.detach()")
 
     def _checked_h(self, h: Tensor | float) -> Tensor:
-        h = check_h(h, torch.empty((), dtype=self.dtype))
+        h = check_h(h, self._like)
         check_range(h, self.metadata.get("h_range"))
         return h
 
