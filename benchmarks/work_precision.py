@@ -174,20 +174,25 @@ def draw(scenes: dict[str, list[dict]], path: Path) -> None:
             ax.set_visible(False)
         handles: dict[str, Any] = {}
         for ax, (name, points) in zip(axes, scenes.items(), strict=False):
-            for kind in order:
-                mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
-                thick = kind.startswith("learned")
-                for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
-                    x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
-                    width = 0 if faint < 1 else 2.2 if thick else 1.0
-                    (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
-            ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
-            ax.set(xlabel="µs per unit of time", ylabel="median error of q")
-            ax.set_ylim(top=10)
+            _panel(ax, name, points, styles, handles)
         shown = [n for n in order if n in handles]
         keys = [handles[n] for n in shown]
         figure.legend(keys, shown, loc="outside lower center", ncols=columns + 1, fontsize=8)
         harness.picture(figure, path)
+
+
+def _panel(ax: Any, name: str, points: list[dict], styles: dict[str, Any], handles: dict[str, Any]) -> None:
+    """One scene; `handles` receives a line a family."""
+    for kind in styles:
+        mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
+        thick = kind.startswith("learned")
+        for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
+            x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
+            width = 0 if faint < 1 else 2.2 if thick else 1.0
+            (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
+    ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
+    ax.set(xlabel="µs per unit of time", ylabel="median error of q")
+    ax.set_ylim(top=10)
 
 
 def spread_of(points: list[dict]) -> float:
