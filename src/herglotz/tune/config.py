@@ -59,7 +59,7 @@ class TuneConfig:
             raise InputError(f"artefacts must be some of {', '.join(ARTEFACTS)}, got {self.artefacts}")
         if not self.multiples:
             raise InputError("multiples is empty; give at least one, such as 1")
-        if any(m < 1 or m != int(m) for m in self.multiples):
+        if not all(m >= 1 and float(m).is_integer() for m in self.multiples):
             raise InputError(f"multiples must be whole numbers >= 1, got {self.multiples}")
         if any(w < 1 for w in self.widths):
             raise InputError(f"widths must be >= 1, got {self.widths}; give an empty tuple for no distillation")
