@@ -165,16 +165,14 @@ def export_c(
     return path
 
 
-def c_source(
-    model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True, derivatives: bool = True
-) -> str:
-    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two.
+def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, derivatives: bool = True) -> str:
+    """The text of the header.
 
     Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
     """
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
-    step = StepInC(equations, explicit and model.capabilities.explicit)
+    step = StepInC(equations, model.capabilities.explicit)
     emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
     types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]

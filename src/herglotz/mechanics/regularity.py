@@ -57,7 +57,6 @@ def regularity(
     q1: Tensor,  # (..., n)
     s0: Tensor,  # (...)
     h: Tensor | float,
-    tol: float | None = None,
 ) -> Regularity:
     """How far every condition is from failing at (q0, q1, s0).
 
@@ -71,8 +70,6 @@ def regularity(
         (...) action variable.
     h
         Time step, scalar or (...).
-    tol
-        A margin below this counts as lost; default 1000 machine epsilons.
 
     Returns
     -------
@@ -82,7 +79,7 @@ def regularity(
     Source: erratum E4; for H⁻ the same argument on the left Lagrangian of erratum E5.
     """
     eps = torch.finfo(q0.dtype).eps
-    tol = 1e3 * eps if tol is None else tol
+    tol = 1e3 * eps  # a margin below this counts as lost
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     with torch.no_grad():
         P = partials(L_d, q0, q1, s0, h, order=2)
