@@ -42,7 +42,7 @@ class Fan:
 
     start: State  # (F, n), (F, n), (F)
     S: dict[int, GeneratingFunction]  # by k
-    sigma: Tensor  # (F, K+1) as the stepper reports c
+    sigma: dict[int, Tensor]  # (F) by k, as the stepper reports c
     keep: dict[int, Tensor]  # (F) bool by k: away from a caustic
     failed: int = 0  # solutions dropped because a step failed or has no finite derivative
 
@@ -73,9 +73,9 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
     failed = int((~sound).sum())
     start = State(*(x[sound] for x in start))
     with torch.no_grad():
-        sigma = subject.rollout(start, steps).sigma
+        sigma = dict(enumerate(subject.rollout(start, steps).sigma.unbind(-1)))
     S = {k: generating_function(subject.flow(k), *start) for k in sorted({1, 2, steps - 1, steps})}
-    keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[:, k]) for k, g in S.items()}
+    keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
     return Fan(start, S, sigma, keep, failed)
 
 
@@ -88,8 +88,8 @@ def derivatives(f: Fan, bound: float, bound_of_c: float) -> list[Check]:
 
     note = f.left_out()
     D2 = largest(lambda _, g: (g.D2 - g.p).abs() / size)
-    D1 = largest(lambda k, g: (g.D1 + f.sigma[:, k, None] * f.start.p).abs() / size)
-    D3 = largest(lambda k, g: ((1 + g.D3) / f.sigma[:, k] - 1).abs())
+    D1 = largest(lambda k, g: (g.D1 + f.sigma[k][..., None] * f.start.p).abs() / size)
+    D3 = largest(lambda k, g: ((1 + g.D3) / f.sigma[k] - 1).abs())
     return [
         Check.at_most("D2S", "generating function: D2 S^k = p_k", D2, bound, note),
         Check.at_most("D1S", "generating function: D1 S^k = −σ_k p0", D1, bound, note),
