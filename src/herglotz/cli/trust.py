@@ -23,7 +23,7 @@ examples:
   herglotz trust runs/pendulum --level 0.95 --json
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
-COLUMNS = 80
+COLUMNS = 80  # of a terminal as it opens
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 

@@ -13,7 +13,7 @@ from herglotz.plots.style import MODEL, MUTED, SHADE, UNSEEN, captions, new_figu
 if TYPE_CHECKING:
     from herglotz.training import Bands, Run
 
-MOST_PANELS = 4
+MOST_PANELS = 4  # more are too small to read
 
 
 def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
