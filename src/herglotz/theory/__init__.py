@@ -77,6 +77,7 @@ from herglotz.theory.noether import (
 from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
 from herglotz.theory.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
 from herglotz.theory.splitting import ContactSplitting, linear_damping
+from herglotz.theory.symmetries import Symmetries, symmetries
 from herglotz.theory.tulczyjew import (
     TulczyjewTriple,
     left_leg,
@@ -110,6 +111,7 @@ __all__ = [
     "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
+    "Symmetries",
     "TheoremCheck",
     "TulczyjewTriple",
     "bivector",
@@ -188,6 +190,7 @@ __all__ = [
     "sharp",
     "sharp_bivector",
     "solve_right_position",
+    "symmetries",
     "transport_section",
     "tulczyjew_triple",
     "vee",
