@@ -76,6 +76,14 @@ MODELS = {
         3, (False,) * 3, order=4, potential_width=0, features=("r^-1", "sin(q1 - q3) v1 v3")
     ),
     "order four, alike": config(8, (False,) * 8, order=4, potential_width=0, alike=True, features=("sites 4",)),
+    "translations": config(
+        3,
+        (False, True, False),
+        level="affine",
+        correction_width=5,
+        features=("(q1 - q3)^4",),
+        translations=("q1 + q3", "q2"),
+    ),
     "softplus": config(1, activation="softplus", correction_width=6),
     "silu": config(2, activation="silu", level="affine", mass_width=4),
 }

@@ -16,9 +16,11 @@ J_k = σ_k J_0. With forces the same holds of L_d, and J changes by F⁻·ξ(q0)
 
 The condition is linear in (A, b, a, k, w, B). Its defects are summed along motions of K steps, J_k − σ_k J_0, so that
 what is no symmetry is broken by its whole rate of change and not by h times it; χ is chosen best for every ξ by
-projection; a singular value is then an RMS defect over the RMS of p·ξ − a s, a number without a unit: the **drift**. A
-generator is a symmetry where its drift is at most `precision`: rounding of an L_d that is known, the relative error of
-the free run of a learned one (J is then kept as precisely as the model keeps its positions).
+projection; a singular value is then an RMS defect over the RMS of what no boundary term explains of p·ξ − a s, a number
+without a unit that s ↦ s + b(q), b quadratic, does not change: the **drift**. A generator is a symmetry where its drift
+is at most `precision`: rounding of an L_d that is known, the relative error of the free run of a learned one (J is then
+kept as precisely as the model keeps its positions). Positions alone determine L_d up to a gauge (trap 3): a network
+that was fitted to them may hide a symmetry behind a boundary term that is not quadratic; named terms do not.
 
 Sources: E. Lishkova, P. Scherer, S. Ridderbusch, M. Jamnik, P. Liò, S. Ober-Blöbaum, C. Offen, Discrete Lagrangian
 neural networks with automatic symmetry discovery, IFAC-PapersOnLine 56 (2023) 3203; contact Noether theorem: section 1
@@ -43,7 +45,6 @@ from herglotz.theory.symmetry_words import formula, name_of
 PRECISION = 1e-9
 SEEN = 1e-7  # of the largest: a generator whose p·ξ − a s is smaller on all motions is not determined by them
 FLAT = 1e-12  # of its terms: a boundary term whose defect is smaller is trivial, as a constant where c = 1
-PIVOT = 0.05  # of a generator's largest entry, in units of p·ξ: its A is 0 where it is smaller
 NEAR = 0.05  # of its largest entry: entries so near to ½, 1, … are tried there
 
 
@@ -60,7 +61,7 @@ class Symmetries:
     k: Tensor  # (r) χ(q) = k + w·q + ½ q·B q
     w: Tensor  # (r, n)
     B: Tensor  # (r, n, n)
-    drift: Tensor  # (r) RMS of J_k − σ_k J_0 over RMS of p·ξ − a s
+    drift: Tensor  # (r) RMS of J_k − σ_k J_0 over that of p·ξ − a s without boundary terms
     spectrum: Tensor  # (m) drifts of all directions that were tried, the smallest first
     precision: float  # the drift up to which a generator is a symmetry
     unseen: int  # directions that the motions do not determine
@@ -171,7 +172,7 @@ class _Columns:
     """
 
     defect: Tensor  # (R, m) J_k − σ_k J_0
-    size: Tensor  # (R, m) p·ξ − a s
+    size: Tensor  # (R, m) p·ξ − a s without what boundary terms explain
     shift: Tensor  # (R, m') J_k − σ_k J_0 of the boundary terms
     terms: Tensor  # (m') RMS of the boundary terms
     centre: Tensor  # (n) q̄
@@ -194,7 +195,7 @@ class _Columns:
         return chi
 
     def drift(self, rows: Tensor) -> Tensor:
-        """RMS of what is left over RMS of p·ξ − a s, (r)."""
+        """RMS of what is left over RMS of the size, (r)."""
         left = rows @ self.defect.mT + self.chi(rows) @ self.shift.mT
         return _rms(left.mT) / _rms(self.size @ rows.mT)
 
@@ -227,51 +228,65 @@ def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: in
         rows.append(P.c[:, k, None] * rows[-1] + step[:, k])
     defect = torch.stack(rows, 1).flatten(0, 1)
     size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
-    m = size.shape[-1]
+    chi, m = chi1.flatten(0, 1), size.shape[-1]
+    U, S, _ = torch.linalg.svd(chi / _rms(chi).clamp_min(FLAT), full_matrices=False)
+    U = U[:, FLAT * S[0] < S]
+    size = size - U @ (U.mT @ size)  # what a boundary term explains is no size: a gauge adds it to p
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
-    return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi1.flatten(0, 1)), centre, middle, straight)
+    return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi), centre, middle, straight)
 
 
 def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmetries:
-    """The generators whose drift is at most the precision, in a reduced basis."""
-    scale = _rms(x.size)
-    scale = torch.where(scale > 0, scale, 1.0)
-    _, G, W = torch.linalg.svd(x.size / scale, full_matrices=False)
-    seen = SEEN * G.amax() < G
-    unit = W[seen] / G[seen, None] * len(x.size) ** 0.5 / scale  # generators whose p·ξ − a s has an RMS of 1
-    left = unit @ x.defect.mT + x.chi(unit) @ x.shift.mT
-    U, drift, _ = torch.linalg.svd(left, full_matrices=False)
-    drift, U = (drift / left.shape[1] ** 0.5).flip(0), U.flip(1)
-    found = int((drift <= precision).sum())
+    """The generators whose drift is at most the precision, in a reduced basis: translations, then the others."""
     n, wide = len(x.centre), len(x.centre) * len(x.straight)
-    basis = x.about(U[:, :found].mT @ unit, -x.centre)  # ξ = A q + b
-    if found:
-        basis = torch.stack([_snapped(x, row, precision) for row in _reduced(basis * scale, wide) / scale])
-    about = x.about(basis, x.centre)
-    chi, A = x.chi(about), basis.new_zeros(found, n, n)
-    A[:, :, x.straight] = basis[:, :wide].unflatten(-1, (n, -1))
-    k, w, B = _expanded(chi, x, basis[:, -1])
-    return Symmetries(
-        A, basis[:, wide:-1], basis[:, -1], k, w, B, x.drift(about), drift, precision, int((~seen).sum()), names
-    )
+    basis, drift, unseen = _small(x, list(range(wide + n + 1)), precision)
+    moved, _, _ = _small(x, list(range(wide, wide + n)), precision)
+    moved = _reduced(moved, range(wide, wide + n))
+    # what is left beside the translations: the directions of the basis that are furthest from them
+    Q, _ = torch.linalg.qr(x.size @ moved.mT)
+    beside = x.size @ basis.mT
+    _, _, V = torch.linalg.svd(beside - Q @ (Q.mT @ beside), full_matrices=False)
+    rest = x.about(V[: len(basis) - len(moved)] @ basis, -x.centre)  # ξ = A q + b
+    rest = _reduced(rest, [wide + n, *range(wide)])
+    for row in moved:
+        at = int(row.abs().argmax())
+        rest = rest - rest[:, at, None] * row / row[at]
+    rows = torch.stack([_snapped(x, row, precision) for row in (*moved, *rest)]) if len(basis) else basis
+    about = x.about(rows, x.centre)
+    chi, A = x.chi(about), rows.new_zeros(len(rows), n, n)
+    A[:, :, x.straight] = rows[:, :wide].unflatten(-1, (n, -1))
+    k, w, B = _expanded(chi, x, rows[:, -1])
+    return Symmetries(A, rows[:, wide:-1], rows[:, -1], k, w, B, x.drift(about), drift, precision, unseen, names)
 
 
-def _reduced(rows: Tensor, wide: int) -> Tensor:
-    """Reduced rows of the same span, pivots first in a and A, then in b: translations come out alone."""
-    rows, done, m = rows.clone(), [], rows.shape[1]
-    for columns, least in (([m - 1, *range(wide)], PIVOT), (list(range(wide, m - 1)), PIVOT), (list(range(m)), 0.0)):
-        while len(done) < len(rows):
-            free = [i for i in range(len(rows)) if i not in done]
-            part = (rows[free] / rows[free].abs().amax(1, keepdim=True))[:, columns].abs()
-            i, j = free[int(part.argmax()) // len(columns)], columns[int(part.argmax()) % len(columns)]
-            if float(part.max()) < least:
-                break
-            rows[i] = rows[i] / rows[i, j]
-            others = torch.arange(len(rows)) != i
-            rows[others] -= rows[others, j, None] * rows[i]
-            done.append(i)
-    return rows[list(reversed(done))]
+def _small(x: _Columns, columns: list[int], precision: float) -> tuple[Tensor, Tensor, int]:
+    """Generators of some columns whose drift is at most the precision (r, m), all drifts, and the unseen directions."""
+    size = x.size[:, columns]
+    scale = _rms(size)
+    scale = torch.where(scale > 0, scale, 1.0)
+    _, G, W = torch.linalg.svd(size / scale, full_matrices=False)
+    seen = SEEN * G.amax() < G
+    unit = size.new_zeros(int(seen.sum()), x.size.shape[1])  # generators of size 1
+    unit[:, columns] = W[seen] / G[seen, None] * len(size) ** 0.5 / scale
+    U, drift, _ = torch.linalg.svd(unit @ x.defect.mT + x.chi(unit) @ x.shift.mT, full_matrices=False)
+    drift, U = (drift / len(size) ** 0.5).flip(0), U.flip(1)
+    return U[:, : int((drift <= precision).sum())].mT @ unit, drift, int((~seen).sum())
+
+
+def _reduced(rows: Tensor, columns: Sequence[int]) -> Tensor:
+    """Reduced rows of the same span, their pivots in these columns."""
+    rows, done, columns = rows.clone(), [], list(columns)
+    for _ in rows:
+        part = rows[:, columns].abs()
+        part = part / part.amax(1, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
+        part[done] = 0.0
+        i, j = int(part.argmax()) // len(columns), columns[int(part.argmax()) % len(columns)]
+        rows[i] = rows[i] / rows[i, j]
+        others = torch.arange(len(rows)) != i
+        rows[others] -= rows[others, j, None] * rows[i]
+        done.append(i)
+    return rows[done]
 
 
 def _snapped(x: _Columns, row: Tensor, precision: float) -> Tensor:

@@ -104,6 +104,9 @@ class FitConfig:
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
     terms
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
+    translations
+        Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
+        learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
         Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
         (forced level). See `herglotz.models.drag`.
@@ -145,6 +148,7 @@ class FitConfig:
     diagonal: bool = False
     coupled: bool = False
     terms: tuple[str, ...] = ()
+    translations: tuple[str, ...] = ()
     drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
