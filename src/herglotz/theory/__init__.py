@@ -9,6 +9,7 @@ from herglotz.theory.continuous_equation import ContinuousEquation, FractionalSt
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
 from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
 from herglotz.theory.evolution import EvolutionStepper
+from herglotz.theory.explicit_time import TimeDependent, energies, time_defect
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
@@ -113,6 +114,7 @@ __all__ = [
     "RigidBodyStepper",
     "Symmetries",
     "TheoremCheck",
+    "TimeDependent",
     "TulczyjewTriple",
     "bivector",
     "boundary_value",
@@ -130,6 +132,7 @@ __all__ = [
     "discrete_section_residuals",
     "dissipation_defect",
     "divergence",
+    "energies",
     "energy_on_section",
     "evolution_vector_field",
     "exp_so3",
@@ -191,6 +194,7 @@ __all__ = [
     "sharp_bivector",
     "solve_right_position",
     "symmetries",
+    "time_defect",
     "transport_section",
     "tulczyjew_triple",
     "vee",
