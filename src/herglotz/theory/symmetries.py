@@ -229,12 +229,20 @@ def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: in
     defect = torch.stack(rows, 1).flatten(0, 1)
     size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
     chi, m = chi1.flatten(0, 1), size.shape[-1]
-    U, S, _ = torch.linalg.svd(chi / _rms(chi).clamp_min(FLAT), full_matrices=False)
-    U = U[:, FLAT * S[0] < S]
-    size = size - U @ (U.mT @ size)  # what a boundary term explains is no size: a gauge adds it to p
+    # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
+    sigma = P.c.cumprod(-1)
+    start = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
+    size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, start], -1), size[:, -1:])], -1)
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
     return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi), centre, middle, straight)
+
+
+def _beside(known: Tensor, columns: Tensor) -> Tensor:
+    """What columns have beside the span of others."""
+    U, S, _ = torch.linalg.svd(known / _rms(known).clamp_min(FLAT), full_matrices=False)
+    U = U[:, FLAT * S[0] < S]
+    return columns - U @ (U.mT @ columns)
 
 
 def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmetries:

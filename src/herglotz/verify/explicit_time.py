@@ -84,7 +84,8 @@ def _rollout(members: list[Subject], start: State) -> SampledRollout:
         states.append(State(*(x.detach() for x in step.state)))
         rows.append((step.c.detach(), step.status, D))
     c, status, D = (torch.stack(x, 1) for x in zip(*rows, strict=True))
-    return SampledRollout(*(torch.stack(x, 1) for x in zip(*states, strict=True)), c, status, D)
+    q, p, s = (torch.stack([getattr(x, name) for x in states], 1) for name in ("q", "p", "s"))
+    return SampledRollout(q, p, s, c, status, D)
 
 
 def _fan(members: list[Subject], start: State, w: SampledRollout) -> Fan:
