@@ -8,7 +8,8 @@ rounding at every step (`herglotz.theory.symmetries` finds what to ask for).
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -16,11 +17,6 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.models.feature_grammar import parse
 from herglotz.models.features import expand
-
-if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from herglotz.models.config import ModelConfig
 
 HOW = "name what moves together, as 'q1 + q2'"
 
@@ -49,7 +45,7 @@ def directions(texts: Sequence[str], angles: Sequence[bool]) -> list[tuple[float
     return found
 
 
-def check_translations(config: ModelConfig) -> None:
+def check_translations(config: Any) -> None:
     """Raise `InputError` where a term of the model would see a translation that the model is to have."""
     moved = directions(config.translations, config.angles)
     if not moved:
@@ -70,13 +66,13 @@ def check_translations(config: ModelConfig) -> None:
                 raise InputError(f"feature '{text}': changes under the translation; name one of differences")
 
 
-def unmoved(config: ModelConfig, values: tuple[float, ...]) -> tuple[float, ...]:
+def unmoved(config: Any, values: tuple[float, ...]) -> tuple[float, ...]:
     """Stiffness or tilt, zero where a coordinate is moved."""
     moved = directions(config.translations, config.angles)
     return tuple(0.0 if any(d[i] for d in moved) else x for i, x in enumerate(values))
 
 
-def blind(config: ModelConfig, velocities: int) -> Tensor | None:
+def blind(config: Any, velocities: int) -> Tensor | None:
     """What networks may see of their features (position, then so many velocities): a projection (m, m), or None."""
     moved = directions(config.translations, config.angles)
     if not moved:

@@ -5,7 +5,6 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import partials
-from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import noether_defect, symmetries
 from herglotz.theory.symmetry_words import formula, name_of
@@ -109,24 +108,6 @@ def test_J_is_dissipated_along_other_motions(name):
         J = lambda q, p, s, i=i: found.momentum(q, p, s)[..., i]  # noqa: E731
         size = float(J(q, p, s).abs().max()) + float((p * found.generator(q)[..., i, :]).abs().sum(-1).max())
         assert float(noether_defect(J, (q, p, s), step.state, step.c).abs().max()) < 1e-12 * size  # measured 2e-14
-
-
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        ("kepler", ("rotation in the plane (x, y)",)),
-        ("double_pendulum", ()),
-        ("chain", ()),
-        ("cart_pole", ("translation along x",)),
-    ],
-)
-def test_scenes(name, expected):
-    # fails if an angle is taken for a length, or gravity's double pendulum is given a symmetry
-    from herglotz.verify import symmetries as of_target
-
-    found = of_target(name, samples=24, steps=20)
-    assert found.names == expected
-    assert found.coordinates == scene(name).coordinates
 
 
 def test_a_small_break_is_no_symmetry_but_within_its_precision():
