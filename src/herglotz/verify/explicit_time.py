@@ -12,7 +12,7 @@ from herglotz.mechanics import flow_derivative, momentum_jacobian, momentum_plus
 from herglotz.mechanics.contact import Flow
 from herglotz.stepping import State, Status, Stepper, solve
 from herglotz.theory import TimeDependent, energies, generating_function, time_defect
-from herglotz.verify.action import Fan, derivatives, hamilton_jacobi, left_hamilton_jacobi
+from herglotz.verify.action import CAUSTIC, Fan, derivatives, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, contact, convergence, positive_factor, volume, worst
 from herglotz.verify.subject import Subject
@@ -95,7 +95,7 @@ def _fan(members: list[Subject], start: State, w: SampledRollout) -> Fan:
     count = len(members)
     S = {k: generating_function(_stepped(members, k), *start) for k in sorted({1, 2, count - 1, count})}
     sigma = dict(enumerate(w.c[whole].cumprod(-1).unbind(-1), 1))
-    keep = {k: (g.spread > 1e-2 * k * S[1].spread) & torch.isfinite(g.D2).all(-1) for k, g in S.items()}
+    keep = {k: (g.spread > CAUSTIC * k * S[1].spread) & torch.isfinite(g.D2).all(-1) for k, g in S.items()}
     return Fan(start, S, sigma, keep, int((~whole).sum()))
 
 

@@ -1,6 +1,7 @@
 """Translations that a model has by construction, at every weight of its networks."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 import torch
@@ -96,3 +97,16 @@ def test_translations_hold_in_c(tmp_path, monkeypatch):
     out = compile_c(made, h=0.1).rollout(*x, h=0.1, steps=20)
     torch.testing.assert_close(out.q, expected.q, rtol=1e-11, atol=1e-11)
     torch.testing.assert_close(out.p, expected.p, rtol=1e-11, atol=1e-11)
+
+
+def test_rotation_is_imposed_by_features_of_the_distance():
+    # fails if `alike` leaves a mass or a spring that tells one direction from another: what docs/theory.md says
+    zero = (0.0, 0.0)
+    settings = config(level="linear", features=("central",), alike=True, potential_width=0)
+    made = ContactLagrangian(replace(settings, stiffness=zero, tilt=zero))  # as a fit builds it
+    with torch.no_grad():
+        made.get_parameter("potential.features.sum.coefficient").copy_(torch.tensor([0.1, -0.2, -0.5, 0.1, 0.1, 0.1]))
+    q, p, s = states(2)
+    q = 1.5 * q / q.norm(dim=-1, keepdim=True)
+    found = symmetries(made.requires_grad_(False), (q, 0.3 * p, s), 0.1, steps=25)
+    assert found.names == ("rotation in the plane (q1, q2)",)
