@@ -64,7 +64,7 @@ def symmetries(
         angles, names = known.scene.angles, known.scene.coordinates
     if known.run is not None:
         angles, names = known.run.data.angles, known.run.data.names
-        length, exact = _unseen_steps(known.run), max(_precision(known.run), PRECISION)
+        length, exact = _unseen_steps(known.run), precision or max(_precision(known.run), PRECISION)
         states = _opened(states, torch.Generator().manual_seed(seed))
     return of_lagrangian(
         known.L_d,
