@@ -231,8 +231,8 @@ def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: in
     chi, m = chi1.flatten(0, 1), size.shape[-1]
     # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
     sigma = P.c.cumprod(-1)
-    start = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
-    size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, start], -1), size[:, -1:])], -1)
+    kept = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
+    size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
     return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi), centre, middle, straight)
