@@ -48,6 +48,7 @@ COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
+LIKELIER = 1.0  # log-likelihood that halved steps have to bring
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
@@ -310,7 +311,8 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
             other = self._refit(found, found.terms, 2 * found.config.substeps)
-            if other is None or not other.rms < found.rms:
+            count = self.data.q.numel()  # likelihoods of as many parameters compare as they are
+            if other is None or not count * math.log(found.rms / max(other.rms, self.floor)) > LIKELIER:
                 self.in_vain = found.config.substeps, found.rms
                 break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
