@@ -85,11 +85,6 @@ def _probe(path: Path, folder: Path) -> None:
         raise InputError(f"--out {path}: cannot be written ({error.strerror}); choose another place") from error
 
 
-def is_run(path: Path) -> bool:
-    """Return whether a path is a folder: a run is one, a data file is not."""
-    return path.is_dir()
-
-
 def print_json(values: dict[str, Any]) -> None:
     """Print one JSON object; NaN and infinities, which JSON lacks, become null."""
     print(json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False))

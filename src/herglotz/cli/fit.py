@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from herglotz.cli.common import print_json
-from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, parse_angles, progress
+from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.training import fit, load_run, save_run
 
     config = settings_of(arguments)
-    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
+    data = load(arguments.data, **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     made = _make(out)
     try:

@@ -20,15 +20,15 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
     add_data_settings(parser)
-    parser.add_argument(
-        "--angles", metavar="NAMES",
-        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
-    )  # fmt: skip
     add_column_flags(parser)
 
 
 def add_column_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --time, --coordinates, --inputs, --drop and --group: the roles of a csv file's columns."""
+    """Add --angles, and --time, --coordinates, --inputs, --drop and --group: the roles of a csv file's columns."""
+    parser.add_argument(
+        "--angles", type=names, metavar="NAMES",
+        help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
+    )  # fmt: skip
     columns = parser.add_argument_group("columns of a csv file (default: by their names, printed as a table)")
     columns.add_argument("--time", metavar="NAME", help="column of the time")
     columns.add_argument("--coordinates", type=names, metavar="NAMES", help="exactly these, with commas")
@@ -39,7 +39,7 @@ def add_column_flags(parser: argparse.ArgumentParser) -> None:
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what the flags say of the columns, for `load`."""
-    given = {name: getattr(arguments, name) for name in ("time", "coordinates", "inputs", "drop", "group")}
+    given = {name: getattr(arguments, name) for name in ("angles", "time", "coordinates", "inputs", "drop", "group")}
     return {name: value for name, value in given.items() if value is not None}
 
 
@@ -74,11 +74,6 @@ def check_run_folder(out: Path, resume: bool) -> None:
     check_output_folder(out)
     if (out / "model.pt").exists() and not resume:
         raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
-
-
-def parse_angles(text: str | None) -> list[str] | None:
-    """Return [] for `none`, [a, b] for `a,b`, and None, which keeps the angles of the file, without a flag."""
-    return None if text is None else names(text)
 
 
 def names(text: str) -> list[str]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder, is_run
+from herglotz.cli.common import check_output_folder
 from herglotz.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
@@ -40,15 +40,15 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Draw and say where."""
     source: Path = arguments.source
-    folder = arguments.out or (source if is_run(source) else Path())
+    folder = arguments.out or (source if source.is_dir() else Path())
     check_output_folder(folder)
-    if arguments.animate and (arguments.theory or not is_run(source)):
+    if arguments.animate and (arguments.theory or not source.is_dir()):
         raise InputError(f"--animate draws a run; {source} is none: fit it first, and leave out --theory")
     if arguments.theory:
         from herglotz.plots import save_theory_figures
 
         written = save_theory_figures(str(source), folder, form=arguments.format)
-    elif is_run(source):
+    elif source.is_dir():
         from herglotz.training import load_run
 
         result = load_run(source)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, positive, print_json, print_table
-from herglotz.cli.flags import add_column_flags, add_force_flag, columns_of, parse_angles
+from herglotz.cli.flags import add_column_flags, add_force_flag, columns_of
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -49,7 +49,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--horizon", type=positive, metavar="T", help="time of the free run in a window, in the data's unit of time"
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="write the predicted motion: .csv or .npz, and a .png")
-    parser.add_argument("--angles", metavar="NAMES", help="coordinates that are angles (default: those in rad or deg)")
     add_column_flags(parser)
     add_force_flag(parser)
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
@@ -66,7 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.training import load_run
 
     result = load_run(arguments.source)
-    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
+    data = load(arguments.data, **columns_of(arguments))
     if data.time_unit != result.data.time_unit:
         raise InputError(
             f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"

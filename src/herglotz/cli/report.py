@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import check_output_folder
-from herglotz.cli.flags import add_column_flags, columns_of, parse_angles
+from herglotz.cli.flags import add_column_flags, columns_of
 
 DESCRIPTION = """\
 Write report.html, one self-contained page, and report.md, its words and tables: the verdict first, then the learned
@@ -25,7 +25,6 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
     parser.add_argument("--against", type=Path, metavar="DATA", help="another recording to score the model on")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for both files (default: RUN)")
-    parser.add_argument("--angles", metavar="NAMES", help="coordinates of DATA that are angles (default: rad or deg)")
     add_column_flags(parser)
     parser.set_defaults(run=run)
 
@@ -41,7 +40,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     result, against = load_run(arguments.source), None
     if arguments.against is not None:
-        against = load(arguments.against, angles=parse_angles(arguments.angles), **columns_of(arguments))
+        against = load(arguments.against, **columns_of(arguments))
     for path in write_report(result, folder, against, name=str(arguments.source)):
         print(path)
     return 0

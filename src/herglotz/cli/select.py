@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 
 from herglotz.cli.common import count, print_json
-from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, parse_angles, progress
+from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, add_machine_flags, settings_of
 
 DESCRIPTION = """\
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
 
-    data = load(arguments.data, angles=parse_angles(arguments.angles), **columns_of(arguments))
+    data = load(arguments.data, **columns_of(arguments))
     config = settings_of(arguments)
     levels = None
     if arguments.levels is not None:

@@ -44,30 +44,6 @@ def time_split(
     return (torch.cat(train), cuts), (torch.cat(test), rest)
 
 
-def trajectory_split(
-    count: int,  # B
-    fraction: float,  # of the trajectories that train
-    generator: torch.Generator,
-    source: str = "",
-) -> tuple[list[int], list[int]]:
-    """Draw `round(fraction * count)` trajectories to train; the others test, both in their old order.
-
-    Raises
-    ------
-    InputError
-        If the fraction is not inside (0, 1) or leaves a part without a trajectory.
-    """
-    check_fraction(fraction)
-    train = round(fraction * count)
-    if not 0 < train < count:
-        raise InputError(
-            f"{source or 'trajectories'}: fraction {fraction:g} of {count} trajectories leaves {train} to train and "
-            f"{count - train} to test; change the fraction, or split in time"
-        )
-    order = torch.randperm(count, generator=generator).tolist()
-    return sorted(order[:train]), sorted(order[train:])
-
-
 class Concatenation(Protocol):
     """Trajectories stored one after the other."""
 

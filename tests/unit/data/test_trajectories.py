@@ -189,24 +189,6 @@ def test_split_time():  # fails if the cut is not per trajectory, or a sample is
             long.split_time(bad)
 
 
-def test_split_trajectories():  # fails if parts overlap, the seed is ignored, or the global generator is drawn from
-    t = torch.arange(30.0).double()
-    data = Trajectories.of(t, t, (3,) * 10)
-    torch.manual_seed(0)
-    state = torch.get_rng_state()
-    train, test = data.split_trajectories(0.7, torch.Generator().manual_seed(3))
-    assert torch.equal(state, torch.get_rng_state())
-    assert (len(train), len(test)) == (7, 3)
-    assert sorted(train.q[:, 0].tolist() + test.q[:, 0].tolist()) == list(range(30))
-    again, _ = data.split_trajectories(0.7, torch.Generator().manual_seed(3))
-    other, _ = data.split_trajectories(0.7, torch.Generator().manual_seed(4))
-    assert train.digest() == again.digest() != other.digest()
-    with pytest.raises(InputError, match=r"fraction 0.01 of 10 trajectories leaves 0 to train and 10 to test"):
-        data.split_trajectories(0.01, torch.Generator())
-    with pytest.raises(InputError, match=r"leaves 10 to train and 0 to test"):
-        data.split_trajectories(0.99, torch.Generator())
-
-
 def test_select():  # fails if order or repetition is lost, or a wrong index wraps round
     data = ragged()
     assert data.select([2, 0, 2]).lengths == (6, 4, 6)
