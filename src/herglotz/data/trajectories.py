@@ -137,6 +137,19 @@ class Trajectories:
         """Trajectory of every sample, (N,) long."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
 
+    @cached_property
+    def balance(self) -> Tensor:
+        """(n,) size of the motion of each kind of coordinate over the largest: 1 where all have one unit.
+
+        Errors over it can be added up and compared: metres and radians cannot. Coordinates of one unit are measured
+        alike, and keep their differences.
+        """
+        kinds = list(zip(self.units, self.angles, strict=True))
+        moved = (self.q - self.q[0]).std(0, correction=0)
+        size = torch.stack([moved[[other == kind for other in kinds]].square().mean().sqrt() for kind in kinds])
+        size = size / size.max()
+        return torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
+
     def steps(self) -> Steps:
         """Return all N - B steps, with their trajectory and the row they start from."""
         return steps(self.t, self.trajectory)

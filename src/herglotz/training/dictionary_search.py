@@ -29,6 +29,7 @@ from herglotz.training.named_terms import (
     NamedTerms,
     candidates,
     chains,
+    own_terms,
     places,
     settings_of,
     started,
@@ -48,7 +49,6 @@ COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-LOWER = 0.99  # share of the misfit that is left where halved steps are kept
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
@@ -104,7 +104,7 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
-        self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
+        self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
@@ -122,7 +122,8 @@ class DictionarySearch:
             if name is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
-            if more is None or not more.rms < found.rms or (found.coloured and not self._beaten(found, more)):
+            white = more is not None and not (found.coloured and more.coloured)  # what the criterion takes for granted
+            if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
         return self._last_terms(self._pruned(found))
@@ -132,10 +133,10 @@ class DictionarySearch:
         local = local_polynomials(self.data)
         if local is None:
             return None
+        start = smoothed(self.data, local)
         linear = best_start(self.data, self.base, (self.all, *chains(self.data)), local)
-        if linear is None:
-            return None
-        found = self._grown(linear.terms, linear.values, 1, smoothed(self.data, local))
+        found = None if linear is None else self._grown(linear.terms, linear.values, 1, start)
+        found = found or self._grown(*self._bare(), 1, start)
         return None if found is None else self._finer(self._held(self._simpler(found)))
 
     def _from_part(self, part: Trajectories) -> Found | None:
@@ -152,6 +153,13 @@ class DictionarySearch:
             first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=begin)
             fit = None if first is None else stages.grow(first, sigma)
         return None if fit is None else self._found(found.terms, stages, fit)
+
+    def _bare(self) -> tuple[NamedTerms, dict]:
+        """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
+        base, own = self.base, own_terms(self.data.angles[0]) if self.data.dof == 1 else {}
+        values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
+        features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
+        return NamedTerms(tuple(own)), {**values, **features}
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
@@ -212,7 +220,7 @@ class DictionarySearch:
     def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None) -> Found | None:
         """The fit with other terms or steps, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps)
-        states = found.fit.problem.states_at(found.fit.path, problem.grid.start_sample)
+        states = found.fit.path.x[:, 0, : problem.d]
         fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
@@ -224,7 +232,7 @@ class DictionarySearch:
         _, problem = self._problem(found, self.all, found.config.substeps)
         theta = problem.parameters.get()
         at = places(problem.parameters, self.all)
-        x = problem.pack(theta, found.fit.problem.states_at(found.fit.path, problem.grid.start_sample))
+        x = problem.pack(theta, found.fit.path.x[:, 0, : problem.d])
         cost, A, b = problem.normal_equations(x)
         if not math.isfinite(float(cost)):
             return None
@@ -302,7 +310,7 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
             other = self._refit(found, found.terms, 2 * found.config.substeps)
-            if other is None or not other.rms < LOWER * found.rms:
+            if other is None or not other.rms < found.rms:
                 self.in_vain = found.config.substeps, found.rms
                 break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
@@ -321,8 +329,7 @@ class DictionarySearch:
         """RMS change of the fitted motion by so many model steps in a recorded one."""
         _, problem = self._problem(found, found.terms, substeps)
         fit = found.fit
-        states = fit.problem.states_at(fit.path, problem.grid.start_sample)
-        path = problem.solve(problem.pack(fit.theta, states))
+        path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
         if path is None:
             return math.inf
         order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
