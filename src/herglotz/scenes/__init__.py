@@ -8,6 +8,7 @@ from herglotz.scenes.driven_duffing import driven_duffing
 from herglotz.scenes.driven_pendulum import driven_pendulum
 from herglotz.scenes.duffing import duffing
 from herglotz.scenes.exact import NumericallyExact, Reason, exact_discrete_lagrangian
+from herglotz.scenes.forced_oscillator import ExactForcedOscillator
 from herglotz.scenes.galerkin import GalerkinLobatto, lobatto4, lobatto6
 from herglotz.scenes.kepler import kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag, linear_drag
@@ -43,6 +44,7 @@ from herglotz.scenes.van_der_pol import van_der_pol
 __all__ = [
     "ORDERS",
     "DrivenRule",
+    "ExactForcedOscillator",
     "ExactLinearDrag",
     "ExactOscillator",
     "ExactParachute",

@@ -9,6 +9,7 @@ from herglotz.theory.continuous_equation import ContinuousEquation, FractionalSt
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
 from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
 from herglotz.theory.evolution import EvolutionStepper
+from herglotz.theory.explicit_time import TimeDependent, energies, time_defect
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
@@ -77,6 +78,7 @@ from herglotz.theory.noether import (
 from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
 from herglotz.theory.rotations import cayley, hat
 from herglotz.theory.splitting import ContactSplitting, linear_damping
+from herglotz.theory.symmetries import Symmetries, symmetries
 from herglotz.theory.tulczyjew import (
     TulczyjewTriple,
     left_leg,
@@ -110,7 +112,9 @@ __all__ = [
     "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
+    "Symmetries",
     "TheoremCheck",
+    "TimeDependent",
     "TulczyjewTriple",
     "bivector",
     "boundary_value",
@@ -128,6 +132,7 @@ __all__ = [
     "discrete_section_residuals",
     "dissipation_defect",
     "divergence",
+    "energies",
     "energy_on_section",
     "evolution_vector_field",
     "fiber_derivative",
@@ -184,6 +189,8 @@ __all__ = [
     "sharp",
     "sharp_bivector",
     "solve_right_position",
+    "symmetries",
+    "time_defect",
     "transport_section",
     "tulczyjew_triple",
 ]

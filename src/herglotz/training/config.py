@@ -108,6 +108,12 @@ class FitConfig:
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
     terms
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
+    frequencies
+        Angular frequencies ν, in rad per unit of time, of a periodic force whose amplitude and phase are learned:
+        cos νt and sin νt become the inputs (`herglotz.data.waves`). For data without inputs.
+    translations
+        Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
+        learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
         Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
         (forced level). See `herglotz.models.drag`.
@@ -149,6 +155,8 @@ class FitConfig:
     diagonal: bool = False
     coupled: bool = False
     terms: tuple[str, ...] = ()
+    translations: tuple[str, ...] = ()
+    frequencies: tuple[float, ...] = ()
     drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1

@@ -177,7 +177,7 @@ def _fine(base: Baseline) -> bool:
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
     """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
     c = task.config
-    more = c.features or c.known or c.terms or c.alike or c.mass_width
+    more = c.features or c.known or c.terms or c.alike or c.mass_width or c.translations
     if c.objective not in ("auto", "residual") or more or c.supervision != "q" or task.data.u is not None:
         return None
     model = task.build("correction")
