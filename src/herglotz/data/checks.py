@@ -7,6 +7,7 @@ from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -170,3 +171,20 @@ def check_positive(name: str, value: float) -> None:
     """Raise unless `value` is finite and greater than 0."""
     if not (math.isfinite(value) and value > 0):
         raise InputError(f"{name} must be finite and > 0, got {value}")
+
+
+def check_alike(sets: Sequence[Any]) -> None:
+    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined."""
+    if not sets:
+        raise InputError("cat needs at least one set of trajectories, got none")
+    for other in sets[1:]:
+        for what in ("names", "units", "angles", "time_unit", "hold"):
+            one, two = getattr(sets[0], what), getattr(other, what)
+            if one != two:
+                raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")
+    for name in ARRAYS:
+        arrays = [x for one in sets if (x := getattr(one, name)) is not None]
+        if len(arrays) not in (0, len(sets)):
+            raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
+        if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
+            raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")

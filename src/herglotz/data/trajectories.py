@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
+from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
 from herglotz.data.holds import HOLDS, held
 from herglotz.data.splits import liveliest_rows, time_split, trajectory_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
@@ -248,7 +248,7 @@ class Trajectories:
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
         """Join sets of the same coordinates, units and optional arrays."""
         sets = list(sets)
-        _check_alike(sets)
+        check_alike(sets)
         present = [name for name in ARRAYS if getattr(sets[0], name) is not None]
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
         lengths = tuple(length for one in sets for length in one.lengths)
@@ -342,20 +342,3 @@ def _tensor(name: str, x: Tensor | np.ndarray | Sequence) -> Tensor:
 
 def _column(x: Tensor) -> Tensor:
     return x[:, None] if x.ndim == 1 else x
-
-
-def _check_alike(sets: Sequence[Trajectories]) -> None:
-    """Raise unless the sets have the same coordinates, units and arrays, so that they can be joined."""
-    if not sets:
-        raise InputError("cat needs at least one set of trajectories, got none")
-    for other in sets[1:]:
-        for what in ("names", "units", "angles", "time_unit", "hold"):
-            one, two = getattr(sets[0], what), getattr(other, what)
-            if one != two:
-                raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")
-    for name in ARRAYS:
-        arrays = [x for one in sets if (x := getattr(one, name)) is not None]
-        if len(arrays) not in (0, len(sets)):
-            raise InputError(f"{len(arrays)} of the {len(sets)} sets to join have {name}; drop it or add it to all")
-        if len({(x.dtype, x.device, x.shape[1:]) for x in arrays}) > 1:
-            raise InputError(f"the sets to join differ in the dtype, device or width of {name}; make them the same")
