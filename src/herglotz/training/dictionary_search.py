@@ -23,11 +23,12 @@ from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.linear_terms import LinearTerms
+from herglotz.training.linear_terms import best_start
 from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
+    chains,
     own_terms,
     places,
     settings_of,
@@ -108,7 +109,8 @@ class DictionarySearch:
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
-        self.order = 4 if self.precision < SMOOTH * self.spread else 2
+        plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
+        self.order = 4 if plain and self.precision < SMOOTH * self.spread else 2
 
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
@@ -132,8 +134,9 @@ class DictionarySearch:
         local = local_polynomials(self.data)
         if local is None:
             return None
-        start, linear = smoothed(self.data, local), LinearTerms(self.data, self.base, self.all).start(local)
-        found = None if linear is None else self._grown(*linear, 1, start)
+        start = smoothed(self.data, local)
+        linear = best_start(self.data, self.base, (self.all, *chains(self.data)), local)
+        found = None if linear is None else self._grown(linear.terms, linear.values, 1, start)
         found = found or self._grown(*self._bare(), 1, start)
         return None if found is None else self._finer(self._held(self._simpler(found)))
 
@@ -258,16 +261,13 @@ class DictionarySearch:
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""
         count = self.data.q.numel()
-        for worth in (
-            4**self.order * count,
-            count,
-        ):  # as much as halved steps may bring, then twice the misfit
+        for worth in (4**self.order * count, count):  # as much as halved steps may bring, then twice the misfit
             terms = self._needed(found, worth)
             less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
-            limit = (1 + worth / count) ** 0.5 * max(found.rms, self.floor)  # far from a minimum it may cost more
-            if less is None or less.rms > limit:
-                continue
-            if self._too_long(less) or self._as_good(less, found):
+            if less is None or less.rms > (1 + worth / count) ** 0.5 * max(found.rms, self.floor):
+                continue  # far from the minimum it costs more
+            less = self._finer(less)
+            if self._as_good(less, found):
                 return less
         return found
 

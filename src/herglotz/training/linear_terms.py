@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,12 +13,34 @@ from herglotz.data import Trajectories
 from herglotz.data.smoothing import LocalPolynomials, smooth_triples
 from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
+from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_start import LinearFit, NamedForces
 from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, own_terms
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
 ENOUGH = 5  # residuals for each coefficient: fewer leave its smallest singular value to noise
+
+
+class LinearStart(NamedTuple):
+    """What a linear problem gives a fit to start from."""
+
+    terms: NamedTerms
+    values: dict  # by the name of a term or of a parameter
+    error: float  # J⁻¹R, RMS over the triples, in units of q
+
+
+def best_start(
+    data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials
+) -> LinearStart | None:
+    """The start with fewest terms whose error the best one does not undercut by more than a twentieth.
+
+    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing.
+    """
+    tried = [start for terms in families if (start := LinearTerms(data, base, terms).start(local)) is not None]
+    least = min((start.error for start in tried), default=math.inf)
+    fair = [start for start in tried if start.error <= MARGIN * least]
+    return min(fair, key=lambda start: len(start.terms.names), default=None)
 
 
 class LinearTerms:
@@ -34,8 +58,8 @@ class LinearTerms:
         self.data, self.base, self.all = data, base, every
         self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
 
-    def start(self, local: LocalPolynomials) -> tuple[NamedTerms, dict] | None:
-        """Terms and values of the linear problem, pruned."""
+    def start(self, local: LocalPolynomials) -> LinearStart | None:
+        """Terms and values of the linear problem, pruned, and its error; None where no mass fits."""
         t, u = smooth_triples(self.data, local)
         rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
         if len(t) > ROWS:
@@ -68,14 +92,18 @@ class LinearTerms:
                 left[at[own]] = False
         alone = torch.zeros_like(x)
         alone[at], alone[columns.nonzero()[0]] = less, 1.0
-        start = fit.start(fit.solve(left)) or fit.start(alone)
+        x = fit.solve(left)
+        start = fit.start(x)
+        if start is None:
+            x = alone
+            start = fit.start(x)
         if start is None:
             return None
         values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
         for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
             values |= zip(names, values.pop(parameter, ()), strict=True)
         values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
-        return terms, values
+        return LinearStart(terms, values, float(fit.errors(x).square().mean().sqrt()))
 
     @property
     def _still(self) -> list[str]:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.models.features import lengths, revolute
+from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.parameter_vector import ParameterVector
@@ -56,6 +56,33 @@ def candidates(data: Trajectories) -> NamedTerms:
     for i, angle in enumerate(angles, 1):
         drag += [f"|v{i}| v{i}", f"load {i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
     return NamedTerms(tuple(features), tuple(drag), True)
+
+
+def chains(data: Trajectories) -> list[NamedTerms]:
+    """Fewer terms for joints: those of a planar chain of links, by the angles between neighbours and by absolute ones.
+
+    Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
+    with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone.
+    """
+    if data.dof < 2 or not all(data.angles):
+        return []
+    every = [(name, parse(name, data.angles)[0]) for name in revolute(data.angles)]
+    between = [name for name, f in every if _of_neighbours(f)]
+    absolute = [name for name, f in every if {i: w for i, w in enumerate(f.form) if w} == _difference(f)]
+    return [NamedTerms(tuple(names), (), True) for names in (between, absolute)]
+
+
+def _of_neighbours(f: Product) -> bool:
+    """Whether a chain has this term by the angles between neighbours: a sum of neighbouring angles."""
+    on = [i for i, w in enumerate(f.form) if w]
+    row = all(f.form[i] == 1 for i in on) and on == list(range(on[0], on[-1] + 1))
+    return row and (on[0] == min(f.velocities) + 1 if f.velocities else on[0] == 0)
+
+
+def _difference(f: Product) -> dict[int, float]:
+    """q_i − q_j of the two speeds of a term."""
+    i, j = sorted(f.velocities) if len(set(f.velocities)) == 2 else (0, 0)
+    return {} if i == j else {i: 1.0, j: -1.0}
 
 
 def own_terms(angle: bool) -> dict[str, tuple[str, float]]:

@@ -124,6 +124,7 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
+        self.patient = True  # paths are stepped through where no other gives them
         self.hurried = False  # stages before the last end where they gain less than 1 %
 
     def fit(
@@ -149,6 +150,7 @@ class SegmentStages:
             start = problem.parameters.get()
             states = first_states(problem, start, begin)
             problem.guess_from_states(states_of_pairs(self.model, begin or task.data))
+            problem.patient = self.patient
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
@@ -202,7 +204,9 @@ class SegmentStages:
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
     ) -> TrajectoryFit | None:
         """Whole trajectories without shorter segments before; None where that misses far more than σ."""
+        self.patient = False
         found = self.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        self.patient = True
         return None if found is None or found.noise > LOST * sigma else found
 
     def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
