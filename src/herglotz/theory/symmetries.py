@@ -208,10 +208,10 @@ class _Columns:
         return moved
 
 
-def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: int, straight: list[int]) -> _Columns:
+def _columns(L_d: DiscreteLagrangian, states: State, h: Tensor | float, steps: int, straight: list[int]) -> _Columns:
     """Step the motions, and add up the defects of every basis generator along them."""
     with torch.no_grad():
-        out = Stepper(L_d).rollout(*start, h=h, steps=steps)
+        out = Stepper(L_d).rollout(*states, h=h, steps=steps)
         whole = (out.status == Status.CONVERGED).all(-1)
         if not bool(whole.any()):
             raise InputError(f"no motion could be stepped {steps} times; give other states, a shorter h or fewer steps")
@@ -230,8 +230,8 @@ def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: in
     size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
     chi, m = chi1.flatten(0, 1), size.shape[-1]
     # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
-    sigma = P.c.cumprod(-1)
-    kept = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
+    start = torch.cat([s0[:, :1, None], chi0[:, :1]], -1)
+    kept = (P.c.cumprod(-1)[..., None] * start).flatten(0, 1)
     size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
