@@ -42,7 +42,7 @@ def landau_gauge(q, v):
     return 1.7 * q[..., 0] * v[..., 1]
 
 
-def states(n, count=24, seed=0, at=0.0):
+def states(n, count=24, seed=0, at: float | torch.Tensor = 0.0):
     make = torch.Generator().manual_seed(seed)
     q, p = (torch.randn(count, n, generator=make, dtype=F64) for _ in range(2))
     return State(at + q, p, torch.rand(count, generator=make, dtype=F64) - 0.5)
@@ -161,10 +161,16 @@ def test_an_angle_is_only_translated():
 def test_far_from_the_origin():
     # fails if columns are not taken about the middle of the motions: q² is 1e10 there
     far = torch.tensor([1e5, -2e5], dtype=F64)
-    found = symmetries(
-        lagrangian(lambda q: ((q - far) ** 2).sum(-1) ** 2, 0.1), states(2, at=far), H, steps=25, precision=1e-7
-    )
+    found = symmetries(lagrangian(lambda q: ((q - far) ** 2).sum(-1) ** 2, 0.1), states(2, at=far), H, steps=25)
     assert found.names == (PLANE + " about (1e+05, -2e+05)",)
+
+
+def test_single_precision():
+    # fails if rounding of float32 is judged as that of float64
+    L_d, n, expected = CASES["free chain with damping"]
+    found = symmetries(L_d, State(*(x.float() for x in states(n))), H, steps=25)
+    assert set(found.names) == expected
+    assert found.precision == 1e-4
 
 
 def test_directions_that_the_motions_do_not_show_are_counted():
