@@ -181,8 +181,8 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--hold", choices=HOLDS,
-        help="what the inputs do between samples: nothing, straight lines, or cubics (default: what the file says, or "
-        "what explains the data best)",
+        help="what the inputs do between samples: nothing, straight lines or polynomials (default: what the file says, "
+        "or what explains the data best)",
     )  # fmt: skip
 
 

@@ -12,7 +12,7 @@ from herglotz.scenes.forced_oscillator import ExactForcedOscillator
 from herglotz.scenes.galerkin import GalerkinLobatto, lobatto4, lobatto6
 from herglotz.scenes.kepler import kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag, linear_drag
-from herglotz.scenes.motion import Motion, hamiltonian_motion, herglotz_motion, lagrangian_motion
+from herglotz.scenes.motion import Motion, herglotz_motion, lagrangian_motion
 from herglotz.scenes.nonlinear_action import nonlinear_action
 from herglotz.scenes.oscillator import ExactOscillator, damped_oscillator
 from herglotz.scenes.parachute import ExactParachute, parachute
@@ -67,7 +67,6 @@ __all__ = [
     "driven_scene",
     "duffing",
     "exact_discrete_lagrangian",
-    "hamiltonian_motion",
     "herglotz_motion",
     "kepler",
     "lagrangian_motion",

@@ -58,7 +58,7 @@ from herglotz.theory.jacobi import (
     sharp,
     sharp_bivector,
 )
-from herglotz.theory.left import LeftLagrangian, left_momenta
+from herglotz.theory.left import LeftLagrangian
 from herglotz.theory.legendre_dual import fiber_derivative, fiber_inverse, legendre_dual
 from herglotz.theory.legendrian import (
     LegendrianDefect,
@@ -76,7 +76,7 @@ from herglotz.theory.noether import (
     noether_defect,
 )
 from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
-from herglotz.theory.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
+from herglotz.theory.rotations import cayley, hat
 from herglotz.theory.splitting import ContactSplitting, linear_damping
 from herglotz.theory.symmetries import Symmetries, symmetries
 from herglotz.theory.tulczyjew import (
@@ -135,7 +135,6 @@ __all__ = [
     "energies",
     "energy_on_section",
     "evolution_vector_field",
-    "exp_so3",
     "fiber_derivative",
     "fiber_inverse",
     "flat",
@@ -150,7 +149,6 @@ __all__ = [
     "infinitesimal_generator",
     "initial_value",
     "invariance_defect",
-    "inverse_cayley",
     "inverse_step",
     "jacobi_bracket",
     "joined_action",
@@ -161,14 +159,12 @@ __all__ = [
     "left_hamiltonian_on_flow",
     "left_leg",
     "left_leg_states",
-    "left_momenta",
     "left_step",
     "legendre_dual",
     "legendrian_defect",
     "legendrian_relation",
     "lie_derivative_of_contact_form",
     "linear_damping",
-    "log_so3",
     "mean_value_gradient",
     "midpoint_gradient",
     "momentum_map",
@@ -197,5 +193,4 @@ __all__ = [
     "time_defect",
     "transport_section",
     "tulczyjew_triple",
-    "vee",
 ]

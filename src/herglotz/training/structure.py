@@ -208,9 +208,9 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
         t = data.thinned(every).triples(every * base.max_step).spread_out(most)
         if len(t) * n < ENOUGH * (len(names) + n * n):
             break
-        fit = LinearFit.of(data.angles, names, t)
+        fit = LinearFit.of(data.angles, names, t, data.balance)
         (x,) = of_first(fit.solve(_columns(fit, data.angles)))
-        moved = t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)
+        moved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / data.balance
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
             best = score, every, fit, x
