@@ -1,6 +1,7 @@
 """Symmetries of scenes and runs: their states, names and precision."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.scenes import scene
+from herglotz.stepping import State
 from herglotz.verify import symmetries as of_target
 
 
@@ -72,6 +74,16 @@ def test_what_cannot_be_searched_is_refused(run):
     assert of_target(bare, precision=1e-2).names[0] == "translation of x and y together"
     with pytest.raises(InputError, match="has no L_d to look into"):
         of_target((_Map(), (torch.ones(3, 2), torch.ones(3, 2), torch.ones(3))), h=0.1)
+
+
+def test_motions_start_beside_the_recorded_ones():
+    # fails if p is not spread, so that J is one number on one undamped motion, or spread far beyond what was recorded
+    q, make = torch.zeros(4000, 2).double(), torch.Generator().manual_seed(0)
+    p = torch.tensor([2.0, 0.1]).double() * torch.randn(4000, 2, generator=make, dtype=torch.float64)
+    opened = import_module("herglotz.verify.symmetries")._opened(State(q, p, q[:, 0]), make)
+    ratio = (opened.p - p).std(0) / p.std(0)
+    assert bool(((ratio > 0.27) & (ratio < 0.33)).all())
+    assert bool((opened.q == q).all())
 
 
 class _Map:
