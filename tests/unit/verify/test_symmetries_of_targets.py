@@ -30,6 +30,13 @@ def test_scenes(name, expected):
     assert found.coordinates == scene(name).coordinates
 
 
+def test_angles_of_a_scene_are_angles():
+    # fails if the units of a scene are forgotten: an angle is not scaled
+    free = scene("linear_drag")
+    assert len(of_target(free, samples=24, steps=20)) == 2
+    assert of_target(replace(free, units=("rad",)), samples=24, steps=20).names == ("translation along q",)
+
+
 @pytest.fixture(scope="module")
 def run():
     """Two bodies and a spring between them, free in space, with a little noise; named terms."""
