@@ -33,7 +33,9 @@ def test_scenes(name, expected):
 def test_angles_of_a_scene_are_angles():
     # fails if the units of a scene are forgotten: an angle is not scaled
     free = scene("linear_drag")
-    assert len(of_target(free, samples=24, steps=20)) == 2
+    found, brief = (of_target(free, samples=24, steps=k) for k in (20, 2))
+    assert len(found) == 2
+    assert float(brief.spectrum[-1]) < 0.5 * float(found.spectrum[-1])  # fails if `steps` is not handed on
     assert of_target(replace(free, units=("rad",)), samples=24, steps=20).names == ("translation along q",)
 
 
