@@ -65,6 +65,9 @@ def test_a_learned_translation_is_found_within_the_error_of_the_free_run(run):
     ).names  # a quadratic L_d is scaled; weak springs to the origin are learned, too
     assert [name for name in exact if not name.startswith("scaling")] == []
     assert len(run.symmetries(steps=5, precision=1e9)) == len(found.spectrum)
+    unseen = run.data.lengths[0] - run.train_lengths[0]
+    assert unseen < 30
+    assert run.symmetries(steps=unseen).spectrum.tolist() == found.spectrum.tolist()
 
 
 def test_what_is_imposed_is_kept_to_rounding(run):
