@@ -200,7 +200,7 @@ MUTANTS = [
     ("verify/symmetries.py", 'return SURE * error / spread', 'return SURE * error'),
     ("verify/symmetries.py", 'if known.L_d is None:', 'if False:'),
     ("verify/symmetries.py", 'angles, names = known.scene.angles, known.scene.coordinates', 'names = known.scene.coordinates'),
-    ("verify/symmetries.py", 'exact if precision is None else precision', 'exact'),
+    ("verify/symmetries.py", 'precision or _precision(known.run)', '_precision(known.run)'),
     ("verify/symmetries.py", 'length if steps is None else steps', 'length'),
     ("verify/symmetries.py", '("extrapolation_rms", "train_rms")', '("train_rms", "extrapolation_rms")'),
     ("verify/symmetries.py", 'if error is None or not spread:', 'if False:'),

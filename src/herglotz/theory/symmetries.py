@@ -40,9 +40,9 @@ from herglotz.mechanics.partials import DiscreteLagrangian, partials
 from herglotz.stepping import State, Status, Stepper
 from herglotz.theory.symmetry_words import formula, name_of
 
-# Of drift. Symmetries of an L_d that is known leave 1e-16 to 1e-13; breaking one by 1e-7 of the force leaves more
-# (`tests/unit/theory/test_symmetries.py`).
-PRECISION = 1e-9
+# Of drift, for an L_d that is known: its symmetries leave 1e-16 to 1e-13 (float32: 1e-6), and one that is broken by
+# 1e-7 of the force leaves more (`tests/unit/theory/test_symmetries.py`).
+PRECISION = {torch.float64: 1e-9, torch.float32: 1e-4}
 SEEN = 1e-7  # of the largest: a generator whose p·ξ − a s is smaller on all motions is not determined by them
 FLAT = 1e-12  # of its terms: a boundary term whose defect is smaller is trivial, as a constant where c = 1
 NEAR = 0.05  # of its largest entry: entries so near to ½, 1, … are tried there
@@ -120,7 +120,7 @@ def symmetries(
     h: Tensor | float,
     *,
     steps: int = 40,
-    precision: float = PRECISION,
+    precision: float | None = None,
     angles: Sequence[bool] = (),
     coordinates: Sequence[str] = (),
 ) -> Symmetries:
@@ -137,7 +137,7 @@ def symmetries(
     steps
         K, the steps of each motion; the motions should last long enough for what is no symmetry to change.
     precision
-        Largest drift of a symmetry.
+        Largest drift of a symmetry; by default 1e-9, in float32 1e-4.
     angles
         Which coordinates are angles: ξ and χ do not depend on those, which keeps them single-valued.
     coordinates
@@ -161,7 +161,8 @@ def symmetries(
         if len(given) not in (0, n):
             raise InputError(f"{what} needs one entry a coordinate ({n}), got {len(given)}")
     straight = [i for i in range(n) if not (angles and angles[i])]
-    return _null_space(_columns(L_d, State(q, p, s), h, steps, straight), precision, names)
+    most = PRECISION.get(q.dtype, 1e-4) if precision is None else precision
+    return _null_space(_columns(L_d, State(q, p, s), h, steps, straight), most, names)
 
 
 @dataclass(frozen=True)
@@ -208,15 +209,16 @@ class _Columns:
         return moved
 
 
-def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: int, straight: list[int]) -> _Columns:
+def _columns(L_d: DiscreteLagrangian, states: State, h: Tensor | float, steps: int, straight: list[int]) -> _Columns:
     """Step the motions, and add up the defects of every basis generator along them."""
     with torch.no_grad():
-        out = Stepper(L_d).rollout(*start, h=h, steps=steps)
+        out = Stepper(L_d).rollout(*states, h=h, steps=steps)
         whole = (out.status == Status.CONVERGED).all(-1)
         if not bool(whole.any()):
             raise InputError(f"no motion could be stepped {steps} times; give other states, a shorter h or fewer steps")
         q, s = out.q[whole], out.s[whole]
-        P = partials(L_d, q[:, :-1], q[:, 1:], s[:, :-1], h)
+        P = partials(L_d, q[:, :-1], q[:, 1:], s[:, :-1], h).map(lambda x: x.double())
+        q, s = q.double(), s.double()
     centre, middle = q.mean((0, 1)), s.mean()
     (q0, q1), (s0, s1) = ((x[:, :-1], x[:, 1:]) for x in (q - centre, s - middle))
     chi0, chi1 = _boundary(q0[..., straight]), _boundary(q1[..., straight])
@@ -230,8 +232,8 @@ def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: in
     size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
     chi, m = chi1.flatten(0, 1), size.shape[-1]
     # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
-    sigma = P.c.cumprod(-1)
-    kept = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
+    start = torch.cat([s0[:, :1, None], chi0[:, :1]], -1)
+    kept = (P.c.cumprod(-1)[..., None] * start).flatten(0, 1)
     size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
     if len(size) < 2 * defect.shape[-1]:
         raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")

@@ -10,7 +10,6 @@ from herglotz.errors import InputError
 from herglotz.stepping import State
 from herglotz.theory import Symmetries
 from herglotz.theory import symmetries as of_lagrangian
-from herglotz.theory.symmetries import PRECISION
 from herglotz.threads import one_thread
 from herglotz.training import Run
 from herglotz.verify.subject import subject
@@ -59,19 +58,19 @@ def symmetries(
         raise InputError(f"{known.name}: has no L_d to look into; give the run that it was exported from")
     angles: tuple[bool, ...] = ()
     names: tuple[str, ...] = ()
-    length, exact = STEPS, PRECISION
+    length = STEPS
     if known.scene is not None:
         angles, names = known.scene.angles, known.scene.coordinates
     if known.run is not None:
         angles, names = known.run.data.angles, known.run.data.names
-        length, exact = _unseen_steps(known.run), precision or max(_precision(known.run), PRECISION)
+        length, precision = _unseen_steps(known.run), precision or _precision(known.run)
         states = _opened(states, torch.Generator().manual_seed(seed))
     return of_lagrangian(
         known.L_d,
         states,
         torch.tensor(known.h, dtype=states.q.dtype),
         steps=length if steps is None else steps,
-        precision=exact if precision is None else precision,
+        precision=precision,
         angles=angles,
         coordinates=names,
     )

@@ -42,7 +42,7 @@ def landau_gauge(q, v):
     return 1.7 * q[..., 0] * v[..., 1]
 
 
-def states(n, count=24, seed=0, at=0.0):
+def states(n, count=24, seed=0, at: float | torch.Tensor = 0.0):
     make = torch.Generator().manual_seed(seed)
     q, p = (torch.randn(count, n, generator=make, dtype=F64) for _ in range(2))
     return State(at + q, p, torch.rand(count, generator=make, dtype=F64) - 0.5)
@@ -121,6 +121,33 @@ def test_a_small_break_is_no_symmetry_but_within_its_precision():
     assert abs(float(finer.drift[0]) / float(found.drift[0]) - 1) < 0.3
 
 
+def test_the_drift_is_that_of_J_along_the_motions():
+    # fails if a step is left out of the sums, or they do not shrink by c: J_k − σ_k J_0 from p, q, s of a rollout
+    broken = lagrangian(lambda q: springs(q) + 0.1 * q[..., 0] ** 2, 0.8)
+    found = symmetries(broken, states(2), H, steps=25, precision=10.0, angles=(True, True))
+    out = Stepper(broken).rollout(*states(2), h=H, steps=25)
+    J = found.momentum(out.q, out.p, out.s)
+    left = (J - out.sigma[..., None] * J[:, :1])[:, 1:]
+    size = (out.p @ found.b.mT)[:, 1:]
+    expected = left.square().mean((0, 1)).sqrt() / (size - size.mean((0, 1))).square().mean((0, 1)).sqrt()
+    moved = found.a == 0
+    assert int(moved.sum()) == 2
+    torch.testing.assert_close(found.drift[moved], expected[moved], rtol=1e-6, atol=0)
+
+
+def test_a_gauge_does_not_change_the_drift():
+    # fails if the size is that of p, which a boundary term shifts: L_d + w·(q1 − q0) moves alike
+    broken = lagrangian(lambda q: springs(q) + 1e-3 * q[..., 0] ** 2)
+    w = torch.tensor([50.0, -20.0], dtype=F64)
+    gauged = lambda q0, q1, s0, h: broken(q0, q1, s0, h) + (q1 - q0) @ w  # noqa: E731
+    q, p, s = states(2)
+    one, other = (
+        symmetries(L_d, x, H, steps=25, precision=0.05) for L_d, x in ((broken, (q, p, s)), (gauged, (q, p + w, s)))
+    )
+    assert one.names == other.names == ("translation of q1 and q2 together",)
+    torch.testing.assert_close(one.drift, other.drift, rtol=1e-6, atol=0)
+
+
 def test_an_angle_is_only_translated():
     # fails if ξ or χ depends on an angle: the free rotor would be scaled, and a torque would be a boundary term
     rotor = lagrangian(nothing, 0.2)
@@ -132,9 +159,18 @@ def test_an_angle_is_only_translated():
 
 
 def test_far_from_the_origin():
-    # fails if columns are not taken about the middle of the motions
-    found = symmetries(lagrangian(springs, 0.3), states(3, at=1e4), H, steps=25, precision=1e-8)
-    assert found.names == ("translation of q1, q2 and q3 together",)
+    # fails if columns are not taken about the middle of the motions: q² is 1e10 there
+    far = torch.tensor([1e5, -2e5], dtype=F64)
+    found = symmetries(lagrangian(lambda q: ((q - far) ** 2).sum(-1) ** 2, 0.1), states(2, at=far), H, steps=25)
+    assert found.names == (PLANE + " about (1e+05, -2e+05)",)
+
+
+def test_single_precision():
+    # fails if rounding of float32 is judged as that of float64
+    L_d, n, expected = CASES["free chain with damping"]
+    found = symmetries(L_d, State(*(x.float() for x in states(n))), H, steps=25)
+    assert set(found.names) == expected
+    assert found.precision == 1e-4
 
 
 def test_directions_that_the_motions_do_not_show_are_counted():

@@ -1,6 +1,7 @@
 """Symmetries of scenes and runs: their states, names and precision."""
 
 from dataclasses import replace
+from importlib import import_module
 
 import pytest
 import torch
@@ -9,6 +10,7 @@ import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.scenes import scene
+from herglotz.stepping import State
 from herglotz.verify import symmetries as of_target
 
 
@@ -26,6 +28,15 @@ def test_scenes(name, expected):
     found = of_target(name, samples=24, steps=20)
     assert found.names == expected
     assert found.coordinates == scene(name).coordinates
+
+
+def test_angles_of_a_scene_are_angles():
+    # fails if the units of a scene are forgotten: an angle is not scaled
+    free = scene("linear_drag")
+    found, brief = (of_target(free, samples=24, steps=k) for k in (20, 2))
+    assert len(found) == 2
+    assert abs(float(brief.spectrum[-1] / found.spectrum[-1]) - 1) > 0.01  # fails if `steps` is not handed on
+    assert of_target(replace(free, units=("rad",)), samples=24, steps=20).names == ("translation along q",)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +65,9 @@ def test_a_learned_translation_is_found_within_the_error_of_the_free_run(run):
     ).names  # a quadratic L_d is scaled; weak springs to the origin are learned, too
     assert [name for name in exact if not name.startswith("scaling")] == []
     assert len(run.symmetries(steps=5, precision=1e9)) == len(found.spectrum)
+    unseen = run.data.lengths[0] - run.train_lengths[0]
+    assert unseen < 30
+    assert run.symmetries(steps=unseen).spectrum.tolist() == found.spectrum.tolist()
 
 
 def test_what_is_imposed_is_kept_to_rounding(run):
@@ -72,6 +86,16 @@ def test_what_cannot_be_searched_is_refused(run):
     assert of_target(bare, precision=1e-2).names[0] == "translation of x and y together"
     with pytest.raises(InputError, match="has no L_d to look into"):
         of_target((_Map(), (torch.ones(3, 2), torch.ones(3, 2), torch.ones(3))), h=0.1)
+
+
+def test_motions_start_beside_the_recorded_ones():
+    # fails if p is not spread, so that J is one number on one undamped motion, or spread far beyond what was recorded
+    q, make = torch.zeros(4000, 2).double(), torch.Generator().manual_seed(0)
+    p = torch.tensor([2.0, 0.1]).double() * torch.randn(4000, 2, generator=make, dtype=torch.float64)
+    opened = import_module("herglotz.verify.symmetries")._opened(State(q, p, q[:, 0]), make)
+    ratio = (opened.p - p).std(0) / p.std(0)
+    assert bool(((ratio > 0.27) & (ratio < 0.33)).all())
+    assert bool((opened.q == q).all())
 
 
 class _Map:
