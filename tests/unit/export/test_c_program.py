@@ -85,7 +85,8 @@ INIT = """
 #include "stepper.h"
 int main(void) {
   const double nan = strtod("nan", 0), inf = strtod("inf", 0);
-  const double q0[1] = {0.1}, q1[1] = {0.12}, bad[1] = {nan}, u[2] = {0.3, -0.2}, first[2] = {nan, 0.0}, last[2] = {0.0, inf};
+  const double q0[1] = {0.1}, q1[1] = {0.12}, bad[1] = {nan};
+  const double u[2] = {0.3, -0.2}, first[2] = {nan, 0.0}, last[2] = {0.0, inf};
   arm_state x = {{7.0}, {7.0}, 7.0, 7.0};
   printf("%d %d ", arm_init(bad, q1, 0.0, 0.1, u, &x), arm_init(q0, bad, 0.0, 0.1, u, &x));
   printf("%d %d ", arm_init(q0, q1, inf, 0.1, u, &x), arm_init(q0, q1, 0.0, 0.0, u, &x));
