@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from argparse import Namespace
 from types import SimpleNamespace
 
 import pytest
@@ -46,7 +47,7 @@ def test_a_step_that_fails_in_one_of_both_is_no_agreement(differing, tiny_run, m
     monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: result)
     said = {"level": run.model.config.level, "dof": run.model.config.dof, "model": run.model.config.to_dict()}
     file = SimpleNamespace(dtype=torch.float64, metadata={"dtype": "float64", **said})
-    agreement = _agreement(file, SimpleNamespace(against=tiny_run, h=None, seed=0))
+    agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
     assert agreement["passed"] is (differing == 0)
     assert ("DOES NOT AGREE" in _table(agreement, tiny_run)) is (differing == 1)
 
