@@ -67,6 +67,7 @@ class Case:
     h: float
 
 
+# With the step of each: thirteen to thirty-one samples a period, where there is one.
 CASES = {
     "undamped pendulum": Case("conservative", scene("damped_pendulum", gamma=0.0), 0.2),
     "undamped masses": Case("conservative", CoupledMasses((0.0, 0.0)), 0.3),

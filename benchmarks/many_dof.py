@@ -77,9 +77,10 @@ def told(**settings: Any) -> FitConfig:
     return FitConfig(**{"train_fraction": 1.0, "objective": "residual", **settings})
 
 
+# What a user knows of two links, of a planet and of a chain; order 4 needs no network.
 LINKS: dict[str, Any] = {"features": ("pendulums",), "order": 4}
-CENTRAL = told(level="linear", features=("central",), alike=True, order=4)
-SPRINGS = told(level="linear", features=("chain",), alike=True, order=4)
+CENTRAL = told(level="linear", features=("central",), alike=True, order=4)  # distances alone
+SPRINGS = told(level="linear", features=("chain",), alike=True, order=4)  # stretches alone
 PLAIN = told(objective="auto")
 JOINTS = told(level="forced", coupled=True, **LINKS)
 ROWS = [

@@ -39,6 +39,7 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
     ("coverage_real", "laplace_measured"): COVERED,
     ("coverage_real", "ensemble_measured"): COVERED,
 }
+# A set: its files, and what measures it.
 ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] = {
     "noise": ((), sets.noise),
     "one_trajectory": ((), partial(sets.noise, trajectories=1)),

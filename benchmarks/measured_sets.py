@@ -45,10 +45,10 @@ DFKI = tuple(
 J, MGL, VISCOUS, COULOMB, OFFSET = 6.259e-2, 1.022e-1 * 9.81, 4.707e-2, 1.839e-1, -7.586e-2
 
 
-LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95, 0.99)
+LEVELS = (0.5, 0.68, 0.8, 0.9, 0.95, 0.99)  # nominal shares, from half to nearly all
 NOMINAL = 0.9  # the level that is a figure of the table
 TRAINED, STEPS, HELD_OUT, SEEN, AHEAD = 12, 60, 20, 20, 100
-MEMBERS = 3
+MEMBERS = 3  # fits of an ensemble: the fewest with a spread that is not one difference
 
 
 def rollout_rms(model: ContactLagrangian, steps: int, seed: int, reach: float | None = None) -> float:

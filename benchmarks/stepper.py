@@ -35,7 +35,7 @@ from herglotz.export.c_wrapper import FLAGS
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 
-H = 0.1
+H = 0.1  # 63 steps in a period of the models, whose stiffness is 1
 Row = dict[str, Any]
 
 

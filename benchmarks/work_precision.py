@@ -3,8 +3,8 @@
 Eight scenes. In C: learned steppers (their own step, larger steps re-trained, several widths and depths, float64,
 float32, bfloat16 weights, loose Newton; large steps of a few learned kicks), RK4, DOP853 (adaptive and with equal
 steps), implicit midpoint and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same
-data. In PyTorch: discrete Lagrangians of order 1 to 6, compositions, tolerance, iterations and guess of Newton, and the
-learned model eager, as ONNX and by AOTInductor. Needs scipy.
+data. In PyTorch: discrete Lagrangians of order 1 to 6, compositions, and the learned model eager, as ONNX and by
+AOTInductor. Needs scipy.
 
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
 Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn; rules in
@@ -116,29 +116,6 @@ def terms(scenes: dict[str, list[dict]]) -> list[str]:
     return ["", "## Terms", "", *harness.table(head, rows)]
 
 
-def headline(points: list[dict], error: str = "median") -> list[dict]:
-    """At the error of each learned setting on the learned front: what the others cost over what it costs.
-
-    The front is that of the choosing starts, where there are any; the errors are those of the judging ones. `error` is
-    "median" or "q95". A rival is the cheapest of its settings, of all sizes and in both precisions, whose error is no
-    larger.
-    """
-    rows = []
-    learned = [{f"choice_{error}": p[error], **p} for p in points if p["kind"].startswith("learned")]
-    for p in front(learned, f"choice_{error}"):
-        if p[error] is None:
-            continue
-        row: dict[str, Any] = {k: p[k] for k in ("setting", "us_per_time", "spread")}
-        row |= {"kind": p["kind"], "error": p[error]}
-        for name, belongs in RIVALS:
-            good = [q for q in points if belongs(q) and q[error] is not None and q[error] <= p[error]]
-            best = min(good, key=lambda q: q["us_per_time"], default=None)
-            row[name] = None if best is None else best["us_per_time"] / p["us_per_time"]
-            row[f"{name}: setting"] = None if best is None else best["setting"]
-        rows.append(row)
-    return rows
-
-
 def add_leapfrog_unit(result: dict[str, Any]) -> None:
     """The unit of cost: a step of C leapfrog on the damped pendulum (or, without it, another scene) of the same run."""
     for name in ("damped_pendulum", *result["scenes"]):
@@ -167,15 +144,6 @@ def markdown(result: dict[str, Any]) -> str:
         lines += ["", f"## {name}", "", *harness.table(head, rows)]
         if rows := knob_rows(points):
             lines += ["", *harness.table(("knob", "setting", "µs per time", "median"), rows)]
-        for error in ("median", "q95"):
-            rows = []
-            for r in result["headline"].get(name, {}).get(error, []):
-                ratios = ["not reached" if r[n] is None else f"{r[n]:.3g}" for n, _ in RIVALS]
-                rows.append([r["setting"], f"{r['error']:.2g}", f"{r['us_per_time']:.3g}", *ratios])
-            if rows:
-                head = ("learned", "error", "µs per time", *(n for n, _ in RIVALS))
-                lines += ["", f"Cost of the others over that of a learned stepper, at its {error} error:", ""]
-                lines += harness.table(head, rows)
     return "\n".join([*lines, *terms(result["scenes"])])
 
 
@@ -184,9 +152,8 @@ ON_FRONT = ("learned", "learned, distilled", "learned kicks")  # shown there; al
 
 def knob_rows(points: list[dict]) -> list[list[str]]:
     """Settings that are off the front and stand for a knob."""
-    solver = [p for p in points if p["kind"].startswith(("Newton", "guess order"))]
     learned = [p for p in points if p["kind"].startswith("learned") and p["kind"] not in ON_FRONT]
-    return [[p["kind"], p["setting"], f"{p['us_per_time']:.3g}", _error(p)] for p in solver + learned]
+    return [[p["kind"], p["setting"], f"{p['us_per_time']:.3g}", _error(p)] for p in learned]
 
 
 def _error(p: dict) -> str:
@@ -207,20 +174,25 @@ def draw(scenes: dict[str, list[dict]], path: Path) -> None:
             ax.set_visible(False)
         handles: dict[str, Any] = {}
         for ax, (name, points) in zip(axes, scenes.items(), strict=False):
-            for kind in order:
-                mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
-                thick = kind.startswith("learned")
-                for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
-                    x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
-                    width = 0 if faint < 1 else 2.2 if thick else 1.0
-                    (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
-            ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
-            ax.set(xlabel="µs per unit of time", ylabel="median error of q")
-            ax.set_ylim(top=10)
+            _panel(ax, name, points, styles, handles)
         shown = [n for n in order if n in handles]
         keys = [handles[n] for n in shown]
         figure.legend(keys, shown, loc="outside lower center", ncols=columns + 1, fontsize=8)
         harness.picture(figure, path)
+
+
+def _panel(ax: Any, name: str, points: list[dict], styles: dict[str, Any], handles: dict[str, Any]) -> None:
+    """One scene; `handles` receives a line a family."""
+    for kind in styles:
+        mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
+        thick = kind.startswith("learned")
+        for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
+            x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
+            width = 0 if faint < 1 else 2.2 if thick else 1.0
+            (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
+    ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
+    ax.set(xlabel="µs per unit of time", ylabel="median error of q")
+    ax.set_ylim(top=10)
 
 
 def spread_of(points: list[dict]) -> float:
@@ -328,7 +300,6 @@ def measure_scene(name: str, result: dict[str, Any], quick: bool, only: str | No
         say("timing")
         found += costs(timed, 3 if quick else 9)
         notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
-        result["headline"][name] = {error: headline(found, error) for error in ("median", "q95")}
     result["scenes"][name] = found
     notes |= {"T": setup.T, "h": setup.h, "spread": spread_of(found), "total_seconds": time.process_time() - began}
     result["notes"][name] = notes
@@ -347,9 +318,9 @@ def main(argv: list[str] | None = None) -> None:
     if arguments.headline:
         measure_headline(path, names, arguments.seeds, arguments.quick)
         return
-    result = {**harness.conditions(), "quick": arguments.quick, "scenes": {}, "headline": {}, "notes": {}}
+    result = {**harness.conditions(), "quick": arguments.quick, "scenes": {}, "notes": {}}
     if arguments.resume:
-        result |= {k: harness.load(path, result)[k] for k in ("scenes", "headline", "notes")}
+        result |= {k: harness.load(path, result)[k] for k in ("scenes", "notes")}
     with tqdm([n for n in names if n not in result["scenes"]], disable=None) as bar:
         for name in bar:
             say = lambda what, name=name: bar.set_postfix_str(f"{name}: {what}")  # noqa: E731

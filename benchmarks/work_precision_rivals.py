@@ -34,7 +34,8 @@ from herglotz.tune.cost import Timed as Timing
 TIMED, PER = 16, 4e-3  # motions and seconds of one timing, at least: far above the resolution of the clock
 SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1, "damped_oscillator": 2, "parachute": 3, "kepler": 4, "chain": 5,
            "driven_pendulum": 6, "rigid_body": 7}  # fmt: skip
-NETWORK = 9
+NETWORK = 9  # of SYSTEM in work_precision.c
+# Numbers of work_precision.c.
 METHODS = {"RK4": 0, "DOP853": 1, "implicit midpoint": 2, "leapfrog": 3, "DOP853 fixed": 4}
 SEPARABLE = ("damped_pendulum", "damped_oscillator", "kepler", "chain", "driven_pendulum")
 REAL = {"float64": "double", "float32": "float"}

@@ -1,8 +1,8 @@
 """The ways to step that `work_precision.py` compares, without the rivals: scenes, fits, and how each way is timed.
 
 A way is a `Timed`: a point of the plot with its errors, and what `herglotz.tune.cost` times. Learned steppers
-come in every form, at the step of the data and at larger ones, with terms more and less; rules, compositions and the
-knobs of Newton on the true Lagrangian are timed in PyTorch.
+come in every form, at the step of the data and at larger ones, with terms more and less; rules and compositions on the
+true Lagrangian are timed in PyTorch.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ import torch
 from torch import Tensor
 
 from herglotz.data import simulate
+from herglotz.data.simulate import uniform
 from herglotz.errors import InputError
 from herglotz.export import compile_c, export_aoti, export_onnx, load_onnx, load_pt2
 from herglotz.scenes import scene
-from herglotz.stepping import State, Status, Stepper, kahan_li, suzuki, yoshida
-from herglotz.stepping.guess import EQUAL
+from herglotz.stepping import State, Stepper, kahan_li, suzuki, yoshida
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import Timed as Timing
 from herglotz.tune.cost import measure_costs, timed_stepping
@@ -124,12 +124,8 @@ SETUPS = {
 
 def starts_of(system: Any, count: int, seed: int) -> State:
     """States uniform in the scene's ranges, s = 0."""
-    generator = torch.Generator().manual_seed(seed)
-    spans = []
-    for low, high in (system.q_range, system.v_range):
-        low, high = (torch.as_tensor(x, dtype=torch.float64).expand(count, system.dof) for x in (low, high))
-        spans.append(low + (high - low) * torch.rand(count, system.dof, generator=generator, dtype=torch.float64))
-    q, v = spans
+    make = torch.Generator().manual_seed(seed)
+    q, v = (uniform(name, getattr(system, name), (count, system.dof), make) for name in ("q_range", "v_range"))
     return State(q, system.momentum(q, v, torch.zeros_like(q[..., 0])), torch.zeros(count, dtype=torch.float64))
 
 
@@ -248,12 +244,12 @@ def motions_of(case: Case) -> State:
         first.append(x + JITTER * size * (2 * torch.rand(x.shape, generator=make, dtype=torch.float64) - 1))
     anywhere = draw_starts(run, 40, case.seed + 5)
     starts = State(*(torch.cat([a.reshape(len(a), -1), b]) for a, b in zip(anywhere, first, strict=True)))
-    return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T, "own").states
+    return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T).states
 
 
 ORDERS = {"left": 1, "right": 1, "midpoint": 2, "midpoint_heun": 2, "trapezoid_heun": 2, "strang": 2, "lobatto4": 4,
           "lobatto6": 6, "strang_exponential": 2}  # fmt: skip
-COMPOSED = ((yoshida, 4), (suzuki, 4), (kahan_li, 6))
+COMPOSED = ((yoshida, 4), (suzuki, 4), (kahan_li, 6))  # with their orders
 
 
 class Counted:
@@ -276,7 +272,7 @@ class Counted:
 
 
 def analytic(setup: Setup, quick: bool) -> list[dict]:
-    """Every rule and composition of a scene at several steps, and what tolerance, iterations and guess change."""
+    """Every rule and composition of a scene at several steps."""
     system = setup.scene
     start = starts_of(system, RULE_MOTIONS, 1)
     truth = exact_motion(setup, start)
@@ -300,57 +296,20 @@ def analytic(setup: Setup, quick: bool) -> list[dict]:
             found.append({"kind": kind, "setting": f"{label}, h {setup.h / parts:.4g}", "order": order, **one})
             if seconds > PATIENCE:
                 break
-    return found + _solver(setup, rules["midpoint_heun"], start, truth)
+    return found
 
 
-def _measured(
-    setup: Setup, L_d: Any, make: Any, parts: int, start: State, truth: Tensor, roll: Any = None
-) -> tuple[dict, float]:
+def _measured(setup: Setup, L_d: Any, make: Any, parts: int, start: State, truth: Tensor) -> tuple[dict, float]:
     counted = Counted(L_d)
     steps, u = round(setup.T / setup.h) * parts, setup.inputs()
     options = {} if u is None else {"inputs": u.repeat_interleave(parts, 0)}
     with torch.no_grad():
         began = time.process_time()
-        if roll is None:
-            q = make(counted).rollout(*start, h=setup.h / parts, steps=steps, **options).q[:, 1:]
-        else:
-            q = roll(counted, start, setup.h / parts, steps, options.get("inputs"))
+        q = make(counted).rollout(*start, h=setup.h / parts, steps=steps, **options).q[:, 1:]
         seconds = time.process_time() - began
     cost = {"us_per_time": 1e6 * seconds / setup.T, "spread": 0.0, "evaluations_per_time": counted.count / setup.T}
     form = {"artefact": "eager", "dtype": "float64", "batch": RULE_MOTIONS, "h": setup.h / parts}
     return {**errors_of(q[:, steps // CHECKS - 1 :: steps // CHECKS], truth), **cost, **form}, seconds
-
-
-def _solver(setup: Setup, L_d: Any, start: State, truth: Tensor) -> list[dict]:
-    """Newton's tolerance, its iterations and the order of its guess, of the explicit midpoint rule."""
-    found = []
-    for tol in (1e-3, 1e-5, 1e-8):
-        one, _ = _measured(setup, L_d, lambda L, t=tol: Stepper(L, tol=t), 1, start, truth)
-        found.append({"kind": "Newton tolerance", "setting": f"midpoint_heun, tol {tol:g}, h {setup.h:.4g}", **one})
-    for order in (0, 1, 3, 5):
-        for most in (1, 2, 30) if order else (30,):
-            one, _ = _measured(setup, L_d, None, 1, start, truth, partial(_guessed, order=order, most=most))
-            kind = "guess order" if most == 30 else "Newton iterations"
-            label = f"midpoint_heun, guess of order {order}, ≤ {most} iterations"
-            found.append({"kind": kind, "setting": label, **one})
-    return found
-
-
-def _guessed(L_d: Any, state: State, h: float, steps: int, u: Any, order: int, most: int) -> Tensor:
-    """Steps from the polynomial of this order through the last positions; NaN once the iterations did not suffice."""
-    stepper, trail, out = Stepper(L_d, max_iterations=most), [state.q], []
-    for k in range(steps):
-        weights = EQUAL[min(order + 1, len(trail))]
-        guess = torch.stack([w * q for w, q in zip(weights, trail[-len(weights) :], strict=True)]).sum(0)
-        # A first step has no past to guess from: it may take as many iterations as it needs.
-        now = Stepper(stepper.L_d) if k < order and most < 30 else stepper
-        step = now.step(state, h, guess, None if u is None else u[k])
-        state = step.state
-        if bool((step.status != Status.CONVERGED).all()):
-            return torch.full((len(state.q), steps, state.q.shape[-1]), torch.nan, dtype=torch.float64)
-        trail = [*trail[-order:], state.q] if order else [state.q]
-        out.append(state.q)
-    return torch.stack(out, 1)
 
 
 def learned(case: Case, quick: bool) -> list[Timed]:

@@ -23,7 +23,7 @@ run.plot("learned")
 # over seconds.
 
 # %%
-from herglotz.plots.prediction import plot_prediction
+from herglotz.plots.motion import plot_prediction
 
 other = hz.simulate(hz.scene("double_pendulum"), trajectories=1, steps=100, h=0.04, seed=7)
 found = run.predict(other)

@@ -10,7 +10,6 @@ Data: pendulum_02, pendulum_05, pendulum_10 (simulated damped pendulum at three 
 Examples
 --------
     python benchmarks/peers --data pendulum_05 --peers ours,hnn,sindy --seeds 2 --budget 5 --out runs/peers
-    python benchmarks/peers --reproduce            # figures of the sources, measured with our implementations
     python benchmarks/peers --redraw               # table and figure from the JSON that is there
 
 Needs, each for its peer alone: torchdiffeq, pysindy, phlearn (`pip install --no-deps phlearn imageio`, then ipython and
@@ -33,7 +32,6 @@ from benchmarks.peers import PEERS, networks
 from benchmarks.peers.known_equation import train_known_equation
 from benchmarks.peers.problems import PROBLEMS, Problem
 from benchmarks.peers.report import draw, table
-from benchmarks.peers.reproduce import reproduce
 from herglotz.errors import InputError
 
 BUDGET = 10.0  # seconds of processor time of a network peer's fit
@@ -123,8 +121,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--peers", help=f"with commas (default: all of {', '.join(PEERS)})")
     parser.add_argument("--seeds", type=int, default=5, help="seeds 0, 1, … of data and weights (default 5)")
     parser.add_argument("--budget", type=float, help=f"seconds of processor time a network fit (default {BUDGET:g})")
-    parser.add_argument("--again", action="store_true", help="measure the chosen cells (or the figures) anew")
-    parser.add_argument("--reproduce", action="store_true", help="only the figures of the sources")
+    parser.add_argument("--again", action="store_true", help="measure the chosen cells anew")
     parser.add_argument("--redraw", action="store_true", help="only the table and the figure")
     arguments = parser.parse_args(argv)
     data = harness.chosen(parser, arguments.data, PROBLEMS, "data set")
@@ -135,11 +132,7 @@ def main(argv: list[str] | None = None) -> None:
     path = harness.json_file(arguments, "peers")
     try:
         result = opened(path, arguments.budget)
-        if arguments.reproduce:
-            if arguments.again:
-                result.pop("reproduced", None)
-            reproduce(result, arguments.seeds, lambda: harness.store(path, result))
-        elif not arguments.redraw:
+        if not arguments.redraw:
             measure(result, plan(data, peers, arguments.seeds), arguments.again, path)
     except InputError as error:
         raise SystemExit(f"error: {error}") from None

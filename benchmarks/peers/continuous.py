@@ -34,13 +34,13 @@ FINEST = 0.25  # its Runge–Kutta step at most, in units of velocity over accel
 
 
 class Hamiltonian:
-    """H(q, p), and D(q, p) where dissipative, as networks that `network` makes for a number of inputs."""
+    """H(q, p), and D(q, p) where dissipative, as networks."""
 
-    def __init__(self, scales: Scales, network: Callable[[int], nn.Module], *, dissipative: bool):
+    def __init__(self, scales: Scales, generator: torch.Generator, *, dissipative: bool):
         inputs = scales.q_inputs + len(scales.angles)
         self.scales, self.energy = scales, float((scales.v * scales.v).mean())
-        self.H = network(inputs)
-        self.D = network(inputs) if dissipative else None
+        self.H = Network(inputs, 1, generator)
+        self.D = Network(inputs, 1, generator) if dissipative else None
         self.parameters = [*self.H.parameters(), *(self.D.parameters() if self.D else ())]
 
     def rates(self, q: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
@@ -59,7 +59,7 @@ def train_hnn(samples: Samples, seed: int, budget: float, *, dissipative: bool =
     generator = torch.Generator().manual_seed(seed)
     motion = samples.motion()
     scales = Scales.of(samples.angles, torch.cat(samples.q), motion.p, motion.f)
-    model = Hamiltonian(scales, lambda inputs: Network(inputs, 1, generator), dissipative=dissipative)
+    model = Hamiltonian(scales, generator, dissipative=dissipative)
     return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=True)
 
 
@@ -68,57 +68,45 @@ def train_dissipative_hnn(samples: Samples, seed: int, budget: float) -> Flow:
     return train_hnn(samples, seed, budget, dissipative=True)
 
 
-def acceleration(L: Tensor, q: Tensor, v: Tensor, force: Tensor | None = None) -> Tensor:
-    """v̇ of the Euler–Lagrange equation with a force on its right-hand side, (B, n); L is (B,) at (q, v)."""
+def acceleration(L: Tensor, q: Tensor, v: Tensor) -> Tensor:
+    """v̇ of the Euler–Lagrange equation, (B, n); L is (B,) at (q, v)."""
     L_q, L_v = torch.autograd.grad(L.sum(), (q, v), create_graph=True)
     rows = [
         torch.autograd.grad(L_v[:, i].sum(), (q, v), create_graph=True, materialize_grads=True)
         for i in range(q.shape[1])
     ]
     mixed, mass = (torch.stack([row[k] for row in rows], 1) for k in (0, 1))
-    right = L_q - (mixed @ v[..., None])[..., 0]
-    return torch.linalg.solve_ex(mass, right if force is None else right + force)[0]
+    return torch.linalg.solve_ex(mass, L_q - (mixed @ v[..., None])[..., 0])[0]
 
 
 class FreeLagrangian:
-    """L(q, v) = E [½|v/σ|² + net(q, v)]; `kinetic` is the weight of the first term."""
+    """L(q, v) = E [½|v/σ|² + net(q, v)]."""
 
-    def __init__(self, scales: Scales, network: Callable[[int], nn.Module], *, kinetic: float = 1.0):
-        self.scales, self.kinetic = scales, kinetic
-        self.net = network(scales.q_inputs + len(scales.angles))
+    def __init__(self, scales: Scales, generator: torch.Generator):
+        self.scales = scales
+        self.net = Network(scales.q_inputs + len(scales.angles), 1, generator, nn.Softplus())
         self.parameters = list(self.net.parameters())
 
     def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
         """(v, v̇) at (q, v)."""
         q, v = q.requires_grad_(), v.requires_grad_()
-        L = self.kinetic * (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
+        L = (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
         return v, acceleration(L, q, v)
 
 
 class DeepLagrangian:
-    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate where asked for.
+    """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate.
 
-    The diagonal of C is softplus(net + `shift`) + `least`; with the defaults M is near 1 at the start.
+    The diagonal of C is softplus(net + 0.54), so that M is near 1 at the start.
     """
 
-    def __init__(
-        self,
-        scales: Scales,
-        generator: torch.Generator,
-        *,
-        friction: bool = True,
-        shift: float = 0.54,
-        least: float = 0.0,
-    ):
+    def __init__(self, scales: Scales, generator: torch.Generator):
         n = len(scales.angles)
-        self.shift, self.least = shift, least
         self.scales, self.index = scales, torch.tril_indices(n, n)
         self.factor = Network(scales.q_inputs, self.index.shape[1], generator)
         self.potential = Network(scales.q_inputs, 1, generator)
-        self.parameters: list[Tensor] = [*self.factor.parameters(), *self.potential.parameters()]
-        self.log_friction = torch.full((n,), -3.0 if friction else -torch.inf, dtype=torch.float64)
-        if friction:
-            self.parameters.append(self.log_friction.requires_grad_())
+        self.log_friction = torch.full((n,), -3.0, dtype=torch.float64, requires_grad=True)
+        self.parameters = [*self.factor.parameters(), *self.potential.parameters(), self.log_friction]
 
     def mass(self, q: Tensor) -> Tensor:
         """M(q) in units of the scaled velocity, (B, n, n), positive definite."""
@@ -126,12 +114,12 @@ class DeepLagrangian:
         entries = self.factor(self.scales.of_q(q))
         C = entries.new_zeros(len(q), n, n)
         C[:, self.index[0], self.index[1]] = entries
-        diagonal = nn.functional.softplus(C.diagonal(dim1=-2, dim2=-1) + self.shift) + self.least  # softplus(0.54) = 1
+        diagonal = nn.functional.softplus(C.diagonal(dim1=-2, dim2=-1) + 0.54)  # softplus(0.54) = 1
         C = C.tril(-1) + torch.diag_embed(diagonal)
         return C @ C.mT + 1e-3 * torch.eye(n, dtype=q.dtype)
 
-    def equation(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(M, r) of M ẇ = r + σ τ for the scaled velocity w = v/σ and a torque τ; (B, n, n) and (B, n)."""
+    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        """(v, v̇) at (q, v): M ẇ = r for the scaled velocity w = v/σ."""
         q = q.requires_grad_()
         w = v / self.scales.v
         M = self.mass(q)
@@ -141,24 +129,15 @@ class DeepLagrangian:
         M_q_w = torch.stack([gradient(Mw[:, i], q) for i in range(q.shape[1])], 1)
         M_dot_w = (M_q_w @ v[..., None])[..., 0]
         T_q = gradient((w.detach() * (M @ w.detach()[..., None])[..., 0]).sum(-1) / 2, q)
-        return M, self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
-
-    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(v, v̇) at (q, v) without torque."""
-        M, right = self.equation(q, v)
+        right = self.scales.v * (T_q - V_q) - M_dot_w - self.log_friction.exp() * w
         return v, self.scales.v * torch.linalg.solve_ex(M, right)[0]
-
-    def torque(self, q: Tensor, v: Tensor, a: Tensor) -> Tensor:
-        """The torque (B, n) of the motion, the inverse model that Lutter et al. train."""
-        M, right = self.equation(q, v)
-        return ((M @ (a / self.scales.v)[..., None])[..., 0] - right) / self.scales.v
 
 
 def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
     """Fit one network L(q, v) to accelerations."""
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of(samples, samples.motion())
-    model = FreeLagrangian(scales, lambda inputs: Network(inputs, 1, generator, nn.Softplus()))
+    model = FreeLagrangian(scales, generator)
     return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
 
 

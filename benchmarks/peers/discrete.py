@@ -30,15 +30,10 @@ def scales_of_triples(samples: Samples) -> Scales:
 
 
 class DiscreteLagrangian:
-    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1.
+    """L_d(q0, q1) = h E [½|Δ/σ|² + net(q̄, Δ)], and forces where given; in units in which mass and spreads are 1."""
 
-    `kinetic` is the weight of the first term.
-    """
-
-    def __init__(
-        self, scales: Scales, h: float, net: nn.Module, force: nn.Module | None = None, *, kinetic: float = 1.0
-    ):
-        self.h, self.scales, self.net, self.force, self.kinetic = h, scales, net, force, kinetic
+    def __init__(self, scales: Scales, h: float, net: nn.Module, force: nn.Module | None = None):
+        self.h, self.scales, self.net, self.force = h, scales, net, force
         self.weights = [*net.parameters(), *(force.parameters() if force else ())]
 
     def inputs(self, q0: Tensor, q1: Tensor) -> Tensor:
@@ -48,7 +43,7 @@ class DiscreteLagrangian:
     def slopes(self, q0: Tensor, q1: Tensor) -> tuple[Tensor, Tensor]:
         """(D₁L_d, D₂L_d), (B, n) each, of L_d over h."""
         v = (q1 - q0) / (self.h * self.scales.v)
-        value = self.kinetic * v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
+        value = v.square().sum() / 2 + self.net(self.inputs(q0, q1)).sum()
         return torch.autograd.grad(value, (q0, q1), create_graph=True)  # type: ignore[return-value]
 
     def residual(self, q0: Tensor, q1: Tensor, q2: Tensor) -> Tensor:
@@ -65,13 +60,9 @@ class DiscreteLagrangian:
         """−h² σ D₁D₂L_d σ over h, (B, n, n): the unit matrix for a unit mass."""
         q0, q1 = (x.detach().requires_grad_() for x in (q0, q1))
         scale = self.scales.v[:, None] * self.scales.v
-        return -(self.h**2) * scale * jacobian(self.slopes(q0, q1)[0], q1)
-
-
-def jacobian(D1: Tensor, q1: Tensor) -> Tensor:
-    """∂D₁/∂q1 of pairs, (B, n, n)."""
-    rows = [torch.autograd.grad(D1[:, i].sum(), q1, create_graph=True)[0] for i in range(D1.shape[1])]
-    return torch.stack(rows, 1)
+        D1 = self.slopes(q0, q1)[0]
+        rows = [torch.autograd.grad(D1[:, i].sum(), q1, create_graph=True)[0] for i in range(D1.shape[1])]
+        return -(self.h**2) * scale * torch.stack(rows, 1)
 
 
 def regularity(mixed: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from .rollouts import Flow, rk4
 from .samples import Motion, Samples
 
 STEP = 0.025  # longest Runge–Kutta step, times the motion's fastest rate
-ITERATIONS = 40
+ITERATIONS = 40  # at most: a fit ends where the cost falls by less than 1e-9 of itself
 WINDOWS = 120  # fitted at most
 BUMP = 1e-6  # of the differences
 

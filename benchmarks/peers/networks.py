@@ -15,7 +15,7 @@ from .rollouts import SUBSTEP, Flow
 from .samples import Motion, Samples
 
 WIDTH = 64  # units of each of two hidden layers, for every peer
-BATCH = 256
+BATCH = 256  # samples in a step of Adam, for every peer
 LEARNING_RATE = 3e-3  # of Adam, falling as a cosine
 ADAM_PART = 0.6  # of the budget; L-BFGS has the rest
 PATIENCE = 0.35  # part of the budget without a better validation loss after which a fit stops
@@ -24,18 +24,11 @@ Rates = Callable[[Tensor, Tensor], tuple[Tensor, Tensor]]  # (q, y) → (q̇, �
 
 
 class Network(nn.Module):
-    """Two hidden layers unless told otherwise; float64; weights from the given generator."""
+    """Two hidden layers; float64; weights from the given generator."""
 
-    def __init__(
-        self,
-        inputs: int,
-        outputs: int,
-        generator: torch.Generator,
-        activation: nn.Module | None = None,
-        hidden: Sequence[int] = (WIDTH, WIDTH),
-    ):
+    def __init__(self, inputs: int, outputs: int, generator: torch.Generator, activation: nn.Module | None = None):
         super().__init__()
-        sizes = (inputs, *hidden, outputs)
+        sizes = (inputs, WIDTH, WIDTH, outputs)
         layers: list[nn.Module] = []
         for a, b in pairwise(sizes):
             linear = nn.Linear(a, b, dtype=torch.float64)
@@ -65,12 +58,6 @@ class Scales:
         """Spreads of points (N, n)."""
         spread = [x.square().mean(0).sqrt().clamp_min(1e-12) for x in (q - q.mean(0), v, a)]
         return cls(tuple(angles), q.mean(0), *spread)
-
-    @classmethod
-    def unit(cls, *angles: bool, v: float = 1.0) -> Scales:
-        """No scaling, but of velocities by `v`."""
-        one = torch.ones(len(angles), dtype=torch.float64)
-        return cls(angles, 0 * one, one, v * one, one)
 
     @property
     def q_inputs(self) -> int:

@@ -320,6 +320,7 @@ def ibm() -> Problem:
     return Problem(title, samples, judge, simulated=False, dof=2)
 
 
+# Steps h of the pendulum: 31, 13 and 6 samples a period.
 PROBLEMS: dict[str, Callable[[], Problem]] = {
     "pendulum_02": lambda: pendulum(0.2),
     "pendulum_05": lambda: pendulum(0.5),

@@ -7,6 +7,8 @@ import textwrap
 from pathlib import Path
 from typing import Any
 
+from matplotlib.axes import Axes
+
 from benchmarks.harness import picture, spread
 from benchmarks.harness import table as lines_of
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, new_figure, styled
@@ -62,7 +64,7 @@ def table(result: dict[str, Any]) -> str:
     for data in PROBLEMS:
         if rows := rows_of(result["cells"], data):
             lines += [f"## {data}", "", result["titles"][data] + ".", "", *_errors(rows), *_ahead(rows), ""]
-    return "\n".join([*lines, *_sources(result)])
+    return "\n".join(lines)
 
 
 def _errors(rows: Rows) -> list[str]:
@@ -100,19 +102,6 @@ def _ahead(rows: Rows) -> list[str]:
     return ["", words, "", *lines_of(["peer", *(f"after {t}" for t in times)], found)]
 
 
-def _sources(result: dict[str, Any]) -> list[str]:
-    """Figures of the sources and ours."""
-    if not result.get("reproduced"):
-        return []
-    found = []
-    for one in result["reproduced"].values():
-        here = one["here"]
-        shown = f"{statistics.median(here):.2e} ({min(here):.1e} – {max(here):.1e})"
-        found.append([one["figure"], one["source"], shown, len(here), one["rule"], "yes" if one["agrees"] else "no"])
-    head = ("figure", "source", "here median (least – largest)", "seeds", "agrees if", "agrees")
-    return ["## Figures of the sources", "", *lines_of(head, found), "", result["reproduced_note"]]
-
-
 def draw(result: dict[str, Any], path: Path) -> None:
     """RMS of every seed, a panel a data set: filled where positions only were given."""
     shown = [data for data in PROBLEMS if rows_of(result["cells"], data)]
@@ -132,32 +121,37 @@ def draw(result: dict[str, Any], path: Path) -> None:
         for ax in list(axes.flat)[len(shown) :]:
             ax.set_visible(False)
         for ax, data in zip(axes.flat, shown, strict=False):
-            for (peer, given), cells in rows_of(result["cells"], data).items():
-                exact, found = given == "exact", values(cells, "rms")
-                color = MODEL if peer.startswith("ours") else UNSEEN if exact else INK
-                y = place[peer] + (-0.2 if exact else 0.12 if PEERS[peer].needs != "positions" else 0.0)
-                failed, total = (sum(int(c.get(k) or 0) for c in cells) for k in ("failures", "rollouts"))
-                style: dict[str, Any] = {"ms": 4, "mec": color, "mfc": "white" if exact else color, "clip_on": False}
-                if found:  # an empty line that is not clipped would lie at the figure's corner, and stretch the layout
-                    ax.plot(found, [y] * len(found), "x" if 2 * failed > total else "o", **style)
-                    ax.plot([statistics.median(found)] * 2, [y - 0.2, y + 0.2], color=color, lw=1.6)
-                else:
-                    ink = color if exact else MUTED
-                    ax.text(0.99, y, "failed", transform=ax.get_yaxis_transform(), ha="right", va="center", color=ink,
-                            fontsize=7.5, in_layout=False)  # fmt: skip
-            words = result["titles"].get(data, data).split(";")[0].replace(" = ", "\u00a0=\u00a0")
-            ax.set_title(textwrap.fill(words, 38), fontsize=8)
-            ax.set(xscale="log", xlabel="RMS (rad)", ylim=(-0.7, len(peers) - 0.4))
-            low, high = ax.get_xlim()
-            ax.set_xlim(low, high * (high / low) ** 0.03)
-            ax.set_yticks(list(place.values()), [PEERS[p].title for p in place])
-            ax.tick_params(axis="y", length=0)
-            ax.grid(axis="both", color="#EEEEEE", lw=0.8)
-            for text in ax.get_yticklabels():
-                text.set_color(MODEL if text.get_text().startswith("herglotz") else INK)
+            _panel(ax, result, data, place)
         key = [("● positions only, or differences of them", INK), ("○ exact velocities given", UNSEEN)]
         key.append(("× most rollouts failed", INK))
         for k, (text, color) in enumerate([("● herglotz, positions only", MODEL), *key]):
             left = (0.1, 2.2, 5.2, 7.2)[k] / width
             figure.text(left, 1 - 0.42 / height, text, color=color, fontsize=9)
         picture(figure, path)
+
+
+def _panel(ax: Axes, result: dict[str, Any], data: str, place: dict[str, int]) -> None:
+    """One data set: a row a peer, a mark a seed."""
+    for (peer, given), cells in rows_of(result["cells"], data).items():
+        exact, found = given == "exact", values(cells, "rms")
+        color = MODEL if peer.startswith("ours") else UNSEEN if exact else INK
+        y = place[peer] + (-0.2 if exact else 0.12 if PEERS[peer].needs != "positions" else 0.0)
+        failed, total = (sum(int(c.get(k) or 0) for c in cells) for k in ("failures", "rollouts"))
+        style: dict[str, Any] = {"ms": 4, "mec": color, "mfc": "white" if exact else color, "clip_on": False}
+        if found:  # an empty line that is not clipped would lie at the figure's corner, and stretch the layout
+            ax.plot(found, [y] * len(found), "x" if 2 * failed > total else "o", **style)
+            ax.plot([statistics.median(found)] * 2, [y - 0.2, y + 0.2], color=color, lw=1.6)
+        else:
+            ink = color if exact else MUTED
+            ax.text(0.99, y, "failed", transform=ax.get_yaxis_transform(), ha="right", va="center", color=ink,
+                    fontsize=7.5, in_layout=False)  # fmt: skip
+    words = result["titles"].get(data, data).split(";")[0].replace(" = ", "\u00a0=\u00a0")
+    ax.set_title(textwrap.fill(words, 38), fontsize=8)
+    ax.set(xscale="log", xlabel="RMS (rad)", ylim=(-0.7, len(place) - 0.4))
+    low, high = ax.get_xlim()
+    ax.set_xlim(low, high * (high / low) ** 0.03)
+    ax.set_yticks(list(place.values()), [PEERS[p].title for p in place])
+    ax.tick_params(axis="y", length=0)
+    ax.grid(axis="both", color="#EEEEEE", lw=0.8)
+    for text in ax.get_yticklabels():
+        text.set_color(MODEL if text.get_text().startswith("herglotz") else INK)

@@ -10,6 +10,7 @@ from herglotz.errors import InputError
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from herglotz.theory import Symmetries
     from herglotz.training import Run
     from herglotz.verify import Report
 
@@ -36,6 +37,13 @@ def verify(run: Run, **settings: Any) -> Report:
     from herglotz.verify import verify
 
     return verify(run, **settings)
+
+
+def symmetries(run: Run, **settings: Any) -> Symmetries:
+    """Find the symmetries of the run; see `herglotz.verify.symmetries`."""
+    from herglotz.verify import symmetries
+
+    return symmetries(run, **settings)
 
 
 def report(run: Run, folder: str | Path, against: Any) -> list[Path]:

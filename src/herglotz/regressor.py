@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.stepping import State
+from herglotz.stepping import OneStepMethod, State
 from herglotz.threads import one_thread
 from herglotz.training import FitConfig, fit
 
@@ -121,37 +122,43 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
 
     def _from(self, start: State, spans: np.ndarray) -> np.ndarray:
         """Positions at the times `spans` ≥ 0 after a state."""
-        run, order = self.run_, np.argsort(spans)
-        found, state, now, stepper = np.empty((len(spans), run.data.dof)), start, 0.0, None
-        regular = np.allclose(spans[order], run.h * np.round(spans[order] / run.h), atol=1e-6 * run.h, rtol=1e-9)
-        for i in order:
-            while regular and spans[i] - now > 0.5 * run.h:
-                state, now = run.stepper.step(state, run.h).state, now + run.h
-            if not regular and spans[i] - now > SAME * run.h:
-                stepper = stepper or run.at_step(run.h_range[0] / 2)  # which has steps of any length
-                state, now = stepper.step(state, float(spans[i] - now)).state, float(spans[i])
-            found[i] = state.q.double().numpy()
-        return found
+        run = self.run_
+        steps = np.round(spans / run.h).astype(int)
+        if np.allclose(spans, run.h * steps, atol=1e-6 * run.h, rtol=1e-9):
+            stepper, sizes, row = run.stepper, np.full(steps.max(), run.h), steps
+        else:  # steps of any length, from one asked time to the next
+            stepper, ends = run.at_step(run.h_range[0] / 2), np.unique(spans[spans > SAME * run.h])
+            sizes, row = np.diff(ends, prepend=0.0), np.searchsorted(ends, spans) + (spans > SAME * run.h)
+        return self._positions(stepper, start, sizes)[row]
+
+    def _positions(
+        self, stepper: OneStepMethod, start: State, sizes: np.ndarray, inputs: Tensor | None = None
+    ) -> np.ndarray:
+        """Positions (K + 1, n) over K steps of these sizes, in float64."""
+        if not len(sizes):
+            return start.q[None].double().numpy()
+        with torch.no_grad():
+            return stepper.rollout(*start, h=torch.from_numpy(sizes), inputs=inputs).q.double().numpy()
 
     def _driven(self, X: np.ndarray) -> np.ndarray:
         """From the last fitted sample on; the input of a row acts from its time to the next row's."""
         run = self.run_
-        state, now = run.last_fitted()
+        start, fitted = run.last_fitted()
         last = run.data.offsets[0] + run.train_lengths[0] - 1
         u, (low, high) = run.data.u, run.h_range
         assert u is not None  # `predict` asks
-        acts, found = u[last], np.empty((len(X), run.data.dof))
-        for i, (t, *row) in enumerate(X.tolist()):
-            step = t - now
-            if step > SAME * run.h:
-                if not low <= step <= high:
-                    raise InputError(f"row {i} of X: a step of {step:g}, the data had {low:g} to {high:g}; resample X")
-                state = run.stepper.step(state, step, u=acts).state
-            elif step < -SAME * run.h:
-                raise InputError(f"row {i} of X: t = {t:g} is before {now:g}; with inputs, times increase from the fit")
-            acts, now = u.new_tensor(row), max(t, now)
-            found[i] = state.q.double().numpy()
-        return found
+        t, before = X[:, 0], np.maximum.accumulate(np.r_[fitted, X[:-1, 0]])
+        step = t - before
+        moves, back = step > SAME * run.h, step < -SAME * run.h
+        wrong = back | (moves & ~((low <= step) & (step <= high)))
+        if wrong.any():
+            i = int(wrong.argmax())
+            text = f"a step of {step[i]:g}, the data had {low:g} to {high:g}; resample X"
+            if back[i]:
+                text = f"t = {t[i]:g} is before {before[i]:g}; with inputs, times increase from the fit"
+            raise InputError(f"row {i} of X: {text}")
+        acts = torch.cat([u[last : last + 1], u.new_tensor(X[:-1, 1:])])[torch.from_numpy(moves)]
+        return self._positions(run.stepper, start, step[moves], acts)[moves.cumsum()]
 
 
 def _matrix(name: str, x: Any) -> np.ndarray:

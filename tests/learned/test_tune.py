@@ -62,7 +62,7 @@ def test_promise_holds_on_held_out_starts(name, pendulum_run, monkeypatch):
     assert found.held_out["share_within"] >= 0.95, found.held_out
     # and once more from outside, with other starts still: the tuned run against the run, position by position
     tuned = found.tuned_run()
-    motions = record(found.run, draw_starts(found.run, 60, 99), found.horizon, "own").every(2)
+    motions = record(found.run, draw_starts(found.run, 60, 99), found.horizon).every(2)
     with torch.no_grad():
         start = (x[:, 0] for x in motions)
         q = Stepper(tuned.model).rollout(*start, h=tuned.h, steps=motions.s.shape[1] - 1).q
@@ -159,7 +159,7 @@ def test_a_smaller_correction_is_tried_at_the_own_step_and_a_larger_one_is_not(p
         ([], "either --max-error or --budget-us"),
         (["--max-error", "1e-3", "--widths", "8.5"], "--widths needs whole numbers"),
         (["--max-error", "1e-3", "--kicks", "2.5"], "--kicks needs whole numbers"),
-        (["--max-error", "1e-3", "--multiples", "a"], "--multiples needs numbers"),
+        (["--max-error", "1e-3", "--multiples", "a"], "--multiples needs whole numbers"),
         (["--max-error", "1e-3", "--starts", "9"], "take 59 or more"),
     ],
 )

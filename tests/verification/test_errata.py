@@ -135,11 +135,13 @@ def landing_reference():
 def test_the_landing_to_fifteen_digits():
     # fails if the closed form takes the other root, or the flow another velocity
     time, speed = landing_reference()
-    x = parachute_motion.start()
-    v0 = float(scene("parachute").velocity(*x))
-    for t, v in (parachute_motion.landing(100.0, v0), parachute_motion.landing_by_root(x, time)):
-        assert abs(t / time - 1) < 1e-15
-        assert abs(v / speed - 1) < 1e-15
+    x, fall = parachute_motion.start(), scene("parachute")
+    found = parachute_motion.landing(100.0, float(fall.velocity(*x)))
+    assert abs(found[0] / time - 1) < 1e-15
+    assert abs(found[1] / speed - 1) < 1e-15
+    state = fall.flow(*x, time)
+    assert abs(float(state[0])) < 1e-13  # of 100 m
+    assert abs(float(fall.velocity(*state)) / speed - 1) < 1e-15
 
 
 @pytest.fixture(scope="module")

@@ -8,7 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-CODE = 130
+CODE = 130  # what shells report of a process that SIGINT has ended, 128 + 2
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -13,7 +13,7 @@ DESCRIPTION = """\
 Draw figures as png, svg or pdf. Of a RUN: trajectory, phase portrait, what was learned, training and the plan; with
 --animate, animation.gif instead, of data and model moving. Of DATA: its samples. With --theory, of a SCENE or a RUN:
 the momentum against the generating function and the Hamilton–Jacobi residual; of parachute also the paper's two
-figures. (`herglotz verify RUN --plots` draws the first two as well.)
+figures. (`herglotz verify RUN --plots FOLDER` draws the first two as well.)
 
 examples:
   herglotz plot runs/pendulum

@@ -110,7 +110,7 @@ def _write(found: Prediction, out: Path) -> list[Path]:
     """The predicted motion as far as it goes, and the figure."""
     from herglotz.data import save
     from herglotz.plots import save_figure
-    from herglotz.plots.prediction import plot_prediction
+    from herglotz.plots.motion import plot_prediction
 
     motion: Any = found.motion()
     written = [] if motion is None else [out]

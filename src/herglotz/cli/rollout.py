@@ -50,6 +50,7 @@ class Source:
     box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
     h_range: tuple[float, float] | None  # steps of the fit
     hold: str = ""  # what the inputs of the fit do between samples
+    frequencies: tuple[float, ...] = ()  # of waves that are its inputs
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -171,7 +172,9 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
         start, t0 = run_.last_fitted(trajectory)
         box = Box(run_.box, data.angles, start.q.dtype)
         labels = (data.names, data.units, data.angles, data.time_unit)
-        return Source(run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.data.hold)
+        return Source(
+            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.data.hold, run_.config.frequencies
+        )
 
     from herglotz.export import load_exported
 
@@ -214,11 +217,15 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     import torch
 
     from herglotz.data.driving import driven, even_times, recorded
+    from herglotz.data.waves import waves
 
     steps, path = arguments.steps, arguments.inputs
     if path is None:
-        u = None if arguments.u is None else torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1)
-        return u, even_times(t0, arguments.h or source.h, steps)
+        times = even_times(t0, arguments.h or source.h, steps)
+        if arguments.u is None:
+            middle = 0.5 * (times[1:] + times[:-1])
+            return waves(middle, source.frequencies) if source.frequencies else None, times
+        return torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1), times
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
     found = recorded(path, arguments.trajectory, source.time_unit, source.hold)

@@ -163,6 +163,16 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
         "pendulum's V: no velocity is in it. May be given again",
     )  # fmt: skip
     _setting(
+        parser, "--frequency", field="frequencies", type=positive, action="append", metavar="NU",
+        help="angular frequency, in rad per unit of time, of a periodic force whose amplitude and phase are learned; "
+        "for a recording without inputs. May be given again",
+    )  # fmt: skip
+    _setting(
+        parser, "--translation", field="translations", action="append", metavar="TEXT",
+        help="a symmetry that the model is to have, named by what moves together: 'q1 + q2 + q3', or 'q1' alone; what "
+        "herglotz verify RUN --symmetries finds. May be given again",
+    )  # fmt: skip
+    _setting(
         parser, "--ignore-inputs", field="use_inputs", action="store_false", help="fit as if no input u were recorded"
     )
     _setting(
@@ -171,8 +181,8 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--hold", choices=HOLDS,
-        help="what the inputs do between samples: nothing, straight lines, or cubics (default: what the file says, or "
-        "what explains the data best)",
+        help="what the inputs do between samples: nothing, straight lines or polynomials (default: what the file says, "
+        "or what explains the data best)",
     )  # fmt: skip
 
 

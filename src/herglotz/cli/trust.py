@@ -23,7 +23,7 @@ examples:
   herglotz trust runs/pendulum --level 0.95 --json
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
-COLUMNS = 80
+COLUMNS = 80  # of a terminal as it opens
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 
@@ -62,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         "level": arguments.level,
         "inside_training": float(inside[~held].double().mean()),
         "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
-        "noise": bands.sigma,
+        "noise": dict(zip(result.data.names, bands.sigma.tolist(), strict=True)),
         "held_out_over_noise": posterior.inflation,
         "parameters": _by_name(physical),
         "not_determined": [
@@ -101,7 +101,8 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], equation: dict[st
     if numbers["inside_held_out"] is not None:
         rows.append((f"{percent}, held out", f"{100 * numbers['inside_held_out']:.1f} % of the samples inside"))
     worse = f"{numbers['held_out_over_noise']:.2f}"
-    rows.append(("noise of a sample", f"{numbers['noise']:.3g}; held-out blocks miss {worse} times as much"))
+    noise = ", ".join(f"{x:.3g}" for x in dict.fromkeys(numbers["noise"].values()))
+    rows.append(("noise of a sample", f"{noise}; held-out blocks miss {worse} times as much"))
     worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
     rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
     print_table(rows)

@@ -55,10 +55,6 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="numbers of kicks in an explicit large step, with commas, or none; tried in C where the model has one "
         "coordinate and one damping rate (default %(default)s)",
     )  # fmt: skip
-    parser.add_argument(
-        "--reference", choices=("own", "limit"), default="own",
-        help="measure against the model at its own step, or as h goes to 0 (default %(default)s)",
-    )  # fmt: skip
     parser.add_argument("--no-c", action="store_true", help="PyTorch only")
     parser.add_argument("--starts", type=count, default=128, help="number of motions that choose (default %(default)s)")
     parser.add_argument("--iterations", type=count, default=80, help="most in a re-training (default %(default)s)")
@@ -71,8 +67,8 @@ def run(arguments: argparse.Namespace) -> int:
     """Search, save, draw and report."""
     if (arguments.max_error is None) == (arguments.budget_us is None):
         raise InputError("give either --max-error or --budget-us")
-    multiples = _numbers("--multiples", arguments.multiples)
-    widths, kicks = _whole("--widths", arguments.widths), _whole("--kicks", arguments.kicks)
+    names = ("multiples", "widths", "kicks")
+    multiples, widths, kicks = (_whole(f"--{name}", getattr(arguments, name)) for name in names)
     if arguments.source.is_file():
         raise InputError(f"{arguments.source}: is a file; give the folder that `herglotz fit --out` wrote")
     out: Path = arguments.out or arguments.source / "tuned"
@@ -91,7 +87,6 @@ def run(arguments: argparse.Namespace) -> int:
         widths=widths,
         kicks=kicks,
         artefacts=("eager",) if arguments.no_c else ("eager", "c"),
-        reference=arguments.reference,
         starts=arguments.starts,
         seed=arguments.seed,
         iterations=arguments.iterations,
@@ -114,20 +109,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _numbers(name: str, text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(x) for x in text.split(","))
-    except ValueError:
-        raise InputError(f"{name} needs numbers with commas between them, got {text!r}") from None
-
-
 def _whole(name: str, text: str) -> tuple[int, ...]:
     if text.strip() == "none":
         return ()
-    numbers = _numbers(name, text)
-    if any(not x.is_integer() for x in numbers):
-        raise InputError(f"{name} needs whole numbers, got {text}")
-    return tuple(int(x) for x in numbers)
+    try:
+        return tuple(int(x) for x in text.split(","))
+    except ValueError:
+        raise InputError(f"{name} needs whole numbers with commas between them, got {text!r}") from None
 
 
 def _report(found: Tuning, out: Path) -> None:

@@ -21,6 +21,7 @@ names, or a folder with the same weights beside the file, in the current folder,
 
 examples:
   herglotz verify damped_oscillator
+  herglotz verify kepler --symmetries
   herglotz verify runs/pendulum --json
   herglotz verify stepper.onnx --against runs/pendulum
 """
@@ -44,8 +45,9 @@ def add(commands: argparse._SubParsersAction) -> None:
         metavar="RUN",
         help="run that a file was exported from (default: a run with its weights nearby)",
     )
+    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="draw the identities of S^k of a SCENE or RUN too")
     parser.add_argument(
-        "--plots", type=Path, metavar="FOLDER", help="draw two identities of the action of a RUN, to rounding"
+        "--symmetries", action="store_true", help="find translations, rotations and their momenta J of a SCENE or RUN"
     )
     add_trust_flag(parser)
     parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
@@ -64,38 +66,32 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
     from herglotz.training import load_run
-    from herglotz.verify import verify
+    from herglotz.verify import symmetries, verify
 
     if arguments.plots is not None:
-        _draw(target, arguments.plots)
+        from herglotz.plots import save_theory_figures
+
+        check_output_folder(arguments.plots)
+        save_theory_figures(arguments.target, arguments.plots, h=arguments.h)
     settings = {name: getattr(arguments, name) for name in ("h", "samples", "steps", "seed")}
     model = None if arguments.against is None else load_run(arguments.against).model.to(target.dtype)
     report = verify(target, model=model, **settings)
+    found = symmetries(target, h=arguments.h, seed=arguments.seed) if arguments.symmetries else None
     agreement = None if arguments.against is None else _agreement(target, arguments)
     passed = report.passed and (agreement is None or agreement["passed"])
     if arguments.json:
-        print_json({**report.to_dict(), **({} if agreement is None else {"passed": passed, "against": agreement})})
+        more = {} if found is None else {"symmetries": found.to_dict()}
+        more |= {} if agreement is None else {"passed": passed, "against": agreement}
+        print_json({**report.to_dict(), **more})
     else:
         print(report.table())
+        if found is not None:
+            print(found)
         if agreement is not None:
             print(_table(agreement, arguments.against))
         elif path is not None:
             print("not compared with its model: no run with these weights was found; name it with --against RUN")
     return 0 if passed else 1
-
-
-def _draw(target: Any, folder: Path) -> None:
-    """Draw the identities of S^k of a run, which a model with forces does not have."""
-    from herglotz.plots import IDENTITIES, save_figures
-    from herglotz.training import load_run
-
-    if not Path(str(target)).is_dir():
-        raise InputError(f"--plots draws a run; {target} is none")
-    run = load_run(target)
-    if run.model.friction is not None:
-        raise InputError(f"--plots draws the action S; {target} has forces (level forced), and no S")
-    check_output_folder(folder)
-    save_figures(run, folder, IDENTITIES)
 
 
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:

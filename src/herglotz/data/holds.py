@@ -2,7 +2,7 @@
 
     zero     u_k from sample k to the next: a controller's output
     first    straight lines between the samples: the mean over a step is (u_k + u_{k+1})/2
-    smooth   cubics through four samples: a signal without steps that was sampled at the same times as the motion
+    smooth   polynomials through eight samples: a signal without steps, sampled at the same times as the motion
 
 A model takes one input a step. Where u changes within the step the rule of order 2 wants its value in the middle: this
 is what a hold gives, for the whole recorded step or for each of the equal parts in which the step is crossed.
@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 HOLDS = ("zero", "first", "smooth")
-POINTS = {"zero": 1, "first": 2, "smooth": 4}  # samples that an input in between is made of
+POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in between is made of
 
 
 def held(

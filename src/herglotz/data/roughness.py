@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
 
@@ -12,27 +13,32 @@ MOST = 4000  # windows at most, evenly spread: more do not change an RMS
 
 
 def roughness(data: Trajectories, degree: int = DEGREE) -> float:
-    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q.
+    """Return the RMS residual of polynomials in time through nine samples in a row, in units of q over its balance.
 
     Infinite where no trajectory has nine samples.
 
     Independent noise of standard deviation σ gives σ; coarsely sampled motion gives more. Steps may differ. Angles
     should be `unwrapped()`.
     """
+    return float(_residuals(data, degree).square().mean().sqrt())
+
+
+def _residuals(data: Trajectories, degree: int) -> Tensor:
+    """`roughness` of every coordinate, (n,)."""
     firsts = [
         torch.arange(first, first + length - SAMPLES + 1)
         for first, length in zip(data.offsets, data.lengths, strict=True)
         if length >= SAMPLES
     ]
     if not firsts:
-        return float("inf")
+        return torch.full((data.dof,), torch.inf, dtype=torch.float64)
     rows = torch.cat(firsts)
     rows = rows[:: -(-len(rows) // MOST)].to(data.t.device)[:, None] + torch.arange(SAMPLES, device=data.t.device)
-    t, q = data.t[rows].double().cpu(), data.q[rows].double().cpu()
+    t, q = data.t[rows].double().cpu(), (data.q / data.balance)[rows].double().cpu()
     x = 2 * (t - t[:, :1]) / (t[:, -1:] - t[:, :1]) - 1
     Q = torch.linalg.qr(torch.stack([x**k for k in range(degree + 1)], -1)).Q
     r = q - Q @ (Q.mT @ q)
-    return float((r.square().mean() * SAMPLES / (SAMPLES - degree - 1)).sqrt())
+    return (r.square().mean((0, 1)) * SAMPLES / (SAMPLES - degree - 1)).sqrt()
 
 
 def precision(data: Trajectories) -> float:
@@ -41,3 +47,8 @@ def precision(data: Trajectories) -> float:
     inf where no trajectory has nine samples.
     """
     return min(roughness(data, degree) for degree in DEGREES)
+
+
+def precisions(data: Trajectories) -> Tensor:
+    """`precision` of every coordinate, (n,)."""
+    return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)

@@ -86,8 +86,8 @@ def simulate(
         raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
     generator = torch.Generator().manual_seed(seed)
     shape = (trajectories, scene.dof)
-    q0 = _uniform("q_range", scene.q_range if q_range is None else q_range, shape, generator)
-    v0 = _uniform("v_range", scene.v_range if v_range is None else v_range, shape, generator)
+    q0 = uniform("q_range", scene.q_range if q_range is None else q_range, shape, generator)
+    v0 = uniform("v_range", scene.v_range if v_range is None else v_range, shape, generator)
     drive = getattr(scene, "drive", None)
     middles = h * (torch.arange(steps + 1, dtype=torch.float64) + 0.5)
     u = None if drive is None else drive(middles)  # (steps + 1, m)
@@ -151,7 +151,8 @@ def _kept(samples: int, gaps: int, generator: torch.Generator) -> Tensor:
     return keep
 
 
-def _uniform(name: str, limits: Range, shape: tuple[int, int], generator: torch.Generator) -> Tensor:
+def uniform(name: str, limits: Range, shape: tuple[int, int], generator: torch.Generator) -> Tensor:
+    """Positions or velocities (B, n) drawn uniformly between limits that are numbers or n numbers each."""
     try:
         low, high = (torch.as_tensor(x, dtype=torch.float64).expand(shape) for x in limits)
     except (TypeError, ValueError, RuntimeError) as error:

@@ -11,6 +11,7 @@ from torch import Tensor
 from herglotz.data.checks import MIN_SAMPLES, check_fraction, offsets_of
 from herglotz.errors import InputError
 
+RUN = 200  # samples in a row of a part of a trajectory, at least
 Part = tuple[Tensor, tuple[int, ...]]  # rows of the concatenation, and how many of each trajectory
 
 
@@ -85,3 +86,19 @@ def leading_rows(data: Concatenation, lengths: Sequence[int]) -> Tensor:
     """Rows of the first `lengths[b]` samples of every trajectory b."""
     spans = [torch.arange(first, first + k) for first, k in zip(offsets_of(data.lengths), lengths, strict=True)]
     return torch.cat(spans).to(data.t.device)
+
+
+def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
+    """At most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+    own = min(max(most // len(lengths), RUN), max(lengths))
+    every = max(1, -(-own * len(lengths) // most))
+    rows, kept = [], []
+    size = q.std(0, correction=0).clamp_min(torch.finfo(q.dtype).tiny)
+    for first, length in list(zip(offsets_of(lengths), lengths, strict=True))[::every]:
+        count = min(own, length)
+        moved = (q[first : first + length].diff(dim=0) / size).square().sum(1).cumsum(0)
+        gone = torch.cat([moved.new_zeros(1), moved])
+        start = first + int((gone[count - 1 :] - gone[: length - count + 1]).argmax())
+        rows.append(torch.arange(start, start + count))
+        kept.append(count)
+    return torch.cat(rows), tuple(kept)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, offsets_of
 from herglotz.data.holds import HOLDS, held
-from herglotz.data.splits import time_split, trajectory_split
+from herglotz.data.splits import liveliest_rows, time_split, trajectory_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
@@ -137,6 +137,19 @@ class Trajectories:
         """Trajectory of every sample, (N,) long."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
 
+    @cached_property
+    def balance(self) -> Tensor:
+        """(n,) size of the motion of each kind of coordinate over the largest: 1 where all have one unit.
+
+        Errors over it can be added up and compared: metres and radians cannot. Coordinates of one unit are measured
+        alike, and keep their differences.
+        """
+        kinds = list(zip(self.units, self.angles, strict=True))
+        moved = (self.q - self.q[0]).std(0, correction=0)
+        size = torch.stack([moved[[other == kind for other in kinds]].square().mean().sqrt() for kind in kinds])
+        size = size / size.max()
+        return torch.where(torch.isfinite(size) & (size > 0), size, 1.0)
+
     def steps(self) -> Steps:
         """Return all N - B steps, with their trajectory and the row they start from."""
         return steps(self.t, self.trajectory)
@@ -185,6 +198,11 @@ class Trajectories:
         (train, train_lengths), (test, test_lengths) = time_split(self.lengths, fraction, self.source)
         device = self.t.device
         return self._rows(train.to(device), train_lengths), self._rows(test.to(device), test_lengths)
+
+    def liveliest(self, most: int) -> Trajectories:
+        """Return at most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
+        rows, lengths = liveliest_rows(self.q, self.lengths, most)
+        return self if len(rows) == self.samples else self._rows(rows.to(self.t.device), lengths)
 
     def split_trajectories(self, fraction: float, generator: torch.Generator) -> tuple[Trajectories, Trajectories]:
         """Draw `round(fraction * B)` whole trajectories for training; the others test."""

@@ -10,13 +10,11 @@ from herglotz.export.lower.aoti import export_aoti
 from herglotz.export.lower.onnx import export_onnx
 from herglotz.export.lower.pt2 import export_pt2
 from herglotz.export.metadata import weights_digest
-from herglotz.export.module import StepModule
 from herglotz.export.run_file import export_run
 
 __all__ = [
     "DifferencedStepper",
     "ExportedStepper",
-    "StepModule",
     "compare",
     "compile",
     "compile_c",

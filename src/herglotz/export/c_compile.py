@@ -10,11 +10,12 @@ from typing import Any
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_header import c_source, described
+from herglotz.export.c_header import MAX_ITERATIONS, c_source, described
 from herglotz.export.c_stepper import compiled
 from herglotz.export.c_wrapper import compiler
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
+from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 
@@ -113,7 +114,8 @@ def compile_c(
     if not isinstance(source, ContactLagrangian):
         return load_c(source, trust_code=trust_code)
     dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
-    entries = described(source, h, box, units, "model", dtype, None, tolerance, {})
+    entries = describe(source, h, box, units, MAX_ITERATIONS, {"h_range": None})
+    entries = described(source, entries, "model", dtype, tolerance)
     kept = copy.deepcopy(source)  # the model may be trained on
     header = c_source(kept, entries, "stepper.h", derivatives=False)
     return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

@@ -27,7 +27,7 @@ from herglotz.models import ContactLagrangian
 MARK = "herglotz-metadata: "
 NAME = r"[A-Za-z][A-Za-z0-9_]{0,40}"  # of the prefix
 TOLERANCE = 16  # machine epsilons; the header steps in increments, so this is within reach
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 30  # as of the eager stepper; a step from a good guess takes two to four
 MAX_DERIVATIVES = 8  # coordinates; the elimination of the derivatives is written out and grows with their cube
 MAX_WIDE = 24  # coordinates; with more, registers of n x n matrices outgrow the stack that some threads have
 
@@ -156,23 +156,23 @@ def export_c(
     """
     path = Path(path)
     name = _identifier(path.stem) if name is None else name
-    entries = described(model, h, box, units, name, dtype, h_range, tolerance, metadata or {})
+    extra = dict(metadata or {})
+    extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
+    entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
     content = sealed_text(c_source(model, entries, path.name)).encode()
     write_atomically(path, content)
     remember(content)
     return path
 
 
-def c_source(
-    model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, explicit: bool = True, derivatives: bool = True
-) -> str:
-    """The text of the header; not `explicit` solves by Newton what needs no solving, to compare the two.
+def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *, derivatives: bool = True) -> str:
+    """The text of the header.
 
     Without `derivatives`, and beyond 8 coordinates, NAME_step_jacobian is left out: it is most of the work.
     """
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
-    step = StepInC(equations, explicit and model.capabilities.explicit)
+    step = StepInC(equations, model.capabilities.explicit)
     emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
     types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
@@ -225,23 +225,13 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
 
 
 def described(
-    model: ContactLagrangian,
-    h: float,
-    box: Mapping[str, Sequence[float]] | None,
-    units: Sequence[str],
-    name: str,
-    dtype: str,
-    h_range: tuple[float, float] | None,
-    tolerance: float | None,
-    extra: Mapping[str, Any],
+    model: ContactLagrangian, entries: dict[str, Any], name: str, dtype: str, tolerance: float | None
 ) -> dict[str, Any]:
-    """The checked entries of the comment at the top, from the arguments of `export_c`."""
+    """The checked entries of the comment at the top: those of any file, and those of C."""
     if not re.fullmatch(NAME, name):
         raise InputError(f"name must be a C identifier of at most 41 letters, digits and _, got {name!r}")
     if dtype not in ("float64", "float32"):
         raise InputError(f"dtype must be 'float64' or 'float32', got {dtype!r}")
-    span = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
-    entries = describe(model, h, box, units, MAX_ITERATIONS, {**extra, "h_range": span})
     torch_dtype = getattr(torch, dtype)
     bad = [key for key, value in model.state_dict().items() if not bool(torch.isfinite(value.to(torch_dtype)).all())]
     if bad:
@@ -249,8 +239,7 @@ def described(
     least = TOLERANCE * torch.finfo(torch_dtype).eps
     if tolerance is not None and not least <= tolerance < 1:
         raise InputError(f"tolerance must be at least {least:.2g} in {dtype} and below 1, got {tolerance:g}")
-    entries |= {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
-    return entries
+    return entries | {"name": name, "dtype": dtype, "newton_tolerance": least if tolerance is None else tolerance}
 
 
 def _identifier(stem: str) -> str:

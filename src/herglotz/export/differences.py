@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -44,25 +45,21 @@ class DifferencedStepper:
         q1, p1, s1 = self.stepper.step(_split(x), h).state
         return torch.cat([q1, p1, s1[..., None]], -1)
 
-    def derivative(self, x: Tensor, h: float) -> Tensor:
-        """(B, 2n+1, 2n+1) by differences of all directions in one batch."""
-        size = x.shape[-1]
-        offset = OFFSET[x.dtype] * (1 + x.abs())
-        columns = 0.0
-        for k, weight in enumerate(WEIGHTS, 1):
-            move = torch.diag_embed(k * offset)  # row j moves x_j
-            ahead, behind = x[..., None, :] + move, x[..., None, :] - move
-            y = self.values(torch.stack([ahead, behind]).reshape(-1, size).contiguous(), h)
-            a, b = y.reshape(2, *move.shape)
-            columns = columns + weight * (a - b)
-        assert isinstance(columns, Tensor)
-        return (columns / offset[..., None]).mT
+
+def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor) -> Tensor:
+    """The derivative (..., m, m) of f: (N, m) → (N, m) at x (..., m); in one batch; x_j moves by 1 … 4 offsets."""
+    move = torch.stack([torch.diag_embed(k * offset.expand_as(x)) for k in range(1, len(WEIGHTS) + 1)])
+    points = torch.stack([x[..., None, :] + move, x[..., None, :] - move])  # row j moves x_j
+    ahead, behind = f(points.reshape(-1, x.shape[-1])).reshape(points.shape)
+    columns = torch.stack([w * change for w, change in zip(WEIGHTS, ahead - behind, strict=True)]).sum(0)
+    return (columns / offset[..., None]).mT
 
 
 class _Differenced(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, x: Tensor, owner: DifferencedStepper, h: float) -> Tensor:  # pyright: ignore
-        ctx.save_for_backward(owner.derivative(x.detach(), h))
+        offset = OFFSET[x.dtype] * (1 + x.detach().abs())
+        ctx.save_for_backward(central_differences(lambda y: owner.values(y, h), x.detach(), offset))
         return owner.values(x.detach(), h)
 
     @staticmethod

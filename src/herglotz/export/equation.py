@@ -119,9 +119,9 @@ class Equations:
     model: ContactLagrangian
 
     @classmethod
-    def of(cls, model: ContactLagrangian | Equations) -> Equations:
+    def of(cls, model: ContactLagrangian) -> Equations:
         """Those of a copy of the model, which no export can change or train."""
-        return model if isinstance(model, Equations) else cls(copy.deepcopy(model).eval().requires_grad_(False))
+        return cls(copy.deepcopy(model).eval().requires_grad_(False))
 
     @cached_property
     def field(self) -> Graph | None:

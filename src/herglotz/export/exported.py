@@ -11,11 +11,11 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.export.box import Box
-from herglotz.export.inputs import check_inputs, check_range, check_state, checked_h, spread_h
+from herglotz.export.inputs import check_inputs, check_range, spread_h
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors
-from herglotz.stepping.state import check_rows, check_started
+from herglotz.stepping.state import check_h, check_rows, check_started, check_state
 
 Program = Callable[..., tuple[Tensor, ...]]
 # (q (B, n), p (B, n), s (B,), h (B, K)[, u (B, K, m)]) → K steps, in any memory layout
@@ -57,6 +57,7 @@ class ExportedStepper(OneStepMethod):
         self.inputs: int = metadata.get("inputs", 0)
         self.dtype: torch.dtype = getattr(torch, metadata["dtype"])
         self.h: float = metadata["h"]
+        self._like = torch.empty((), dtype=self.dtype)  # for what comes as a number
         self.loop = scanned(self.programs["rollout"]) if loop is None else loop
         self._idle: Tensor | None = None  # the inputs that do not act, for programs that want some
         if loop is None and self.inputs:
@@ -159,7 +160,7 @@ class ExportedStepper(OneStepMethod):
         """
         if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
-        check_state(*state, self.dof, self.dtype, finite=False)
+        check_state(state, self)
         return self._box(*state)
 
     def _roll_out(
@@ -216,7 +217,9 @@ class ExportedStepper(OneStepMethod):
         return inputs
 
     def _check(self, q: Tensor, p: Tensor, s: Tensor, names: tuple[str, str, str] = ("q", "p", "s")) -> None:
-        check_state(q, p, s, self.dof, self.dtype, names)
+        check_state(State(q, p, s), self, names, finite=True)
+        if s.numel() == 0:
+            raise InputError(f"{', '.join(names)} hold no samples; give at least one")
         for name, x in zip(names, (q, p, s), strict=True):
             if x.device.type != "cpu":
                 raise InputError(f"{name} must be on the CPU, got {x.device}; use {name}.cpu()")
@@ -225,7 +228,7 @@ class ExportedStepper(OneStepMethod):
                 raise InputError(f"{message}; use a .pt2 file, or {name}.detach()")
 
     def _checked_h(self, h: Tensor | float) -> Tensor:
-        h = checked_h(h, self.dtype)
+        h = check_h(h, self._like)
         check_range(h, self.metadata.get("h_range"))
         return h
 

@@ -1,4 +1,4 @@
-"""What exported steppers check before they step: shapes, dtype, values and h."""
+"""What exported steppers check before they step, beside what every stepper does: the range of h, and inputs."""
 
 from __future__ import annotations
 
@@ -8,53 +8,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-
-
-def check_state(
-    q: Tensor,
-    p: Tensor,
-    s: Tensor,
-    dof: int,
-    dtype: torch.dtype,
-    names: tuple[str, str, str] = ("q", "p", "s"),
-    finite: bool = True,
-) -> None:
-    """Refuse a state that the file was not written for.
-
-    Parameters
-    ----------
-    q, p, s
-        (..., n), (..., n), (...).
-    dof, dtype
-        n and the dtype of the file.
-    names
-        What the caller calls the three.
-    finite
-        Whether every value has to be.
-
-    Raises
-    ------
-    InputError
-        Naming the argument, what is wrong and the remedy.
-    """
-    if q.ndim < 1 or q.shape[-1] != dof or p.shape != q.shape or s.shape != q.shape[:-1]:
-        shapes = [tuple(x.shape) for x in (q, p, s)]
-        raise InputError(f"{', '.join(names)} need shapes (..., {dof}), (..., {dof}), (...); got {shapes}")
-    if s.numel() == 0:
-        raise InputError(f"{', '.join(names)} hold no samples; give at least one")
-    for name, x in zip(names, (q, p, s), strict=True):
-        if x.dtype != dtype:
-            raise InputError(f"{name} must be {dtype}, got {x.dtype}; convert it with .to({dtype})")
-        if finite and not bool(torch.isfinite(x).all()):
-            raise InputError(f"{name} must be finite, got {int((~torch.isfinite(x)).sum())} values that are not")
-
-
-def checked_h(h: Tensor | float, dtype: torch.dtype) -> Tensor:
-    """H as a tensor, every entry finite and > 0."""
-    h = torch.as_tensor(h, dtype=dtype)
-    if h.numel() == 0 or not bool(((h > 0) & torch.isfinite(h)).all()):
-        raise InputError(f"h must be finite and > 0, got {float(h.min()) if h.numel() else 'none'}")
-    return h
 
 
 def check_range(h: Tensor, span: Sequence[float] | None) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,12 +10,10 @@ from torch import Tensor, nn
 from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
-from herglotz.errors import InputError
 from herglotz.export.equation import Equations, dense
-from herglotz.export.newton import CARRIED, CONVERGED, ITERATIONS, Values, unfinished
+from herglotz.export.newton import CARRIED, CONVERGED, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
 from herglotz.mechanics.legendre import beyond
-from herglotz.models import ContactLagrangian
 from herglotz.stepping.linearise import eliminate
 
 
@@ -51,7 +49,7 @@ class RolloutModule(nn.Module):
         Bound on the Newton iterations of a step.
     """
 
-    def __init__(self, graphs: StepGraphs, iterations: int = ITERATIONS):
+    def __init__(self, graphs: StepGraphs, iterations: int):
         super().__init__()
         self.graphs, self.iterations = graphs, iterations
 
@@ -101,34 +99,21 @@ class StepModule(nn.Module):
 
     Parameters
     ----------
-    model
-        The discrete Lagrangian, copied; or its equations.
-    iterations
-        Bound on the Newton iterations, at least 2.
-    box, h_range
-        Add the output `outside`, uint8: 1 where the step starts or ends outside the box, and 2 where h is outside.
+    equations
+        Of the discrete Lagrangian.
     graphs
-        The functions of a step, where they are made already.
+        The functions of a step.
+    iterations
+        Bound on the Newton iterations.
     linearised
         Give the derivative as an output.
     """
 
-    def __init__(
-        self,
-        model: ContactLagrangian | Equations,
-        iterations: int = ITERATIONS,
-        box: Mapping[str, Sequence[float]] | None = None,
-        h_range: Sequence[float] | None = None,
-        graphs: StepGraphs | None = None,
-        linearised: bool = False,
-    ):
+    def __init__(self, equations: Equations, graphs: StepGraphs, iterations: int, *, linearised: bool = False):
         super().__init__()
-        if iterations < 2:
-            raise InputError(f"newton_iterations must be at least 2, got {iterations}; {ITERATIONS} suits most models")
-        equations = Equations.of(model)
-        self.graphs = StepGraphs(equations.model, box, h_range) if graphs is None else graphs
-        self.iterations, self.jacobian = iterations, equations.jacobian if linearised else None
-        if self.graphs.layout.iterates and not linearised:
+        self.graphs, self.iterations = graphs, iterations
+        self.jacobian = equations.jacobian if linearised else None
+        if graphs.layout.iterates and not linearised:
             self.slopes, self.first_order = equations.slopes, equations.first_order
 
     def forward(
@@ -178,9 +163,8 @@ class StepModule(nn.Module):
 class InitModule(nn.Module):
     """(q0, q1, s0, h[, u]) → (p1, s1) = (D2 L_d + F⁺, s0 + L_d): the state from two positions, differentiable."""
 
-    def __init__(self, model: ContactLagrangian | Equations):
+    def __init__(self, equations: Equations):
         super().__init__()
-        equations = Equations.of(model)
         self.first_order, self.field = equations.first_order, equations.field
 
     def forward(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, *u: Tensor) -> tuple[Tensor, Tensor]:

@@ -34,10 +34,8 @@ def programs_of(
     stacked = [x.expand(EXAMPLE_STEPS, *x.shape).clone() for x in more]
     iterations = entries["newton_iterations"]
     make = {
-        "model": lambda: _program(StepModule(equations, iterations, graphs=graphs), (q, p, s, *more)),
-        "linearise": lambda: _program(
-            StepModule(equations, iterations, graphs=graphs, linearised=True), (q, p, s, *more)
-        ),
+        "model": lambda: _program(StepModule(equations, graphs, iterations), (q, p, s, *more)),
+        "linearise": lambda: _program(StepModule(equations, graphs, iterations, linearised=True), (q, p, s, *more)),
         "rollout": lambda: _program(RolloutModule(graphs, iterations), (q, p, s, *stacked), stacked=3),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
     }

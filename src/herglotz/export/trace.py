@@ -14,7 +14,7 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from herglotz.errors import InputError
 
 aten = torch.ops.aten
-PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)
+PRIMES = (1021, 1031, 1033, 1039, 1049, 1051)  # larger than any layer: a multiple of one in a shape is the batch
 LARGEST = 4096  # multiples of the batch looked for in shapes: (rows · B, …)
 SAME = (  # what leaves its first argument as it is, wherever shape and dtype stay
     aten.alias.default, aten.to.device, aten.to.dtype, aten.to.dtype_layout, aten.expand.default, aten.reshape.default,

@@ -97,20 +97,14 @@ class Partials:
         """One-step conformal factor c = 1 + D3, shape (...)."""
         return 1.0 + self.D3
 
-    def map(self, change: Callable[..., Tensor], *others: Partials) -> Partials:
-        """`change` applied to every tensor, beside the same tensors of `others`."""
-        return _map(self, change, others)
+    def map(self, change: Callable[[Tensor], Tensor]) -> Partials:
+        """`change` applied to every tensor."""
+        return _map(self, change)
 
 
-def _map(record: Any, change: Callable[..., Tensor], others: tuple[Any, ...]) -> Any:
-    entries: dict[str, Any] = {}
-    for name, value in vars(record).items():
-        beside = tuple(getattr(other, name) for other in others)
-        if isinstance(value, Forces):
-            entries[name] = _map(value, change, beside)
-        elif value is not None:
-            entries[name] = change(value, *beside)
-    return type(record)(**entries)
+def _map(record: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    known = {name: value for name, value in vars(record).items() if value is not None}
+    return type(record)(**{k: _map(x, change) if isinstance(x, Forces) else change(x) for k, x in known.items()})
 
 
 def partials(

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics.legendre import mixed_hessian, momentum_minus
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 
@@ -51,26 +50,6 @@ class Regularity:
                 lines.append(f"{_where(index)}h = {float(self.h[tuple(index)])!r}: {statement}")
         return lines
 
-    def require(self, *names: str) -> None:
-        """Raise unless these conditions hold at every sample; the default is the conditions that a step needs.
-
-        Raises
-        ------
-        InputError
-            Naming the condition, the sample and the step.
-        """
-        names = names or ("finite", "c", "M", "pole")
-        lines = Regularity.report(self.only(*names))
-        if lines:
-            raise InputError(f"{'; '.join(lines[:3])}; take another h")
-
-    def only(self, *names: str) -> Regularity:
-        """The same with every other condition marked as undefined."""
-        margins = {
-            name: getattr(self, name) if name in names else torch.full_like(self.c, torch.nan) for name in CONDITIONS
-        }
-        return Regularity(**margins, h=self.h, tol=self.tol)
-
 
 def regularity(
     L_d: DiscreteLagrangian,
@@ -78,7 +57,6 @@ def regularity(
     q1: Tensor,  # (..., n)
     s0: Tensor,  # (...)
     h: Tensor | float,
-    tol: float | None = None,
 ) -> Regularity:
     """How far every condition is from failing at (q0, q1, s0).
 
@@ -92,8 +70,6 @@ def regularity(
         (...) action variable.
     h
         Time step, scalar or (...).
-    tol
-        A margin below this counts as lost; default 1000 machine epsilons.
 
     Returns
     -------
@@ -103,7 +79,7 @@ def regularity(
     Source: erratum E4; for H⁻ the same argument on the left Lagrangian of erratum E5.
     """
     eps = torch.finfo(q0.dtype).eps
-    tol = 1e3 * eps if tol is None else tol
+    tol = 1e3 * eps  # a margin below this counts as lost
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     with torch.no_grad():
         P = partials(L_d, q0, q1, s0, h, order=2)

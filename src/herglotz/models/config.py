@@ -10,6 +10,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import check_terms
+from herglotz.models.translations import check_translations
 from herglotz.settings import from_plain
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
@@ -31,6 +32,8 @@ class ModelConfig:
     names friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds what the rule lacks of the exact
     L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
     `terms` are further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
+    `translations` are symmetries of L_d, named by what moves together ("q1 + q2"): no part of it depends on where these
+    coordinates are, and what is left of the baseline is not learned (`herglotz.models.translations`).
     Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
     baseline is needed (trap 2).
     """
@@ -66,6 +69,7 @@ class ModelConfig:
     drag: tuple[str, ...] = ()
     order: int = 2
     terms: tuple[str, ...] = ()
+    translations: tuple[str, ...] = ()
 
     def __post_init__(self):
         self._check_sizes()
@@ -73,6 +77,7 @@ class ModelConfig:
         self._check_structure()
         self._check_features()
         check_terms(self)
+        check_translations(self)
 
     def _check_sizes(self) -> None:
         if self.level not in LEVELS:

@@ -24,6 +24,7 @@ from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
+from herglotz.models.translations import blind, unmoved
 
 
 @dataclass(frozen=True)
@@ -67,8 +68,8 @@ class ContactLagrangian(nn.Module):
         own, values = baseline_features(c.angles, c.stiffness, c.tilt) if c.order == 4 and not c.alike else ([], [])
         still, moving = sorted_features((*own, *(x for x in c.features if x not in own)), c.angles)
         known_still, known_moving = sorted_features(c.known, c.angles)
-        fixed, zero = c.alike or c.order == 4, (0.0,) * c.dof
-        stiffness, tilt = (zero, zero) if c.order == 4 else (c.stiffness, c.tilt)
+        fixed, zero = c.alike or c.order == 4 or bool(c.translations), (0.0,) * c.dof
+        stiffness, tilt = (zero, zero) if c.order == 4 else (unmoved(c, c.stiffness), unmoved(c, c.tilt))
         self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike, c.diagonal)
         self.potential = Potential(
             *sizes, stiffness, tilt, c.potential_width, c.potential_depth, make, act,
@@ -95,6 +96,11 @@ class ContactLagrangian(nn.Module):
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
         self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
         self.potential.more = tuple(self.named_terms)
+        if self.potential.network is not None:
+            self.potential.network.blind = blind(c, 0)
+        for term in (self.damping, self.correction):
+            if isinstance(term, AffineDamping | Correction) and term.network is not None:
+                term.network.blind = blind(c, c.dof)
 
     @property
     def named_terms(self) -> list[Term]:

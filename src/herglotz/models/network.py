@@ -60,10 +60,18 @@ class Network(nn.Module):
         if not zero:
             last = torch.randn(outputs or 1, width, generator=generator, dtype=torch.float64) / width**0.5
         self.weights.append(nn.Parameter(last))
+        self.blind: Tensor | None
+        self.register_buffer("blind", None, persistent=False)
+
+    @property
+    def layers(self) -> list[Tensor]:
+        """The weights; the first reads features through the projection `blind`, where there is one."""
+        first, *rest = self.weights
+        return [first if self.blind is None else first @ self.blind, *rest]
 
     def forward(self, x: Jet) -> Jet:
         """Apply the network to a jet of features (..., m); the result is a scalar jet, or (..., k)."""
-        hidden = list(self.weights)[:-1]
+        hidden = self.layers[:-1]
         for weight, bias in zip(hidden, self.biases, strict=True):
             x = _activate(x.linear(weight, bias), self.activation)
         last = self.weights[len(hidden)]

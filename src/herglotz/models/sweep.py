@@ -62,7 +62,7 @@ class Sweep:
         speed: tuple[float, ...] | None,
         factor: float | Tensor,
     ):
-        weights = list(network.weights)
+        weights = network.layers
         index, fold = _columns(angles, scale, speed, weights[0].dtype, weights[0].device)
         self.hidden = [weights[0] if index is None else weights[0][:, index] * fold, *weights[1:-1]]
         self.biases = list(network.biases)

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-from matplotlib.figure import Figure
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
@@ -34,7 +31,7 @@ FIGURES = {
     "training": plot_training,
     "plan": plot_plan,
 }
-# Of S^k, which a model with forces does not have: identities that hold to rounding (`herglotz verify --plots`).
+# Of S^k, which a model with forces does not have: identities that hold to rounding.
 IDENTITIES = {
     "momentum_vs_dS": plot_momentum_vs_generating_function,
     "hj_residual": plot_hamilton_jacobi_residual,
@@ -76,22 +73,20 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
     return files
 
 
-def save_figures(
-    run: Run, folder: PathLike, figures: Mapping[str, Callable[[Run], Figure]] = FIGURES, form: str = "png"
-) -> list[Path]:
+def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
     """Draw the figures of a run and write them as png, svg or pdf into `folder`, which is made if it is missing.
 
     Returns
     -------
     list of Path
-        In the order of `figures`, without the plan where the run holds none. All are drawn before one is written.
+        In the order of `FIGURES`, without the plan where the run holds none. All are drawn before one is written.
 
     Raises
     ------
     InputError
         If the folder cannot be made or written to.
     """
-    held = {name: plot for name, plot in figures.items() if name != "plan" or "plan" in run.metrics}
+    held = {name: plot for name, plot in FIGURES.items() if name != "plan" or "plan" in run.metrics}
     drawn = {f"{name}.{form}": plot(run) for name, plot in held.items()}
     folder = _made(folder)
     for name, figure in drawn.items():

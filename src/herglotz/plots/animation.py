@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from herglotz.training import Run
 
 FRAMES, PER_SECOND, COLOURS = 120, 20, 64  # a file of six seconds and below 1 MB
-MOST_PANELS = 3
+MOST_PANELS = 3  # more are too small to read
 Shape = tuple[np.ndarray, np.ndarray]  # x and y of the joints, (points,) each
 
 

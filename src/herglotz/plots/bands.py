@@ -13,7 +13,7 @@ from herglotz.plots.style import MODEL, MUTED, SHADE, UNSEEN, captions, new_figu
 if TYPE_CHECKING:
     from herglotz.training import Bands, Run
 
-MOST_PANELS = 4
+MOST_PANELS = 4  # more are too small to read
 
 
 def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
@@ -35,7 +35,7 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
             rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
             t, residual = data.t[rows].cpu(), (data.q - bands.q)[rows, i].cpu()
             model = width * bands.std[rows, i].cpu()
-            measured = (model.square() + (width * bands.sigma) ** 2).sqrt()
+            measured = (model.square() + (width * float(bands.sigma[i])) ** 2).sqrt()
             trained = run.train_lengths[b]
             if trained < len(t):
                 ax.axvspan(float(t[trained - 1] + t[trained]) / 2, float(t[-1]), color=SHADE, lw=0, zorder=0)

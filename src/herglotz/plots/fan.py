@@ -50,11 +50,9 @@ def regular(S: GeneratingFunction) -> Tensor:
 
 
 def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
-    """Return `size` solutions that start all over the data (a run), the typical box (a model), or drawn states."""
-    if isinstance(source, ContactLagrangian):
-        return _box_fan(source, size, h)
+    """Return `size` solutions that start all over the data (a run), or from drawn states."""
     if not _is_run(source):
-        known = subject(source, h, size, 0)
+        known = subject(source, _typical_step(source) if h is None else h, size, 0)
         if known.L_d is None:
             raise InputError(f"{known.name} holds no L_d; the figures of S^k need one: give the run, or the L_d")
         return Fan(known.L_d, known.states, known.h)
@@ -107,13 +105,8 @@ def units(run: Run) -> tuple[str, str]:
     return momentum, action
 
 
-def _box_fan(model: ContactLagrangian, size: int, h: float | None) -> Fan:
-    scale = torch.tensor(model.config.scale, dtype=torch.float64)
-    speed = torch.tensor(model.config.speed, dtype=torch.float64)
-    dtype = next(model.parameters()).dtype
-    generator = torch.Generator().manual_seed(0)
-    shape = (size, len(scale))
-    q = (scale * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)).to(dtype)
-    p = (speed * (2 * torch.rand(shape, generator=generator, dtype=torch.float64) - 1)).to(dtype)
-    step = 0.1 * float((scale / speed).min()) if h is None else h
-    return Fan(model, State(q, p, torch.zeros_like(q[:, 0])), step)
+def _typical_step(source: Any) -> float | None:
+    """A tenth of the typical time of a model; of anything else its own step."""
+    if not isinstance(source, ContactLagrangian):
+        return None
+    return 0.1 * min(a / b for a, b in zip(source.config.scale, source.config.speed, strict=True))

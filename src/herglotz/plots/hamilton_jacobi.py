@@ -11,13 +11,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.plots import style
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
 from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
 
 STEPS, SIZE = 8, 31
-NULL_STEPS = (1, 4, 8)
+NULL_STEPS = (1, 4, 8)  # first, middle and last of STEPS
 DISTANCES = np.logspace(-5, -0.5, 10)  # of p̂0 from the fan's solution, in widths of the fan
 ANCHOR = 7  # index of the distance through which the reference line of slope 2 is drawn
 BELOW = 1 / 200  # rounding errors at which a difference of exactly 0 is drawn
@@ -32,7 +33,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     Parameters
     ----------
     source
-        A run, a model alone (then from states drawn at random from its typical box), or what `verify` takes: a scene,
+        A run, a model alone (then from states drawn at random), or what `verify` takes: a scene,
         an L_d with h, a pair (L_d, states) with h.
     h
         Step; left out, the run's typical model step (or a tenth of the model's typical time).
@@ -94,13 +95,9 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, np.maximum(table, floor))
-        _draw_null(
-            right,
-            distance,
-            off_flow,
-            max(worst, floor),
-            with_unit(r"distance of $q_{k+1}$ from the flow", _length(source)),
-        )
+        unit = style.one_unit(source.data.units if hasattr(source, "data") else ("",))
+        far = with_unit(r"distance of $q_{k+1}$ from the flow", unit)
+        _draw_null(right, distance, off_flow, max(worst, floor), far)
     return figure
 
 
@@ -189,8 +186,3 @@ def _without(count: int) -> str:
 
 def _caustics(table: np.ndarray) -> str:
     return ", grey: at a caustic" if not np.isfinite(table).all() else ""
-
-
-def _length(source: Any) -> str:
-    units = source.data.units if hasattr(source, "data") else ("", "")
-    return units[0] if len(set(units)) == 1 else ""

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import torch
@@ -12,12 +13,27 @@ from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
-from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, number, styled, with_unit
+from herglotz.plots.style import (
+    INK,
+    MODEL,
+    MUTED,
+    SHADE,
+    UNSEEN,
+    captions,
+    label,
+    new_figure,
+    number,
+    one_unit,
+    styled,
+    with_unit,
+)
 
 if TYPE_CHECKING:
     from herglotz.training import Run
+    from herglotz.training.predict import Prediction
 
 MOST_PANELS, DATA = 4, "#B5B5B5"
+# Shares that have a word.
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 
@@ -52,24 +68,58 @@ def plot_trajectory(run: Run, trajectory: int | None = None) -> Figure:
     InputError
         If there is no such trajectory.
     """
-    data = run.data
-    if trajectory is not None and not 0 <= trajectory < len(data):
-        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(data) - 1}")
+    if trajectory is not None and not 0 <= trajectory < len(run.data):
+        raise InputError(f"there is no trajectory {trajectory}; choose one from 0 to {len(run.data) - 1}")
+    motion = _Motion(run.data, run.prediction, run.train_lengths, ("model, trained here", "model, free run"))
+    return _drawn(motion, trajectory_title(run), trajectory)
+
+
+def plot_prediction(found: Prediction) -> Figure:
+    """Draw a recording, the free run of a model that has not seen it, and their difference; the warm-up is not shaded.
+
+    A single trajectory shows up to four coordinates; several show their first, four of them spread over the set.
+    """
+    counts = (found.warmup,) * len(found.data)
+    return _drawn(
+        _Motion(found.data, found.states.q, counts, ("state estimated", "free run")), _prediction_title(found)
+    )
+
+
+class _Motion(NamedTuple):
+    """Data beside a model whose first samples of every trajectory have seen them."""
+
+    data: Trajectories
+    model: torch.Tensor  # (N, n) positions
+    counts: Sequence[int]  # samples that the model has seen, of every trajectory
+    words: tuple[str, str]  # for the model there, and beyond
+
+
+def _drawn(motion: _Motion, title: str, trajectory: int | None = None) -> Figure:
+    data = motion.data
     cells = _cells(data, trajectory)
     with styled():
-        figure = new_figure(*_size(len(cells), 3.9), trajectory_title(run))
+        figure = new_figure(*_size(len(cells), 3.9), title)
         for (b, i), ax in zip(cells, _axes(figure, len(cells), 2), strict=True):
-            _draw_motion(run, b, i, ax[0], ax[1], labelled=(b, i) == cells[0])
+            _draw_motion(motion, b, i, ax[0], ax[1], labelled=(b, i) == cells[0])
             ax[1].set_xlabel(with_unit("time", data.time_unit))
             if len(data) > 1:
                 ax[0].set_title(f"trajectory {b}")
     return figure
 
 
+def _prediction_title(found: Prediction) -> str:
+    each = found.rms_per_coordinate
+    if each is None:
+        return "The free run fails at its first step"
+    names = zip(found.data.names, each, found.data.units, strict=True)
+    text = "Free run: RMS " + ", ".join(f"{name} {number(rms, unit)}" for name, rms, unit in names)
+    lost = found.failed_steps
+    return text if lost == 0 else f"{text}; {100 * lost:.3g} % not reached"
+
+
 def trajectory_title(run: Run) -> str:
     """Return the message of the figure: the distance of the free run from data that the fit has not seen."""
-    data = run.data
-    unit = data.units[0] if len(set(data.units)) == 1 else ""
+    data, unit = run.data, one_unit(run.data.units)
     error = (run.prediction - data.q).detach()
     unseen = ~trained_mask(run)
     lost = ~torch.isfinite(error).all(-1)
@@ -94,11 +144,10 @@ def trained_mask(run: Run) -> torch.Tensor:
     return mask
 
 
-def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
-    data, unit = run.data, run.data.units[i]
+def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
+    data, unit, count = motion.data, motion.data.units[i], motion.counts[b]
     t, q = _series(data, data.q, b, i)
-    _, model = _series(data, run.prediction, b, i)
-    count = run.train_lengths[b]
+    _, model = _series(data, motion.model, b, i)
     boundary = t[0] if count == 0 else t[-1] if count >= len(t) else 0.5 * (t[count - 1] + t[count])
     if count < len(t):
         for ax in (top, bottom):
@@ -119,33 +168,24 @@ def _draw_motion(run: Run, b: int, i: int, top: Axes, bottom: Axes, *, labelled:
     bottom.set_ylabel(with_unit("residual", unit))
     for ax in (top, bottom):
         ax.set_xlim(t[0], t[-1])
-    _draw_labels(run, top, bottom, (t, residual), count, labelled)
-
-
-def _draw_labels(
-    run: Run, top: Axes, bottom: Axes, series: tuple[np.ndarray, np.ndarray], count: int, labelled: bool
-) -> None:
-    """Label data, fit and free run once a figure, and write the RMS of each part into every panel."""
-    t, residual = series
-    unit = run.data.units[0] if len(set(run.data.units)) == 1 else ""
-    split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
     if labelled:
-        trained = [("━ model, trained here", MODEL)] if count else []
-        captions(top, [("● data", "#777777"), *trained])
+        captions(top, [("● data", "#777777"), *([(f"━ {motion.words[0]}", MODEL)] if count else [])])
     if labelled and count < len(t):
-        captions(top, [("━ model, free run", UNSEEN)], "upper right")
+        captions(top, [(f"━ {motion.words[1]}", UNSEEN)], "upper right")
+    _write_rms(bottom, t, residual, count, one_unit(data.units))
+
+
+def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, unit: str) -> None:
+    """Write the RMS of each part above its residuals."""
+    split = 0.0 if count == 0 else (t[min(count, len(t) - 1)] - t[0]) / (t[-1] - t[0])
     reach = float(np.nanmax(np.abs(residual))) if np.isfinite(residual).any() else 0.0
     bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
         if len(part):
             text = f"RMS {number(math.sqrt(float(np.mean(part**2))), unit)}"
-            place = bottom.get_xaxis_transform()
-            x = t[0] + where * (t[-1] - t[0])
-            bottom.annotate(
-                text, (x, 1.0), xycoords=place, xytext=(5, -2), textcoords="offset points", color=color, va="top",
-                fontsize=8.5, bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 1.0},
-            )  # fmt: skip
+            place = {"xycoords": bottom.get_xaxis_transform(), "xytext": (5, -2), "va": "top"}
+            label(bottom, t[0] + where * (t[-1] - t[0]), 1.0, text, color, **place)
 
 
 def _cells(data: Trajectories, trajectory: int | None) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, styled
+from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, one_unit, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training.selection import Selection
@@ -18,8 +18,6 @@ def plot_selection(selection: Selection) -> Figure:
     candidates = selection.candidates
     finite = [x for c in candidates for x in c.of_seeds.tolist() if math.isfinite(x)]
     ceiling = 3 * max(finite)
-    data = selection.run.data
-    unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
     with styled():
         figure = new_figure(7.2, 4.2, f"The {selection.chosen.level} level is the simplest that is not beaten")
         ax = figure.subplots()
@@ -37,6 +35,6 @@ def plot_selection(selection: Selection) -> Figure:
         ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade, so that a few per cent look small
         names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
         ax.set_xticks(range(len(names)), names)
-        ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=f"held-out RMS{f' ({unit})' if unit else ''}")
+        ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=with_unit("held-out RMS", one_unit(selection.run.data.units)))
         ax.grid(axis="y", color="#EEEEEE", lw=0.8)
     return figure

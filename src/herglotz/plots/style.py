@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 
-DPI = 150
+DPI = 150  # sharp on a screen at twice the size
 # Okabe & Ito (2008): distinguishable with every common form of colour blindness, and in grey.
 INK, MODEL, UNSEEN, ACCENT, MUTED = "#222222", "#0072B2", "#D55E00", "#009E73", "#8A8A8A"
 SERIES = (MODEL, UNSEEN, ACCENT, "#CC79A7", "#E69F00", "#56B4E9")
@@ -110,6 +110,11 @@ def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left"
 def with_unit(name: str, unit: str) -> str:
     """Return an axis label: `theta (rad)`, or the name alone for a number without unit."""
     return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+def one_unit(units: Sequence[str]) -> str:
+    """Return the unit that all have, or none."""
+    return units[0] if len(set(units)) == 1 else ""
 
 
 def number(value: float, unit: str = "") -> str:

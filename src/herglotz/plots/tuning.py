@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, styled
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, one_unit, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.tune.result import Candidate, Tuning
@@ -30,8 +30,6 @@ def plot_tuning(tuning: Tuning) -> Figure:
     """Draw the error bound against the cost: filled marks: distilled models, half: kicks, circle: the choice."""
     good = [c for c in tuning.candidates if math.isfinite(c.bound)]
     share, unit = f"{100 * tuning.config.quantile:g} % of starts", tuning.run.data.time_unit
-    units = tuning.run.data.units
-    q_unit = f" ({units[0]})" if len(set(units)) == 1 and units[0] != "1" else ""
     chosen = tuning.chosen
     before, what = (tuning.own, "the run as it is") if tuning.own_in_c is None else (tuning.own_in_c, "the same in C")
     with styled():
@@ -60,7 +58,7 @@ def plot_tuning(tuning: Tuning) -> Figure:
             ax.axhline(known, color=MUTED, lw=0.9, ls=":")
             label(ax, max(c.us for c in good), known, "RMS of the model against its data", MUTED, ha="right")
         ax.set(xscale="log", yscale="log", xlabel=f"cost (µs per {'unit of time' if unit == '1' else unit})")
-        ax.set_ylabel(f"error that {share} keep{q_unit}")
+        ax.set_ylabel(with_unit(f"error that {share} keep", one_unit(tuning.run.data.units)))
         ax.grid(color="#EEEEEE", lw=0.8)
         ax.legend(fontsize=8, loc="best")
     return figure

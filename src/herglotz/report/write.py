@@ -13,7 +13,7 @@ from herglotz.data import Trajectories
 from herglotz.data.files import write_atomically
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
-from herglotz.plots.prediction import plot_prediction
+from herglotz.plots.motion import plot_prediction
 from herglotz.report.html import as_html
 from herglotz.report.markdown import as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table

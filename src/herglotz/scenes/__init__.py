@@ -8,10 +8,11 @@ from herglotz.scenes.driven_duffing import driven_duffing
 from herglotz.scenes.driven_pendulum import driven_pendulum
 from herglotz.scenes.duffing import duffing
 from herglotz.scenes.exact import NumericallyExact, Reason, exact_discrete_lagrangian
+from herglotz.scenes.forced_oscillator import ExactForcedOscillator
 from herglotz.scenes.galerkin import GalerkinLobatto, lobatto4, lobatto6
 from herglotz.scenes.kepler import kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag, linear_drag
-from herglotz.scenes.motion import Motion, hamiltonian_motion, herglotz_motion, lagrangian_motion
+from herglotz.scenes.motion import Motion, herglotz_motion, lagrangian_motion
 from herglotz.scenes.nonlinear_action import nonlinear_action
 from herglotz.scenes.oscillator import ExactOscillator, damped_oscillator
 from herglotz.scenes.parachute import ExactParachute, parachute
@@ -43,6 +44,7 @@ from herglotz.scenes.van_der_pol import van_der_pol
 __all__ = [
     "ORDERS",
     "DrivenRule",
+    "ExactForcedOscillator",
     "ExactLinearDrag",
     "ExactOscillator",
     "ExactParachute",
@@ -65,7 +67,6 @@ __all__ = [
     "driven_scene",
     "duffing",
     "exact_discrete_lagrangian",
-    "hamiltonian_motion",
     "herglotz_motion",
     "kepler",
     "lagrangian_motion",

@@ -53,7 +53,7 @@ class Collocation:
         s = s + self.h[:, None] * (self.motion.balance(q, y, s)[3] @ a.mT)
         return torch.cat([q, y, s[..., None]], -1)
 
-    def solve(self, guess: Tensor | None, iterations: int) -> tuple[Tensor, Tensor]:
+    def nodes(self, guess: Tensor | None, iterations: int) -> tuple[Tensor, Tensor]:
         """The nodes, and where Newton's method has converged, (B,)."""
         x = self.start() if guess is None else guess
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from torch import Tensor
-
 from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.duffing import hardening
 from herglotz.scenes.scene import Scene, require_positive
 
 
@@ -33,13 +32,8 @@ def driven_duffing(
     """
     require_positive("driven_duffing", cubic_stiffness_beta=beta)
 
-    def potential(q: Tensor) -> Tensor:
-        x2 = q[..., 0] ** 2
-        return x2 * (0.5 * k + 0.25 * beta * x2)
-
     return driven_scene(
-        potential,
-        lambda q: q * (k + beta * q * q),
+        *hardening(k, beta),
         gamma,
         amplitude,
         frequency,

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor
 
 from herglotz.scenes.driven import driven_scene
+from herglotz.scenes.pendulum import lifted
 from herglotz.scenes.scene import Scene
 
 
@@ -21,12 +21,8 @@ def driven_pendulum(gamma: float = 0.2, amplitude: float = 0.4, frequency: float
     frequency
         Angular frequency ν of the torque, rad per unit of time.
     """
-
-    def potential(q: Tensor) -> Tensor:
-        return 2.0 * torch.sin(0.5 * q[..., 0]) ** 2  # 1 − cos q without its cancellation
-
     return driven_scene(
-        potential,
+        lifted,
         torch.sin,
         gamma,
         amplitude,

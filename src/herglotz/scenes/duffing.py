@@ -5,11 +5,23 @@ L = v²/2 − kx²/2 − βx⁴/4 − γs and H = p²/2 + kx²/2 + βx⁴/4 + γ
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.scenes.natural import natural_scene
 from herglotz.scenes.scene import Scene
+
+
+def hardening(k: float, beta: float) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
+    """V = kx²/2 + βx⁴/4 and V'."""
+
+    def potential(q: Tensor) -> Tensor:
+        x2 = q[..., 0] ** 2
+        return x2 * (0.5 * k + 0.25 * beta * x2)
+
+    return potential, lambda q: q * (k + beta * q * q)
 
 
 def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
@@ -34,13 +46,8 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
     if not beta > 0:
         raise InputError(f"duffing: cubic stiffness beta must be > 0, got {beta}; damped_oscillator is linear")
 
-    def potential(q: Tensor) -> Tensor:
-        x2 = q[..., 0] ** 2
-        return x2 * (0.5 * k + 0.25 * beta * x2)
-
     return natural_scene(
-        potential,
-        lambda q: q * (k + beta * q * q),
+        *hardening(k, beta),
         gamma,
         name="duffing",
         description="oscillator with a hardening spring, ẍ = −γẋ − kx − βx³; reference flow to about 1e-13",

@@ -104,10 +104,10 @@ class NumericallyExact:
             q0, q1 = (x.double().expand(*shape, n).reshape(-1, n) for x in (q0, q1))
             s0, h = (x.double().expand(shape).reshape(-1) for x in (s0, as_step(h, q0)))
             left, guess = torch.arange(len(s0), device=q0.device), None
-            solved: list[tuple[Tensor, Partials, Tensor]] = []
+            solved: list[tuple[Tensor, ...]] = []
             for count in NODES:
                 problem = Collocation(self.motion, count, q0[left], q1[left], s0[left], h[left])
-                x, converged = problem.solve(guess, self.max_iterations)
+                x, converged = problem.nodes(guess, self.max_iterations)
                 finer = Collocation(self.motion, 2 * count - 1, q0[left], q1[left], s0[left], h[left])
                 guess = lobatto(count)[2].to(x) @ x
                 if not bool(converged.all()):
@@ -118,14 +118,13 @@ class NumericallyExact:
                 reason = torch.where(error <= self.tolerance, int(Reason.NONE), int(Reason.UNRESOLVED))
                 reason = torch.where(end.opened, reason, int(Reason.CONJUGATE))
                 reason = torch.where(converged, reason, int(Reason.NOT_CONVERGED)).to(torch.uint8)
-                solved.append((left[done], _second(end).map(lambda x, d=done: x[d]), reason[done]))
+                solved.append((left[done], reason[done], *(x[done] for x in end)))
                 left, guess = left[~done], guess[~done]
                 if not len(left):
                     break
-            place = torch.cat([rows for rows, _, _ in solved]).argsort()
-            reason = torch.cat([reason for _, _, reason in solved])[place].reshape(shape)
-            found = [P for _, P, _ in solved]
-            P = found[0].map(lambda *x: torch.cat(x)[place].reshape((*shape, *x[0].shape[1:])), *found[1:])
+            rows, *found = (torch.cat(x) for x in zip(*solved, strict=True))
+            reason, *ends = (x[rows.argsort()].reshape(shape + x.shape[1:]) for x in found)
+            P = _second(End(*ends))
             nan = torch.where(reason == Reason.NONE, 0.0, torch.nan)
             P = P.map(lambda x: x + nan.reshape(shape + (1,) * (x.ndim - len(shape))))
         return Shot(P, -P.D1 / P.c[..., None], reason)

@@ -19,7 +19,7 @@ from herglotz.scenes.implicit import MAX_NEWTON, fixed_point
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import Lagrangian
 
-ROOT5 = 5.0**0.5
+ROOT5 = 5.0**0.5  # of the inner nodes of order 6
 # Gauss–Lobatto nodes on [0, 1]: with k of them the quadrature, and here the integrator, has order 2k − 2.
 NODES = {4: (0.0, 0.5, 1.0), 6: (0.0, 0.5 - 0.1 * ROOT5, 0.5 + 0.1 * ROOT5, 1.0)}
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from herglotz.mechanics.newton import find_root, solve
 from herglotz.theory.continuous import jacobian
 
-MAX_NEWTON = 30
+MAX_NEWTON = 30  # ends a scalar equation without a solution
 # With the Jacobian held fixed each Newton step inside the graph makes derivatives exact one order further.
 EXACT_DERIVATIVES = 3
 

@@ -1,4 +1,4 @@
-"""A contact system as a vector field to integrate, from explicit derivatives of L, from any H, or from any L."""
+"""A contact system as a vector field to integrate, from explicit derivatives of L, or from any L."""
 
 from __future__ import annotations
 
@@ -52,22 +52,16 @@ def herglotz_motion(
         L_s = rate(q, v, s)
         return v, force(q, v, s) + L_s[..., None] * p, lagrangian(q, v, s), L_s
 
-    return _in_momenta(field, momentum)
+    def balance(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        q_dot, p_dot, s_dot, rate = field(q, p, s)
+        return q_dot, p, p_dot, s_dot, rate
+
+    return Motion(field, momentum, balance)
 
 
 def constant_rate(L_s: float) -> StateFunction:
     """Return the rate L_s of a contact term linear in s, L = … + L_s s."""
     return lambda q, v, s: torch.full_like(s, L_s)  # noqa: ARG005
-
-
-def hamiltonian_motion(hamiltonian: StateFunction, momentum: StateFunction) -> Motion:
-    """Return the field of H(q, p, s) by autograd: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H, L_s = −H_s."""
-
-    def field(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        H = derivatives(hamiltonian, q, p, s)
-        return H.D2, -(H.D1 + p * H.D3[..., None]), (p * H.D2).sum(-1) - H.L, -H.D3
-
-    return _in_momenta(field, momentum)
 
 
 def lagrangian_motion(lagrangian: StateFunction) -> Motion:
@@ -82,13 +76,3 @@ def lagrangian_motion(lagrangian: StateFunction) -> Motion:
         return v, L.D2, L.D1 + L.D3[..., None] * L.D2, L.L, L.D3
 
     return Motion(field, lambda q, v, s: v, balance)  # noqa: ARG005
-
-
-def _in_momenta(field: Field, momentum: StateFunction) -> Motion:
-    """Of a field in (q, p, s)."""
-
-    def balance(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        q_dot, p_dot, s_dot, rate = field(q, p, s)
-        return q_dot, p, p_dot, s_dot, rate
-
-    return Motion(field, momentum, balance)

@@ -12,6 +12,11 @@ from herglotz.scenes.natural import natural_scene
 from herglotz.scenes.scene import Scene
 
 
+def lifted(q: Tensor) -> Tensor:
+    """V = 1 − cos q, without its cancellation."""
+    return 2.0 * torch.sin(0.5 * q[..., 0]) ** 2
+
+
 def damped_pendulum(gamma: float = 0.2) -> Scene:
     """The damped pendulum θ̈ = −sin θ − γθ̇.
 
@@ -20,12 +25,8 @@ def damped_pendulum(gamma: float = 0.2) -> Scene:
     gamma
         Damping rate γ, per unit of time √(ℓ/g).
     """
-
-    def potential(q: Tensor) -> Tensor:
-        return 2.0 * torch.sin(0.5 * q[..., 0]) ** 2  # 1 − cos q, without its cancellation
-
     return natural_scene(
-        potential,
+        lifted,
         torch.sin,
         gamma,
         name="damped_pendulum",

@@ -20,104 +20,83 @@ from herglotz.theory.continuous import Lagrangian
 Rule = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
-def left(L: Lagrangian) -> Rule:
+def _rule(formula: Callable[..., Tensor]) -> Callable[[Lagrangian], Rule]:
+    """Make of a formula of (L, q0, q1, v, s0, h) the rule L ↦ L_d."""
+
+    def rule(L: Lagrangian) -> Rule:
+        def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+            h = as_step(h, q0)
+            return formula(L, q0, q1, (q1 - q0) / h[..., None], s0, h)
+
+        return L_d
+
+    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
+        setattr(rule, name, getattr(formula, name))
+    return rule
+
+
+@_rule
+def left(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:  # noqa: ARG001
     """L_d = h L(q0, v, s0): order 1, c = 1 + h L_s, which vanishes at h = 1/γ for the linear damping L_s = −γ."""
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        return h * L(q0, _velocity(q0, q1, h), s0)
-
-    return L_d
+    return h * L(q0, v, s0)
 
 
-def right(L: Lagrangian) -> Rule:
+@_rule
+def right(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q1, v, s1) with s1 = s0 + L_d, implicit in one scalar: order 1, the adjoint of `left`.
 
     c = 1/(1 − hL_s) for linear damping.
     """
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        v = _velocity(q0, q1, h)
-        return _implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
-
-    return L_d
+    return _implicit(lambda x: h * L(q1, v, s0 + x), q0, q1, s0, h)
 
 
-def midpoint(L: Lagrangian) -> Rule:
+@_rule
+def midpoint(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q̄, v, s0 + L_d/2), implicit in one scalar: order 2, c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
 
     Its own adjoint. Where Newton's method for the scalar does not converge the value is NaN.
     """
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        q, v = 0.5 * (q0 + q1), _velocity(q0, q1, h)
-        return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
-
-    return L_d
+    q = 0.5 * (q0 + q1)
+    return _implicit(lambda x: h * L(q, v, s0 + 0.5 * x), q0, q1, s0, h)
 
 
-def midpoint_heun(L: Lagrangian) -> Rule:
+@_rule
+def midpoint_heun(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q̄, v, s0 + (h/2) L(q̄, v, s0)): order 2, explicit."""
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        q, v = 0.5 * (q0 + q1), _velocity(q0, q1, h)
-        return h * L(q, v, s0 + 0.5 * h * L(q, v, s0))
-
-    return L_d
+    q = 0.5 * (q0 + q1)
+    return h * L(q, v, s0 + 0.5 * h * L(q, v, s0))
 
 
-def midpoint_plain(L: Lagrangian) -> Rule:
+@_rule
+def midpoint_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = h L(q̄, v, s0): order 1 with damping, 2 without. The trap, kept to be measured; use `midpoint_heun`."""
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        return h * L(0.5 * (q0 + q1), _velocity(q0, q1, h), s0)
-
-    return L_d
+    return h * L(0.5 * (q0 + q1), v, s0)
 
 
-def trapezoid(L: Lagrangian) -> Rule:
+@_rule
+def trapezoid(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0 + L_d)], implicit in one scalar: order 2, its own adjoint.
 
     c = (1 + hL_s/2)/(1 − hL_s/2) for linear damping.
     """
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        v = _velocity(q0, q1, h)
-        start = L(q0, v, s0)
-        return _implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
-
-    return L_d
+    start = L(q0, v, s0)
+    return _implicit(lambda x: 0.5 * h * (start + L(q1, v, s0 + x)), q0, q1, s0, h)
 
 
-def trapezoid_heun(L: Lagrangian) -> Rule:
+@_rule
+def trapezoid_heun(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0 + h L(q0, v, s0))]: order 2, explicit.
 
     The second stage has the Euler value of s1; its O(h²) error enters L_d at O(h³), which order 2 allows.
     """
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        v = _velocity(q0, q1, h)
-        start = L(q0, v, s0)
-        return 0.5 * h * (start + L(q1, v, s0 + h * start))
-
-    return L_d
+    start = L(q0, v, s0)
+    return 0.5 * h * (start + L(q1, v, s0 + h * start))
 
 
-def trapezoid_plain(L: Lagrangian) -> Rule:
+@_rule
+def trapezoid_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor, h: Tensor) -> Tensor:
     """L_d = (h/2) [L(q0, v, s0) + L(q1, v, s0)]: order 1 with damping, 2 without. The trap, kept to be measured."""
-
-    def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        v = _velocity(q0, q1, h)
-        return 0.5 * h * (L(q0, v, s0) + L(q1, v, s0))
-
-    return L_d
+    return 0.5 * h * (L(q0, v, s0) + L(q1, v, s0))
 
 
 def adjoint(L_d: DiscreteLagrangian) -> Rule:
@@ -180,10 +159,6 @@ ORDERS = {
 def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:
     """Every rule applied to L, by name."""
     return {name: rule(L) for name, rule in RULES.items()}
-
-
-def _velocity(q0: Tensor, q1: Tensor, h: Tensor) -> Tensor:
-    return (q1 - q0) / h[..., None]
 
 
 def _implicit(action: Callable[[Tensor], Tensor], q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:

@@ -21,8 +21,9 @@ from herglotz.scenes.scene import Scene, State, Step, require_positive
 
 # L_d has no set-valued force: below this share of the default speed range its dry friction is smoothed, as tanh.
 SMOOTHED = 0.01
-# Gauss–Legendre nodes and weights on [−1, 1] for the action of a piece: exact to 1e-14 of it for γh up to 4.
+# Gauss–Legendre nodes on [−1, 1] for the action of a piece: exact to 1e-14 of it for γh up to 4.
 NODES = (0.9739065285171717, 0.8650633666889845, 0.6794095682990244, 0.4333953941292472, 0.1488743389816312)
+# The weights, in the order of the nodes.
 WEIGHTS = (0.0666713443086881, 0.1494513491505806, 0.2190863625159820, 0.2692667193099964, 0.2955242247147529)
 
 

@@ -37,7 +37,7 @@ class Substeps(Protocol):
 
 
 Method = DiscreteLagrangian | Substeps
-MAX_ITERATIONS = 30
+MAX_ITERATIONS = 30  # of a substep, as of `Stepper`
 ADJOINT = 2 / 3  # power of eps that a step forth and back may miss: Newton's rounding leaves 1e-15 to 1e-13
 
 

@@ -13,9 +13,10 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.newton import select
 from herglotz.stepping.state import Crossings, State, Status, Step
 
-MAX_TRIALS = 80
+MAX_TRIALS = 80  # bisection alone, every eighth trial, halves the bracket ten times
 
 
 @dataclass(frozen=True)
@@ -164,11 +165,6 @@ def _stopped(status: Tensor) -> Tensor:
 
 def _select(mask: Tensor, a: Step, b: Step) -> Step:
     """The step `a` in the samples of `mask`, `b` in the others."""
-    column = mask[..., None]
-    state = State(
-        torch.where(column, a.state.q, b.state.q),
-        torch.where(column, a.state.p, b.state.p),
-        torch.where(mask, a.state.s, b.state.s),
-    )
-    c, residual = torch.where(mask, a.c, b.c), torch.where(mask, a.residual, b.residual)
-    return Step(state, c, torch.where(mask, a.status, b.status), residual, max(a.iterations, b.iterations))
+    state = State(*select(mask, tuple(a.state), tuple(b.state)))
+    c, status, residual = select(mask, (a.c, a.status, a.residual), (b.c, b.status, b.residual))
+    return Step(state, c, status, residual, max(a.iterations, b.iterations))

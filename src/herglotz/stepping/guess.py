@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 LENGTH = 6  # positions used: against a cubic, a third fewer evaluations at small h and no more at large h
+# Weights of polynomials through equally spaced positions: binomials with alternating signs.
 EQUAL = {
     1: (1.0,),
     2: (-1.0, 2.0),

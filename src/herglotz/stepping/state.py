@@ -10,7 +10,6 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.newton import Root
 from herglotz.mechanics.partials import check_arguments
 
@@ -100,7 +99,7 @@ class Rollout:
 
 def check_state(
     state: State,
-    L_d: DiscreteLagrangian | None = None,
+    L_d: Any = None,
     names: tuple[str, str, str] = ("q", "p", "s"),
     finite: bool = False,
 ) -> State:
@@ -109,8 +108,8 @@ def check_state(
     Raises
     ------
     InputError
-        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any; with `finite`, if a
-        number is not.
+        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any (an exported file: its
+        `dof` and `dtype`); with `finite`, if a number is not.
     """
     q, p, s = state
     check_arguments(q, p, s, names)
@@ -123,10 +122,10 @@ def check_state(
         raise InputError(f"{', '.join(names)} need shapes (..., n), (..., n), (...); got {shapes}")
     if p.dtype != q.dtype or s.dtype != q.dtype:
         raise InputError(f"q, p and s need one dtype, got {q.dtype}, {p.dtype}, {s.dtype}")
-    parameter = next(L_d.parameters(), None) if isinstance(L_d, torch.nn.Module) else None
-    if parameter is not None and parameter.dtype != q.dtype:
-        raise InputError(f"the state is {q.dtype} and the model {parameter.dtype}; convert one with .to(dtype)")
-    n = getattr(getattr(L_d, "config", None), "dof", None)
+    dtype = getattr(next(L_d.parameters(), None) if isinstance(L_d, torch.nn.Module) else L_d, "dtype", None)
+    if dtype is not None and dtype != q.dtype:
+        raise InputError(f"{names[0]} must be {dtype}, as the model is, got {q.dtype}; convert one with .to(dtype)")
+    n = getattr(getattr(L_d, "config", L_d), "dof", None)
     if n is not None and q.shape[-1] != n:
         raise InputError(f"{names[0]} has {q.shape[-1]} coordinates, the model {n}; its shape must be (..., {n})")
     for name, x in zip(names, state, strict=True):
@@ -159,6 +158,8 @@ def check_h(h: Tensor | float, like: Tensor) -> Tensor:
         If it is not positive and finite.
     """
     h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
+    if not h.numel():
+        raise InputError("h holds no step; give at least one")
     if not bool(((h > 0) & (h < torch.inf)).all()):
         wrong = float(h[~((h > 0) & (h < torch.inf))].flatten()[0])
         raise InputError(f"h must be {'finite' if wrong > 0 else '> 0'}, got {wrong:g}")

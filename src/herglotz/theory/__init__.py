@@ -9,6 +9,7 @@ from herglotz.theory.continuous_equation import ContinuousEquation, FractionalSt
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
 from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
 from herglotz.theory.evolution import EvolutionStepper
+from herglotz.theory.explicit_time import TimeDependent, energies, time_defect
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
 from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
@@ -57,7 +58,7 @@ from herglotz.theory.jacobi import (
     sharp,
     sharp_bivector,
 )
-from herglotz.theory.left import LeftLagrangian, left_momenta
+from herglotz.theory.left import LeftLagrangian
 from herglotz.theory.legendre_dual import fiber_derivative, fiber_inverse, legendre_dual
 from herglotz.theory.legendrian import (
     LegendrianDefect,
@@ -75,8 +76,9 @@ from herglotz.theory.noether import (
     noether_defect,
 )
 from herglotz.theory.rigid_body import BodyRollout, BodyState, RigidBodyStepper
-from herglotz.theory.rotations import cayley, exp_so3, hat, inverse_cayley, log_so3, vee
+from herglotz.theory.rotations import cayley, hat
 from herglotz.theory.splitting import ContactSplitting, linear_damping
+from herglotz.theory.symmetries import Symmetries, symmetries
 from herglotz.theory.tulczyjew import (
     TulczyjewTriple,
     left_leg,
@@ -110,7 +112,9 @@ __all__ = [
     "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
+    "Symmetries",
     "TheoremCheck",
+    "TimeDependent",
     "TulczyjewTriple",
     "bivector",
     "boundary_value",
@@ -128,9 +132,9 @@ __all__ = [
     "discrete_section_residuals",
     "dissipation_defect",
     "divergence",
+    "energies",
     "energy_on_section",
     "evolution_vector_field",
-    "exp_so3",
     "fiber_derivative",
     "fiber_inverse",
     "flat",
@@ -145,7 +149,6 @@ __all__ = [
     "infinitesimal_generator",
     "initial_value",
     "invariance_defect",
-    "inverse_cayley",
     "inverse_step",
     "jacobi_bracket",
     "joined_action",
@@ -156,14 +159,12 @@ __all__ = [
     "left_hamiltonian_on_flow",
     "left_leg",
     "left_leg_states",
-    "left_momenta",
     "left_step",
     "legendre_dual",
     "legendrian_defect",
     "legendrian_relation",
     "lie_derivative_of_contact_form",
     "linear_damping",
-    "log_so3",
     "mean_value_gradient",
     "midpoint_gradient",
     "momentum_map",
@@ -188,7 +189,8 @@ __all__ = [
     "sharp",
     "sharp_bivector",
     "solve_right_position",
+    "symmetries",
+    "time_defect",
     "transport_section",
     "tulczyjew_triple",
-    "vee",
 ]

@@ -94,12 +94,6 @@ class LeftLagrangian:
         )
 
 
-def left_momenta(P: Partials) -> tuple[Tensor, Tensor, Tensor]:
-    """p0 = −D1L⁻, p1 = D2L⁻/(1 − D3L⁻) and c = 1/(1 − D3L⁻), from the partials of L⁻."""
-    c = 1 / (1 - P.D3)
-    return -P.D1, c[..., None] * P.D2, c
-
-
 def unforced(P: Partials) -> Partials:
     """P, unless it comes with forces: those are not derivatives of an action.
 

@@ -20,6 +20,10 @@ OPTIMISERS = ("lm", "adam", "adamw")
 SUPERVISION = ("q", "qs", "qps")
 ROBUST = ("auto", "on", "off")
 DTYPES = {"float64": torch.float64, "float32": torch.float32}
+CHOICES = {
+    "level": ("auto", *LEVELS), "objective": OBJECTIVES, "optimiser": OPTIMISERS, "robust": ROBUST,
+    "supervision": SUPERVISION, "dtype": tuple(DTYPES), "activation": ACTIVATIONS,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,12 @@ class FitConfig:
         Viscous friction of differences of speeds at the forced level: links with hinges between them.
     terms
         Further parts of the potential and of the forces, by their names in `herglotz.models.TERMS` (docs/extending.md).
+    frequencies
+        Angular frequencies ν, in rad per unit of time, of a periodic force whose amplitude and phase are learned:
+        cos νt and sin νt become the inputs (`herglotz.data.waves`). For data without inputs.
+    translations
+        Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
+        learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
         Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
         (forced level). See `herglotz.models.drag`.
@@ -145,23 +155,44 @@ class FitConfig:
     diagonal: bool = False
     coupled: bool = False
     terms: tuple[str, ...] = ()
+    translations: tuple[str, ...] = ()
+    frequencies: tuple[float, ...] = ()
     drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
 
     def __post_init__(self):
-        _choice("level", self.level, ("auto", *LEVELS))
-        _choice("objective", self.objective, OBJECTIVES)
-        _choice("optimiser", self.optimiser, OPTIMISERS)
-        _choice("robust", self.robust, ROBUST)
-        _choice("supervision", self.supervision, SUPERVISION)
+        for name, choices in CHOICES.items():
+            if (value := getattr(self, name)) not in choices:
+                raise InputError(f"unknown {name} '{value}'; choose one of {', '.join(choices)}")
+        for name in ("restarts", "iterations", "substeps"):
+            if (value := getattr(self, name)) is not None and value < 1:
+                raise InputError(f"{name} must be >= 1, got {value}")
+        if not 0 < self.train_fraction <= 1:
+            raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
+        if not self.departures or min(self.departures) <= 0:
+            raise InputError(f"departures must be one or more positive numbers, got {self.departures}")
+        self._check_objective()
+        self._check_forces()
+        self._check_batch()
+        self._check_device()
+
+    def _check_objective(self) -> None:
         if self.supervision != "q" and self.objective not in ("auto", "residual"):
             raise InputError(
                 f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', "
                 f"not '{self.objective}'"
             )
-        _choice("dtype", self.dtype, tuple(DTYPES))
-        _choice("activation", self.activation, ACTIVATIONS)
+        if self.optimiser != "lm" and self.objective not in ("residual", "raw"):
+            raise InputError(
+                f"{self.optimiser} fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm"
+            )
+        if self.substeps > 1 and self.objective not in ("trajectory", "smoothing"):
+            raise InputError(
+                f"substeps are of trajectory fitting, not of the objective {self.objective!r}; set it to 'trajectory'"
+            )
+
+    def _check_forces(self) -> None:
         if self.sticking and self.objective not in ("auto", "trajectory"):
             raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
         forces = self.coulomb or self.sticking or self.input_map or self.drag
@@ -171,25 +202,8 @@ class FitConfig:
             )
         if self.input_map and not self.use_inputs:
             raise InputError("input_map is given but use_inputs is False; leave one of them out")
-        if not 0 < self.train_fraction <= 1:
-            raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
-        if self.restarts is not None and self.restarts < 1:
-            raise InputError(f"restarts must be >= 1, got {self.restarts}")
-        if self.iterations < 1:
-            raise InputError(f"iterations must be >= 1, got {self.iterations}")
-        if not self.departures or min(self.departures) <= 0:
-            raise InputError(f"departures must be one or more positive numbers, got {self.departures}")
-        if self.optimiser != "lm" and self.objective not in ("residual", "raw"):
-            raise InputError(
-                f"{self.optimiser} fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm"
-            )
-        self._check_batch()
-        if self.substeps < 1:
-            raise InputError(f"substeps must be >= 1, got {self.substeps}")
-        if self.substeps > 1 and self.objective not in ("trajectory", "smoothing"):
-            raise InputError(
-                f"substeps are of trajectory fitting, not of the objective {self.objective!r}; set it to 'trajectory'"
-            )
+
+    def _check_device(self) -> None:
         try:
             device = torch.device(self.device)
         except RuntimeError:
@@ -276,8 +290,3 @@ class FitConfig:
 
 def _tuple(x: Any) -> tuple:
     return (x,) if isinstance(x, (str, int, float)) else tuple(x)
-
-
-def _choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise InputError(f"unknown {name} '{value}'; choose one of {', '.join(choices)}")

@@ -28,6 +28,7 @@ from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
+    own_terms,
     places,
     settings_of,
     started,
@@ -44,9 +45,9 @@ from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 COLOURED = 3.0  # standard deviations of white noise's autocorrelation
+PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-LOWER = 0.99  # share of the misfit that is left where halved steps are kept
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
@@ -102,35 +103,66 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
-        self.spread = float((data.q - data.q.mean(0)).square().mean().sqrt())
+        self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
+        self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         self.order = 4 if self.precision < SMOOTH * self.spread else 2
 
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
-        local = local_polynomials(self.data)
-        linear = None if local is None else LinearTerms(self.data, self.base, self.all).start(local)
-        if linear is None or local is None:
-            return None
-        terms, values = linear
-        found = self._grown(terms, values, 1, smoothed(self.data, local))
+        part = self.data.liveliest(PART)
+        found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
-        found = self._finer(self._held(self._simpler(found)))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
-            if more is None or not more.rms < found.rms or (found.coloured and not self._beaten(found, more)):
+            white = more is not None and not (found.coloured and more.coloured)  # what the criterion takes for granted
+            if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
         return self._last_terms(self._pruned(found))
 
+    def _begun(self) -> Found | None:
+        """The terms of one linear problem, fitted to segments that grow."""
+        local = local_polynomials(self.data)
+        if local is None:
+            return None
+        start, linear = smoothed(self.data, local), LinearTerms(self.data, self.base, self.all).start(local)
+        found = None if linear is None else self._grown(*linear, 1, start)
+        found = found or self._grown(*self._bare(), 1, start)
+        return None if found is None else self._finer(self._held(self._simpler(found)))
+
+    def _from_part(self, part: Trajectories) -> Found | None:
+        """What a part of the data asks for, fitted to all of them: a search costs many fits."""
+        search = DictionarySearch(part, self.base, self.config, outliers=self.freedom is not None)
+        found, local = search.run(), local_polynomials(self.data)
+        if found is None or local is None:
+            return None
+        self.order = search.order
+        stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
+        stages.hurried, sigma, begin = True, max(found.rms, self.floor), smoothed(self.data, local)
+        fit = stages.at_once(sigma, self.freedom, begin) if found.whole else None
+        if fit is None:
+            first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=begin)
+            fit = None if first is None else stages.grow(first, sigma)
+        return None if fit is None else self._found(found.terms, stages, fit)
+
+    def _bare(self) -> tuple[NamedTerms, dict]:
+        """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
+        base, own = self.base, own_terms(self.data.angles[0]) if self.data.dof == 1 else {}
+        values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
+        features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
+        return NamedTerms(tuple(own)), {**values, **features}
+
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
         if not found.terms.dry or found.config.sticking or self.config.sticking is False:
+            return found
+        if max(found.values[DRY]) <= 0:  # smooth friction that pushes makes up for another force, and holds nothing
             return found
         other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
         return found if other is None or not other.rms < found.rms else self._longer(other)
@@ -185,7 +217,7 @@ class DictionarySearch:
     def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None) -> Found | None:
         """The fit with other terms or steps, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps)
-        states = found.fit.problem.states_at(found.fit.path, problem.grid.start_sample)
+        states = found.fit.path.x[:, 0, : problem.d]
         fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
@@ -197,7 +229,7 @@ class DictionarySearch:
         _, problem = self._problem(found, self.all, found.config.substeps)
         theta = problem.parameters.get()
         at = places(problem.parameters, self.all)
-        x = problem.pack(theta, found.fit.problem.states_at(found.fit.path, problem.grid.start_sample))
+        x = problem.pack(theta, found.fit.path.x[:, 0, : problem.d])
         cost, A, b = problem.normal_equations(x)
         if not math.isfinite(float(cost)):
             return None
@@ -231,7 +263,10 @@ class DictionarySearch:
         ):  # as much as halved steps may bring, then twice the misfit
             terms = self._needed(found, worth)
             less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
-            if less is not None and (self._too_long(less) or self._as_good(less, found)):
+            limit = (1 + worth / count) ** 0.5 * max(found.rms, self.floor)  # far from a minimum it may cost more
+            if less is None or less.rms > limit:
+                continue
+            if self._too_long(less) or self._as_good(less, found):
                 return less
         return found
 
@@ -275,7 +310,8 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
             other = self._refit(found, found.terms, 2 * found.config.substeps)
-            if other is None or not other.rms < LOWER * found.rms:
+            if other is None or not other.rms < found.rms:
+                self.in_vain = found.config.substeps, found.rms
                 break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
         return found
@@ -285,14 +321,15 @@ class DictionarySearch:
         m = found.config.substeps
         if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
             return False
+        if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
+            return False
         return self._change(found, 2 * m) > max(FINER * found.rms, self.floor)
 
     def _change(self, found: Found, substeps: int) -> float:
         """RMS change of the fitted motion by so many model steps in a recorded one."""
         _, problem = self._problem(found, found.terms, substeps)
         fit = found.fit
-        states = fit.problem.states_at(fit.path, problem.grid.start_sample)
-        path = problem.solve(problem.pack(fit.theta, states))
+        path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
         if path is None:
             return math.inf
         order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()

@@ -60,11 +60,14 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
 
 
 def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
-    """RMS error of the free run over the unseen part, in units of q, without single spikes; inf where it breaks off."""
+    """RMS error of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
+
+    Single spikes are left out.
+    """
     fitted = replace(fitted, states=_with_dropped(fitted, seen.train, seen.spikes))
     states, _ = states_everywhere(fitted, seen.data, seen.train.lengths, task.base.model_step)
     _, free = _errors(fitted, task, seen, seen.spikes, states)
-    found = None if free is None else _rms(free)
+    found = None if free is None else _rms(free / seen.train.balance)
     return math.inf if found is None else found
 
 
@@ -73,13 +76,13 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
     n, u = train.dof, step_inputs(fitted.model, train)
     out = fitted.states.new_empty(train.samples, 2 * n + 1)
     out[~dropped] = fitted.states
-    for row in dropped.nonzero()[:, 0].tolist():  # never the first of a trajectory
-        x, h = out[row - 1], train.t[row] - train.t[row - 1]
+    rows = dropped.nonzero()[:, 0]  # never the first of a trajectory
+    for run in rows.tensor_split((rows.diff() > 1).nonzero()[:, 0] + 1) if len(rows) else ():
+        x, before = out[run[0] - 1], run - 1
+        inputs, h = None if u is None else u[before], train.t[run] - train.t[before]
         with torch.no_grad():
-            step = Stepper(fitted.model).step(
-                State(x[:n], x[n : 2 * n], x[2 * n]), h, u=None if u is None else u[row - 1]
-            )
-        out[row] = torch.cat([step.state.q, step.state.p, step.state.s[None]])
+            found = Stepper(fitted.model).rollout(x[:n], x[n : 2 * n], x[2 * n], h=h, inputs=inputs)
+        out[run] = torch.cat([found.q, found.p, found.s[:, None]], -1)[1:]
     return out
 
 

@@ -14,6 +14,7 @@ from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
 from herglotz.data.units import DEGREES
+from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
@@ -85,7 +86,7 @@ def fit(
     """
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
-    data = as_trajectories(data, **reading)
+    data = with_waves(as_trajectories(data, **reading), config.frequencies)
     check_sizes(data.source or "data", data.q, data.names)
     with nullcontext() if out is None else locked(out):
         return _fit(data, config, plan, out, progress, resume)

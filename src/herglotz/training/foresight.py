@@ -176,7 +176,8 @@ def _with_absent_terms(
     """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
     plain = not any(name.startswith(NETWORKS) for name in parameters.names) and c.objective == "trajectory"
-    if not plain or c.level not in ("linear", "forced") or c.known or c.terms or c.input_map or data.dof > MOST:
+    told = c.known or c.terms or c.input_map or c.translations
+    if not plain or c.level not in ("linear", "forced") or told or data.dof > MOST:
         return model, task.base, {}
     every, own = candidates(data), NamedTerms(c.features, c.drag, c.coulomb)
     if not set(own.names) <= set(every.names):

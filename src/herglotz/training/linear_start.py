@@ -51,9 +51,13 @@ class LinearFit:
 
     @classmethod
     def of(
-        cls, angles: Sequence[bool], features: Sequence[str], t: Triples, forces: NamedForces | None = None,
+        cls, angles: Sequence[bool], features: Sequence[str], t: Triples, balance: Tensor,
+        forces: NamedForces | None = None,
     ) -> LinearFit:  # fmt: skip
-        """The columns of a model of order 2 with these features, coupled friction and no other damping but `forces`."""
+        """The columns of a model of order 2 with these features, coupled friction and no other damping but `forces`.
+
+        Forces and positions are over the `balance` (n,) of the coordinates: the errors of all of them count alike.
+        """
         n, forces = len(angles), forces or NamedForces()
         zero = (0.0,) * n
         model = ContactLagrangian(
@@ -89,6 +93,7 @@ class LinearFit:
         own = -unit.movedim(1, 2) / t.h1[:, None, None, None]
         J = torch.cat([own, J[..., columns]], -1)
         sizes = dict(zip(parameters.names, parameters.sizes, strict=True))
+        R, J = R * balance[:, None], J * (balance[:, None] * balance)[..., None]
         return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in range(sizes[name])))
 
     def rows(self, which: Tensor) -> LinearFit:
@@ -118,7 +123,7 @@ class LinearFit:
         return out
 
     def errors(self, x: Tensor) -> Tensor:
-        """J⁻¹R of every triple at the coefficients x, (T, n), in units of q; inf where J is singular."""
+        """J⁻¹R of every triple at x, (T, n), over the balance of the coordinates; inf where J is singular."""
         r, info = torch.linalg.solve_ex(self.J @ x, self.R @ x)
         return torch.where((info != 0)[:, None], torch.inf, r).nan_to_num(nan=torch.inf)
 

@@ -16,6 +16,7 @@ from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, 
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
+ENOUGH = 5  # residuals for each coefficient: fewer leave its smallest singular value to noise
 
 
 class LinearTerms:
@@ -40,8 +41,10 @@ class LinearTerms:
         if len(t) > ROWS:
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
         forces = NamedForces(self.all.drag, self.base.speed, u)
-        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, forces)
+        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
         columns = self._columns(fit)
+        if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
+            return None
         x = fit.solve(columns)
         if float(x[0]) == 0:
             return None
@@ -55,7 +58,7 @@ class LinearTerms:
         A = X.T @ X / size / overlap
         place = self._linear_places(fit, columns)
         free = torch.tensor([i for own in place.values() for i in own])
-        kept, _ = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
+        kept, less = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
         stay = set(kept.tolist())
         terms = self.all.only([name for name, own in place.items() if stay & set(own)])
         left = columns.clone()
@@ -63,7 +66,9 @@ class LinearTerms:
         for name, own in place.items():
             if name not in terms.names:
                 left[at[own]] = False
-        start = fit.start(fit.solve(left))
+        alone = torch.zeros_like(x)
+        alone[at], alone[columns.nonzero()[0]] = less, 1.0
+        start = fit.start(fit.solve(left)) or fit.start(alone)
         if start is None:
             return None
         values: dict = {name: tuple(v.tolist()) for name, v in start.items()}

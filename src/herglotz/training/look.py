@@ -141,12 +141,13 @@ def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) ->
     elif settings.features:
         terms = _Terms(settings, start_of_features(kept, base, settings))
     terms = replace(terms, motion=_baseline_motion(replace(task, base=terms.base, config=terms.settings)))
-    told = not named or bool(terms.settings.features) or not terms_are_free(kept, user_settings)
+    exact = bool(terms.settings.features) and terms.settings.objective == "residual"
+    told = not named or exact or not terms_are_free(kept, user_settings)
     at_one_step = not (_fine(terms.base) or kept.irregular)  # a network may learn what the rule misses at this step
     if told or (terms.motion is not None and at_one_step):
         return terms
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
-    first, plain = terms.base, replace(settings, sticking=settings.sticking or user_settings.sticking)
+    first, plain = base, replace(settings, sticking=settings.sticking or user_settings.sticking)
     found = kept_structure("terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages)
     terms = replace(terms, structure=found.reason, found=found)
     return terms if found.sigma is None else replace(terms, settings=found.config, base=found.base, motion=None)
@@ -176,7 +177,7 @@ def _fine(base: Baseline) -> bool:
 def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
     """Return triples of the baseline's motion with their error, where the baseline explains exact data."""
     c = task.config
-    more = c.features or c.known or c.terms or c.alike or c.mass_width
+    more = c.features or c.known or c.terms or c.alike or c.mass_width or c.translations
     if c.objective not in ("auto", "residual") or more or c.supervision != "q" or task.data.u is not None:
         return None
     model = task.build("correction")

@@ -13,8 +13,10 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, recorded
+from herglotz.data.waves import waves
 from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
+from herglotz.training.config import FitConfig
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -26,6 +28,8 @@ class Steppable(Protocol):
     def stepper(self) -> Stepper: ...  # noqa: D102
     @property
     def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def config(self) -> FitConfig: ...  # noqa: D102
     @property
     def h(self) -> float: ...  # noqa: D102
 
@@ -103,7 +107,8 @@ def _inputs(
         return driven(found, float(found.t[0]) if from_first else time, steps, h)
     times = even_times(time, h or run.h, steps)
     if inputs is None:
-        return None, times
+        middle = 0.5 * (times[1:] + times[:-1])
+        return waves(middle, run.config.frequencies) if run.config.frequencies else None, times
     u = torch.as_tensor(inputs, dtype=torch.float64)
     u = u.reshape(1) if u.ndim == 0 else u[:, None] if u.ndim == 1 and len(u) == steps else u
     return u.expand(steps, u.shape[-1]), times

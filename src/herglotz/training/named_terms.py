@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -90,11 +91,16 @@ def started(
     for parameter, names in ((STILL, still), (MOVING, moving), (DRAG, of.drag)):
         if names:
             rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
+    zero = (0.0,) * data.dof
     if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
         rate += float(rest.pop("friction.viscous", (0.0,))[0])
+    elif of.diagonal:  # a rate is viscous friction in proportion to the mass: one of the two is enough
+        logs = (0.0, *rest.get("kinetic.base.log_diagonal", rest.get("kinetic.log_diagonal", zero[1:])))
+        viscous = rest.get("friction.viscous", zero)
+        rest["friction.viscous"] = tuple(b + rate * math.exp(2 * x) for b, x in zip(viscous, logs, strict=True))
+        rate = 0.0
     known = _parameters(of, bool(moving))
     rest = {name: x for name, x in ((known(name), x) for name, x in rest.items()) if name and x}
-    zero = (0.0,) * data.dof
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
     assert isinstance(stiffness, tuple)
     assert isinstance(tilt, tuple)

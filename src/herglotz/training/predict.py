@@ -9,10 +9,12 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
+from herglotz.training.config import FitConfig
 from herglotz.training.free_run import near_data
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
@@ -31,6 +33,8 @@ class Trained(Protocol):
     def model(self) -> ContactLagrangian: ...  # noqa: D102
     @property
     def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def config(self) -> FitConfig: ...  # noqa: D102
     @property
     def metrics(self) -> dict[str, Any]: ...  # noqa: D102
     @property
@@ -199,6 +203,7 @@ def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     for i, name, unit in zip(at, wanted.names, wanted.units, strict=True):
         if "1" not in (data.units[i], unit) and data.units[i] != unit:
             raise InputError(f"{where}: {name} is in {data.units[i]}, the run was fitted in {unit}; convert the column")
+    data = with_waves(data, run.config.frequencies)
     u = data.u if run.model.inputs else None
     p = None if data.p is None else data.p[:, at]
     return replace(

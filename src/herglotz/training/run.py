@@ -193,6 +193,13 @@ class Run:
         """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
         return _front().verify(self, **settings)
 
+    def symmetries(self, **settings: Any) -> Any:
+        """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
+
+        A symmetry is one within the error of the run's own free run (`herglotz.verify.symmetries`).
+        """
+        return _front().symmetries(self, **settings)
+
     def report(self, folder: str | Path, against: Any = None) -> list[Path]:
         """Write report.html, which fetches nothing, and report.md; `against` is another recording to be scored."""
         return _front().report(self, folder, against)

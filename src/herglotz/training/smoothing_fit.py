@@ -139,7 +139,8 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     problem = fit.problem
     misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
     used = problem.root_weights(misfit / problem.sigma).square()
-    taken = float(diagonal_of_inverse(matrix.blocks).flatten(0, 1)[problem.node, : problem.n].sum()) / problem.sigma**2
+    variances = diagonal_of_inverse(matrix.blocks).flatten(0, 1)[problem.node, : problem.n]
+    taken = float((variances / problem.deviations.square()).sum())
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d
     sigma = math.sqrt(float((used * misfit.square()).sum()) / max(free, 0.1 * misfit.numel()))

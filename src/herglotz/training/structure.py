@@ -77,7 +77,16 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 def _nothing_named(c: FitConfig) -> bool:
     named = (
-        c.features or c.known or c.terms or c.alike or c.diagonal or c.mass_width or c.coulomb or c.sticking or c.drag
+        c.features
+        or c.known
+        or c.terms
+        or c.alike
+        or c.diagonal
+        or c.mass_width
+        or c.coulomb
+        or c.sticking
+        or c.drag
+        or c.translations
     )
     plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm" and not c.coupled
     return c.level == "auto" and not named and plain
@@ -175,7 +184,7 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     """
     names = tuple(expand(config.features, data.angles))
     other = config.known or config.terms or config.alike or config.mass_width or config.coulomb or data.u is not None
-    other = other or config.objective == "raw"  # a network alone
+    other = other or config.translations or config.objective == "raw"  # a network alone
     own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
         return base
@@ -199,9 +208,9 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
         t = data.thinned(every).triples(every * base.max_step).spread_out(most)
         if len(t) * n < ENOUGH * (len(names) + n * n):
             break
-        fit = LinearFit.of(data.angles, names, t)
+        fit = LinearFit.of(data.angles, names, t, data.balance)
         (x,) = of_first(fit.solve(_columns(fit, data.angles)))
-        moved = t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)
+        moved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / data.balance
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
             best = score, every, fit, x

@@ -88,6 +88,7 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
             drag=config.drag,
             order=config.order,
             terms=() if alone else config.terms,
+            translations=config.translations,
         )
     )
     if model.inputs and not config.input_map:

@@ -71,11 +71,14 @@ class TrajectoryFit:
 
 
 def segment_lengths(data: Trajectories) -> list[int]:
-    """Segment lengths of the stages: 20, 40, 80, … recorded steps, and at last each trajectory whole."""
+    """Segment lengths of the stages: 20, 40, 80, … recorded steps, and at last each trajectory whole.
+
+    A length of more than two thirds of the longest trajectory cuts none in two.
+    """
     longest = max(data.lengths) - 1
     lengths = []
     length = FIRST_SEGMENT
-    while length < longest:
+    while round(longest / length) > 1:
         lengths.append(length)
         length *= 2
     return [*lengths, longest]
@@ -195,6 +198,13 @@ class SegmentStages:
         rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
         return trial if rest is None else rest
 
+    def at_once(
+        self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
+    ) -> TrajectoryFit | None:
+        """Whole trajectories without shorter segments before; None where that misses far more than σ."""
+        found = self.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        return None if found is None or found.noise > LOST * sigma else found
+
     def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
         """Whole trajectories at once, from parameters that are known well; None where that misses far more than σ."""
         used = None if bool(first.problem.used.all()) else first.problem.used
@@ -245,6 +255,10 @@ def fit_trajectories(
     """
     if model.potential.network is None:
         task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
+    if known and model.potential.network is None and task.config.robust != "on":
+        last = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
+        if last is not None and (task.config.robust == "off" or not heavy_tailed(last.misfit)):
+            return Chosen(last, task.config.departures[0], {task.config.departures[0]: last.held_out_errors()})
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
         return None

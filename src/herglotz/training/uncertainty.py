@@ -41,7 +41,7 @@ class Bands:
 
     q: Tensor  # (N, n) free run, in units of q
     std: Tensor  # (N, n) standard deviation of the model's position
-    sigma: float  # standard deviation of the noise of a measurement
+    sigma: Tensor  # (n,) standard deviation of the noise of a measurement
 
     def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
         """Lower and upper end of the central interval, (N, n) each; of a measured value, or of the true position."""
@@ -166,7 +166,7 @@ class Laplace:
         q, std = data.q.new_empty(data.q.shape), data.q.new_empty(data.q.shape)
         q[grid.sample] = path.x[..., : whole.n].flatten(0, 1)[grid.node]
         std[grid.sample] = variance.clamp_min(0).sqrt().flatten(0, 1)[grid.node].to(std.dtype)
-        return Bands(q, std, self.sigma)
+        return Bands(q, std, self.problem.deviations)
 
     def standard_deviations(self) -> dict[str, Tensor]:
         """Of every parameter, by name, in its own units."""
@@ -258,7 +258,7 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
         raise InputError("the runs of an ensemble must be fits to the same data; only their seeds may differ")
     bands = [laplace(run).bands() if data is None else laplace(run).predict(data, seen) for run in runs]
     q, std = torch.stack([b.q for b in bands]), torch.stack([b.std for b in bands])
-    sigma = (sum(b.sigma**2 for b in bands) / len(bands)) ** 0.5
+    sigma = torch.stack([b.sigma for b in bands]).square().mean(0).sqrt()
     return Bands(q.mean(0), (std.square().mean(0) + q.var(0)).sqrt(), sigma)
 
 

@@ -7,7 +7,6 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from herglotz.errors import InputError
-from herglotz.tune.reference import FINEST, REFERENCES
 
 ARTEFACTS = ("eager", "c")
 
@@ -19,7 +18,7 @@ class TuneConfig:
     Parameters
     ----------
     multiples
-        Step sizes to try, in steps of the run: whole numbers, or multiples of 1/4 where the reference is the limit.
+        Step sizes to try, in steps of the run: whole numbers.
     widths
         Hidden units of the distilled corrections; an empty tuple re-trains nothing.
     kicks
@@ -29,8 +28,6 @@ class TuneConfig:
         "eager" (PyTorch), "c" (compiled C, in float64 and float32).
     tolerances
         Newton tolerances of the eager stepper, relative to the size of the positions; None is its default.
-    reference
-        "own": the run's model at the run's step; "limit": that model as h → 0.
     starts
         Number of motions that choose a setting; the same number of other motions judges the choice.
     quantile, confidence
@@ -43,12 +40,11 @@ class TuneConfig:
         Number of timings of each setting; all settings take turns.
     """
 
-    multiples: tuple[float, ...] = (1, 2, 4, 8)
+    multiples: tuple[int, ...] = (1, 2, 4, 8)
     widths: tuple[int, ...] = (8, 16)
     kicks: tuple[int, ...] = ()
     artefacts: tuple[str, ...] = ARTEFACTS
     tolerances: tuple[float | None, ...] = (None, 1e-7)
-    reference: str = "own"
     starts: int = 128
     quantile: float = 0.95
     confidence: float = 0.95
@@ -58,18 +54,13 @@ class TuneConfig:
     rounds: int = 7
 
     def __post_init__(self):
-        if self.reference not in REFERENCES:
-            raise InputError(f"unknown reference '{self.reference}'; choose one of {', '.join(REFERENCES)}")
         wrong = [x for x in self.artefacts if x not in ARTEFACTS]
         if wrong or not self.artefacts:
             raise InputError(f"artefacts must be some of {', '.join(ARTEFACTS)}, got {self.artefacts}")
-        part = 1 if self.reference == "own" else FINEST
-        for m in self.multiples:
-            if not (m > 0 and float(m * part).is_integer()):
-                whole = "whole numbers >= 1" if part == 1 else f"multiples of 1/{part}"
-                raise InputError(f"multiples must be {whole} with the reference '{self.reference}', got {m:g}")
         if not self.multiples:
             raise InputError("multiples is empty; give at least one, such as 1")
+        if not all(m >= 1 and float(m).is_integer() for m in self.multiples):
+            raise InputError(f"multiples must be whole numbers >= 1, got {self.multiples}")
         if any(w < 1 for w in self.widths):
             raise InputError(f"widths must be >= 1, got {self.widths}; give an empty tuple for no distillation")
         if any(k < 1 for k in self.kicks):

@@ -12,7 +12,6 @@ from typing import Any
 
 import torch
 
-from herglotz.export import ExportedStepper
 from herglotz.export.c_stepper import CLibrary
 from herglotz.stepping import State
 from herglotz.tune.kick_composition_c import CompiledKicks
@@ -55,20 +54,12 @@ def measure_costs(timed: Sequence[Timed], rounds: int) -> list[Cost]:
 
 def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
     """Return rollouts of `steps` steps, one start after the other; for C the overhead of the call is timed too."""
-    if isinstance(stepper, ExportedStepper) and isinstance(stepper.loop, CLibrary):
-        count = min(C_STARTS, len(starts.s))
+    if isinstance(getattr(stepper, "loop", stepper), CLibrary | CompiledKicks):
+        few = State(*(x[:C_STARTS] for x in starts))
+        count = len(few.s)
         repeats = max(1, C_STEPS // (count * steps))
-        run, idle = (_native(stepper.loop, starts, count, h, k, repeats) for k in (steps, 0))
+        run, idle = (_repeated(_native(stepper, few, h, k), repeats) for k in (steps, 0))
         return Timed(run, count * steps * repeats, idle)
-    if isinstance(stepper, CompiledKicks):
-        count = min(C_STARTS, len(starts.s))
-        repeats = max(1, C_STEPS // (count * steps))
-        few = State(*(x[:count] for x in starts))
-        calls = []
-        for k in (steps, 0):
-            outputs = [torch.empty(count, k + 1, dtype=stepper.dtype) for _ in range(3)]
-            calls.append(_repeated(stepper.call(few, k, outputs), repeats))
-        return Timed(calls[0], count * steps * repeats, calls[1])
     steps, count = min(steps, EAGER_STEPS), min(EAGER_STARTS, len(starts.s))
     single = [State(*(x[i : i + 1] for x in starts)) for i in range(count)]
 
@@ -80,26 +71,23 @@ def timed_stepping(stepper: Any, starts: State, h: float, steps: int) -> Timed:
     return Timed(run, count * steps)
 
 
-def _repeated(call: Callable[[], None], times: int) -> Callable[[], None]:
+def _repeated(calls: list[Callable[[], None]], times: int) -> Callable[[], None]:
     def run() -> None:
         for _ in range(times):
-            call()
-
-    return run
-
-
-def _native(library: CLibrary, starts: State, count: int, h: float, steps: int, repeats: int) -> Callable[[], None]:
-    """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
-    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
-    one = [State(*(x[i : i + 1].to(library.dtype) for x in starts)) for i in range(count)]
-    calls = [library.prepared(*start, h_all)[0] for start in one]
-
-    def run() -> None:
-        for _ in range(repeats):
             for call in calls:
                 call()
 
     return run
+
+
+def _native(stepper: Any, few: State, h: float, steps: int) -> list[Callable[[], None]]:
+    """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
+    if isinstance(stepper, CompiledKicks):
+        return [stepper.call(few, steps, [torch.empty(len(few.s), steps + 1, dtype=stepper.dtype) for _ in range(3)])]
+    library: CLibrary = stepper.loop
+    h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
+    singles = [State(*(x[i : i + 1].to(library.dtype) for x in few)) for i in range(len(few.s))]
+    return [library.prepared(*start, h=h_all)[0] for start in singles]
 
 
 def _seconds(run: Callable[[], None]) -> float:

@@ -29,6 +29,7 @@ from herglotz.stepping import OneStepMethod, State, Status, Step
 from herglotz.training import levenberg_marquardt
 
 LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
+DEGREE = 4  # of the polynomials of a kick
 EXACT = 1e-8  # σ of the residuals relative to the motion's size, as in `distil`
 WEAK = 10.0  # σ of the prior on each number's distance from its start, relative to the size of the start
 
@@ -135,7 +136,6 @@ def fit_kicks(
     h: float,
     *,
     kicks: int,
-    degree: int = 4,
     iterations: int = 150,
 ) -> KickStepper:
     """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
@@ -154,7 +154,7 @@ def fit_kicks(
     """
     if not can_kick(model):
         raise InputError(f"kicks need one coordinate at the {' or '.join(LEVELS)} level")
-    start = _leapfrog(model, before, h, kicks, degree)
+    start = _leapfrog(model, before, h, kicks)
     sizes = [start.drifts.numel(), start.cosines.numel(), start.sines.numel()]
     first = torch.cat([start.drifts, start.cosines.flatten(), start.sines.flatten()])
 
@@ -191,7 +191,7 @@ def fit_kicks(
     return replace(found, offset=float((data[5] - s).mean()), error=float((q - data[3]).square().mean().sqrt()))
 
 
-def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int, degree: int) -> KickStepper:
+def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int) -> KickStepper:
     """Return K steps of leapfrog with the model's stiffness: drifts h/K over the mass, kicks h/K times the force."""
     config = model.config
     low, high = float(before.q.min()), float(before.q.max())
@@ -199,8 +199,8 @@ def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int, deg
     drifts = torch.full((kicks + 1,), h / kicks, dtype=torch.float64)
     drifts[0] = drifts[-1] = h / kicks / 2
     # A length needs a linear term too: the force is not zero at the middle of the data.
-    a = torch.zeros(kicks, degree if config.angles[0] else degree + 1, dtype=torch.float64)
-    b = torch.zeros(kicks, degree if config.angles[0] else 0, dtype=torch.float64)
+    a = torch.zeros(kicks, DEGREE if config.angles[0] else DEGREE + 1, dtype=torch.float64)
+    b = torch.zeros(kicks, DEGREE if config.angles[0] else 0, dtype=torch.float64)
     k = float(config.stiffness[0])
     if config.angles[0]:
         a[:, 0] = -k * h / kicks

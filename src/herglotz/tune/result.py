@@ -96,7 +96,6 @@ class Tuning:
     candidates: list[Candidate]
     chosen: Candidate
     held_out: dict[str, Any]
-    reference_error: float  # of the reference itself
     motions: State  # the reference's training motions at the chosen step, (B, K+1, …)
     notes: list[str]  # settings that could not be tried, with the reason
 
@@ -154,7 +153,7 @@ class Tuning:
         """The choice and its measurements, for JSON."""
         return {
             "asked": self.asked, "chosen": self.chosen.to_dict(), "held_out": self.held_out,
-            "reference": self.config.reference, "horizon": self.horizon, "model_error": self.model_error,
+            "horizon": self.horizon, "model_error": self.model_error,
         }  # fmt: skip
 
     def to_dict(self) -> dict[str, Any]:
@@ -162,7 +161,6 @@ class Tuning:
         front = self.front
         return {
             **self.summary(),
-            "reference_error": self.reference_error,
             "time_unit": self.run.data.time_unit,
             "own": self.own.to_dict(),
             "candidates": [{**c.to_dict(), "front": c in front} for c in self.candidates],

@@ -51,7 +51,7 @@ def tune(
     """Search step, correction, precision and form of a run's stepper.
 
     The error of a setting is the error of its *stepping*: the largest |q − q_ref| over the horizon, for each start. The
-    reference is the run's own model (`TuneConfig.reference`). `Tuning.model_error` has the error of that model against
+    reference is the run's own model at its own step. `Tuning.model_error` has the error of that model against
     the data, which adds to the error of stepping. Costs are wall time, one motion at a time.
 
     Parameters
@@ -79,7 +79,7 @@ def tune(
     horizon = _horizon(run, config, horizon)
     # Three disjoint sets of starts: the first trains, the second chooses, the third judges.
     training, choosing, judging = (
-        record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon, config.reference) for k in range(3)
+        record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon) for k in range(3)
     )
     tried: list[_Tried] = []
     notes: list[str] = []
@@ -95,9 +95,8 @@ def tune(
     errors = _errors(tried[candidates.index(chosen)].stepper, chosen.setting.h, judging)
     held_out = _held_out(errors, chosen.bound if max_error is None else max_error, config)
     stride = round(chosen.setting.h / training.base)
-    reference_error = max(training.error, choosing.error)
     return Tuning(
-        run, config, horizon, asked, candidates, chosen, held_out, reference_error, training.every(stride),
+        run, config, horizon, asked, candidates, chosen, held_out, training.every(stride),
         list(dict.fromkeys(notes)),
     )  # fmt: skip
 
@@ -142,7 +141,7 @@ def _models(
     for width in config.widths:
         for m in multiples:
             start = widened(own, width, max(run.model.config.correction_depth, 2))
-            if m < 1 or (m == 1 and config.reference == "own" and _size(start) >= _size(own)):
+            if m == 1 and _size(start) >= _size(own):
                 continue  # the run's own model is exact at this step and no larger
             h = m * run.h
             bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
@@ -194,7 +193,7 @@ def _kicks(
     own = frozen_double(run)
     if not config.kicks or "c" not in config.artefacts or not can_kick(own):
         return
-    for m in sorted(m for m in config.multiples if m >= 1):
+    for m in sorted(config.multiples):
         h = m * run.h
         before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
         for count in config.kicks:

@@ -1,6 +1,7 @@
 """Checks that a scene, a fit, a file or any L_d is a contact integrator, and that a fit predicts its data."""
 
 from herglotz.verify.report import Check, Report
+from herglotz.verify.symmetries import symmetries
 from herglotz.verify.verifier import verify
 
-__all__ = ["Check", "Report", "verify"]
+__all__ = ["Check", "Report", "symmetries", "verify"]

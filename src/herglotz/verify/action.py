@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import flow_derivative, mixed_hessian, partials
+from herglotz.mechanics import Partials, flow_derivative, mixed_hessian, partials
 from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import State
 from herglotz.theory import (
@@ -24,6 +25,7 @@ from herglotz.theory import (
     right_hamiltonian,
     right_hamiltonian_on_flow,
 )
+from herglotz.verify.legendre import LEFT, RIGHT
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import worst
 from herglotz.verify.subject import Subject
@@ -31,7 +33,7 @@ from herglotz.verify.subject import Subject
 FAN = 4  # momenta p̂0 from each start (q̂0, ŝ0): together they cover an open set of q_k, which erratum E7 asks for
 OPENING = 0.1  # standard deviation of p̂0 within a fan, in standard deviations of p̂0 over all starts
 CAUSTIC = 1e-2  # S^k is not used where the spread of a fan is below this share of k times the spread after one step
-FOLD = 1e-3  # H⁺ is not used where D2D2 L_d is below this share of its typical size (steps do not need H⁺: E4)
+FOLD = 1e-3  # H⁺ and H⁻ are not used where their `scaled_margin` is below this (steps do not need them: E4)
 
 
 @dataclass(frozen=True)
@@ -70,7 +72,8 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
     sound = torch.isfinite(D).all(-1).all(-1) & torch.isfinite(end[2])
     failed = int((~sound).sum())
     start = State(*(x[sound] for x in start))
-    sigma = _accumulated(subject, start, steps)
+    with torch.no_grad():
+        sigma = dict(enumerate(subject.rollout(start, steps).sigma.unbind(-1)))
     S = {k: generating_function(subject.flow(k), *start) for k in sorted({1, 2, steps - 1, steps})}
     keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
     return Fan(start, S, sigma, keep, failed)
@@ -94,36 +97,28 @@ def derivatives(f: Fan, bound: float, bound_of_c: float) -> list[Check]:
     ]
 
 
+Side = Callable[[GeneratingFunction, GeneratingFunction], tuple[Tensor, Tensor, Tensor]]
+
+
 def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
     """Check S^{k+1}(q_{k+1}) − S^k(q_k) − dS^{k+1}·q_{k+1} + H⁺(q_k, dS^{k+1}, s_k) = 0, relative to its terms.
 
     H⁺ comes from L_d by a Newton solve of D2 L_d(q_k, ·, s_k) = dS^{k+1}, not from the flow. Where only the map is
     known, H⁺ is p1·q1 − (s1 − s0) along the step.
     """
-    residuals, sizes, folds = [], [], 0
-    for k in [k for k in f.S if k + 1 in f.S]:
-        before, after = f.S[k], f.S[k + 1]
-        keep = f.keep[k] & f.keep[k + 1]
-        with torch.no_grad():
-            if subject.L_d is not None:
-                regular = _single_valued(subject, before, after)
-                folds += int((keep & ~regular).sum())
-                keep = keep & regular
-            b, a = (_selected(g, keep) for g in (before, after))
-            H = _right_hamiltonian(subject, b, a)
-            residual = hamilton_jacobi_residual(a.S, b.S, a.D2, a.q, H)
-            residuals.append(residual.abs())
-            sizes.append(a.S.abs() + b.S.abs() + (a.D2 * a.q).abs().sum(-1) + H.abs())
-    notes = [f.left_out()] if f.left_out() else []
-    if folds:
-        notes.append(f"{folds} left out near a fold of H⁺ (det D2D2 L_d = 0)")
-    if subject.L_d is None:
-        notes.append("no L_d in the file: H⁺ rebuilt as p1·q1 − (s1 − s0)")
-    size = worst(torch.cat(sizes))
-    value = worst(torch.cat(residuals)) / size if size > 0 else float("nan")
-    return Check.at_most(
-        "hamilton_jacobi", "discrete Hamilton–Jacobi equation on a fan", value, bound, "; ".join(notes)
-    )
+
+    def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
+        if subject.L_d is None:
+            H = right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
+        else:  # the guess picks the branch of H⁺; it is slightly wrong, so that the solver has to work
+            guess = after.q + 1e-3 * (after.q - before.q)
+            H = right_hamiltonian(subject.L_d, before.q, after.D2, before.s, subject.h, guess)
+        residual = hamilton_jacobi_residual(after.S, before.S, after.D2, after.q, H)
+        return residual, (after.D2 * after.q).sum(-1), H
+
+    note = "no L_d in the file: H⁺ rebuilt as p1·q1 − (s1 − s0)" if subject.L_d is None else ""
+    value, notes = _on_fan(subject, f, side, lambda P: P.D22, "a fold of H⁺ (det D2D2 L_d = 0)")
+    return Check.at_most("hamilton_jacobi", RIGHT, value, bound, "; ".join([*notes, note] if note else notes))
 
 
 def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
@@ -131,72 +126,46 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
 
     H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
     """
-    assert subject.L_d is not None
+    L_d: Any = subject.L_d
+
+    def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
+        guess = before.q - 1e-3 * (after.q - before.q)  # slightly wrong, so that the solver has to work
+        H = left_hamiltonian(L_d, before.D2, after.q, after.s, subject.h, guess)
+        residual = left_hamilton_jacobi_residual(after.S, before.S, before.D2, before.q, H)
+        return residual, (before.D2 * before.q).sum(-1), H
+
+    value, notes = _on_fan(subject, f, side, left_hessian, "a fold of H⁻ (det D1D1 L⁻ = 0)")
+    return Check.at_most("left_hamilton_jacobi", LEFT, value, bound, "; ".join(notes))
+
+
+def _on_fan(
+    subject: Subject, f: Fan, side: Side, hessian: Callable[[Partials], Tensor], fold: str
+) -> tuple[float, list[str]]:
+    """The largest residual over the largest sum of its terms, from S^k and S^{k+1} where the Hamiltonian exists."""
     residuals, sizes, folds = [], [], 0
     for k in [k for k in f.S if k + 1 in f.S]:
         before, after = f.S[k], f.S[k + 1]
         keep = f.keep[k] & f.keep[k + 1]
         with torch.no_grad():
-            regular = _left_single_valued(subject, before, after)
-            folds += int((keep & ~regular).sum())
-            b, a = (_selected(g, keep & regular) for g in (before, after))
-            guess = b.q - 1e-3 * (a.q - b.q)  # slightly wrong, so that the solver has to work
-            H = left_hamiltonian(subject.L_d, b.D2, a.q, a.s, subject.h, guess)
-            residuals.append(left_hamilton_jacobi_residual(a.S, b.S, b.D2, b.q, H).abs())
-            sizes.append(a.S.abs() + b.S.abs() + (b.D2 * b.q).abs().sum(-1) + H.abs())
+            if subject.L_d is not None:
+                P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
+                regular = scaled_margin(hessian(P), mixed_hessian(P), P.D11, P.D22) > FOLD
+                folds += int((keep & ~regular).sum())
+                keep = keep & regular
+            b, a = (_selected(g, keep) for g in (before, after))
+            residual, pairing, H = side(b, a)
+            residuals.append(residual.abs())
+            sizes.append(a.S.abs() + b.S.abs() + pairing.abs() + H.abs())
     notes = [f.left_out()] if f.left_out() else []
-    if folds:
-        notes.append(f"{folds} left out near a fold of H⁻ (det D1D1 L⁻ = 0)")
+    notes += [f"{folds} left out near {fold}"] if folds else []
     size = worst(torch.cat(sizes))
-    value = worst(torch.cat(residuals)) / size if size > 0 else float("nan")
-    return Check.at_most(
-        "left_hamilton_jacobi", "left discrete Hamilton–Jacobi equation", value, bound, "; ".join(notes)
-    )
+    return (worst(torch.cat(residuals)) / size if size > 0 else float("nan")), notes
 
 
 def _selected(g: GeneratingFunction, keep: Tensor) -> GeneratingFunction:
     return GeneratingFunction(**{name: x[keep] for name, x in vars(g).items()})
 
 
-def _right_hamiltonian(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """Return H⁺(q_k, dS^{k+1}, s_k)."""
-    if subject.L_d is None:
-        return right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
-    # The guess picks the branch of H⁺. It is slightly wrong, so that the solver has to work.
-    guess = after.q + 1e-3 * (after.q - before.q)
-    return right_hamiltonian(subject.L_d, before.q, after.D2, before.s, subject.h, guess)
-
-
-def _single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """Return whether det D2D2 L_d is away from 0, so that H⁺ exists."""
-    assert subject.L_d is not None
-    P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
-    finite = torch.isfinite(P.D22).all(-1).all(-1)
-    smallest = torch.zeros_like(P.L)
-    smallest[finite] = torch.linalg.svdvals(P.D22[finite])[..., -1]
-    size = P.D12.abs().amax((-2, -1)) + P.D22.abs().amax((-2, -1))
-    return smallest > FOLD * size
-
-
-def _left_single_valued(subject: Subject, before: GeneratingFunction, after: GeneratingFunction) -> Tensor:
-    """Return whether det D1D1 L⁻ is away from 0, so that H⁻ exists."""
-    assert subject.L_d is not None
-    P = partials(subject.L_d, before.q, after.q, before.s, subject.h, 2)
-    M = mixed_hessian(P)
-    return scaled_margin(left_hessian(P), M, P.D11, P.D22) > FOLD
-
-
 def _usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
     """Return whether S^k is away from a caustic: the fan has opened, compared with k free steps."""
     return (g.spread > CAUSTIC * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)
-
-
-def _accumulated(subject: Subject, start: State, steps: int) -> dict[int, Tensor]:
-    """Return σ_k for k = 1 … K, from the factors c that the stepper reports."""
-    sigma, state, product = {}, start, torch.ones_like(start.s)
-    with torch.no_grad():
-        for k in range(1, steps + 1):
-            step = subject.step(state, subject.h)
-            state, product = step.state, product * step.c
-            sigma[k] = product
-    return sigma

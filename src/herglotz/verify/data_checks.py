@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import precision, precisions
 from herglotz.data.spikes import spikes, without
 from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
@@ -26,7 +26,7 @@ from herglotz.verify.report import Check
 ONE_STEP = 0.5
 # Bound of free runs over 20 recorded steps, over the spread; noise and a good model stay far below a tenth.
 FOLLOW = 0.1
-WINDOW = 20
+WINDOW = 20  # recorded steps: errors of one step have grown, chaos has not
 # Bound of the free run beyond training, over the spread: the mean of the unseen samples would give exactly 1.
 FREE_RUN = 1.0
 DECIDABLE = 2.0  # one step is judged where the null model's squared error exceeds this multiple of the noise's
@@ -128,32 +128,9 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
     r = (h1 / h0)[:, None]
     uniform = q2 - q1 - r * (q1 - q0)
     weight = (1 + (1 + r) ** 2 + r**2).mean()
-    sigma = noise_level(run.data.t, q, run.data)
+    sigma = precisions(run.data.unwrapped()).to(q)
+    sigma = torch.where(torch.isfinite(sigma), sigma, 0.0)  # infinite where there are too few samples to tell
     return _rms(error / spread), _rms(uniform / spread), _rms(sigma / spread) * float(weight) ** 0.5
-
-
-def noise_level(t: Tensor, q: Tensor, data: Trajectories, orders: tuple[int, ...] = (3, 4, 5, 6)) -> Tensor:
-    """Return an upper estimate of the standard deviation of white noise in each coordinate, (n,), without a model.
-
-    Divided differences of order d remove smooth motion; their weights are scaled so that white noise keeps its size.
-    The order with the smallest remainder is the best estimate.
-    """
-    estimates = []
-    for d in orders:
-        rows = [_divided(t[a:b], q[a:b], d) for a, b in _spans(data) if b - a > d]
-        if rows:
-            estimates.append(torch.cat(rows).square().mean(0).sqrt())
-    return torch.stack(estimates).amin(0) if estimates else torch.zeros_like(q[0])
-
-
-def _divided(t: Tensor, q: Tensor, d: int) -> Tensor:
-    """Return normalised divided differences of order d along one trajectory, (N − d, n)."""
-    times = t.unfold(0, d + 1, 1)  # (N − d, d + 1)
-    times = (times - times[:, :1]) / (times[:, -1:] - times[:, :1])
-    gaps = times[:, :, None] - times[:, None, :] + torch.eye(d + 1, dtype=t.dtype, device=t.device)
-    weights = 1 / gaps.prod(-1)
-    weights = weights / weights.norm(dim=-1, keepdim=True)
-    return (q.unfold(0, d + 1, 1) * weights[:, None, :]).sum(-1)
 
 
 def _free_run(run: Run) -> tuple[float, str]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.export.differences import WEIGHTS
+from herglotz.export.differences import WEIGHTS, central_differences
 from herglotz.stepping import State, Status
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, worst
@@ -57,27 +57,20 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
 
 def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> tuple[Tensor, Tensor]:
     """The largest error of a sample, (B), over the largest entry of its row; and where differences exist, (B)."""
-    found, sound = _differences(subject, x, offset * spread)
+    found = central_differences(lambda y: _ends(subject, y), x, offset * spread)
+    sound = found.isfinite().all(-1).all(-1)
     scaled, error = D.abs() * spread, (D - found).abs() * spread
     error = error / scaled.amax((0, -1))[:, None] if len(scaled) else error
     return torch.where(sound, error.flatten(1).amax(-1), 0.0), sound
 
 
-def _differences(subject: Subject, x: Tensor, offset: Tensor) -> tuple[Tensor, Tensor]:
-    """DΦ̃ by central differences of order 8, (B, 2n+1, 2n+1), and where every step of the stencil converged, (B)."""
-    size, columns, sound = x.shape[-1], 0.0, torch.ones(len(x), dtype=torch.bool, device=x.device)
-    n = (size - 1) // 2
-    for k, weight in enumerate(WEIGHTS, 1):
-        move = torch.diag(k * offset)  # row j moves x_j
-        y = torch.stack([x[:, None] + move, x[:, None] - move]).reshape(-1, size)
-        with torch.no_grad():
-            step = subject.step(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]), subject.h)
-        q, p, s = step.state
-        ahead, behind = torch.cat([q, p, s[:, None]], -1).reshape(2, len(x), size, size)
-        good = (step.status == Status.CONVERGED).reshape(2, len(x), size).all(-1).all(0)
-        columns, sound = columns + weight * (ahead - behind), sound & good
-    assert isinstance(columns, Tensor)
-    return (columns / offset[:, None]).mT, sound & columns.isfinite().all(-1).all(-1)
+def _ends(subject: Subject, x: Tensor) -> Tensor:
+    """The map on points (N, 2n+1); NaN where a step has not converged."""
+    n = x.shape[-1] // 2
+    with torch.no_grad():
+        step = subject.step(State(x[:, :n], x[:, n : 2 * n], x[:, 2 * n]), subject.h)
+    q, p, s = step.state
+    return torch.where((step.status == Status.CONVERGED)[:, None], torch.cat([q, p, s[:, None]], -1), torch.nan)
 
 
 def _spread(x: Tensor) -> Tensor:

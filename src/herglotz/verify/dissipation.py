@@ -17,7 +17,7 @@ from herglotz.models import ContactLagrangian
 from herglotz.training import Run
 from herglotz.verify.report import Check
 
-FACTORS = (-1.0, 0.0, 0.5, 2.0)
+FACTORS = (-1.0, 0.0, 0.5, 2.0)  # the wrong sign, none, half and twice
 TOLD = 0.05  # the data tell the dissipation where an altered one changes the error by more than this share
 
 

@@ -107,12 +107,8 @@ def regularity(subject: Subject, w: SampledRollout) -> Check:
             M, sizes, note = _map_hessians(w)
         else:
             M, sizes, note = _hessians(subject, w)
-        scale = torch.stack([x.diagonal(dim1=-2, dim2=-1).abs() for x in sizes]).sum(0).rsqrt()
-        scaled = scale[..., :, None] * M * scale[..., None, :]
-        usable = torch.isfinite(scaled).all(-1).all(-1)
-        margin = torch.zeros_like(usable, dtype=M.dtype)  # all of D11, D22, M zero: no margin
-        margin[usable] = torch.linalg.svdvals(scaled[usable])[..., -1]
-        sign = torch.linalg.det(scaled[usable]).sign()
+        margin = scaled_margin(M, *sizes).nan_to_num(0.0)
+        sign = torch.linalg.det(M[torch.isfinite(M).all(-1).all(-1)]).sign()
     same = bool((sign == sign[:1]).all()) and bool(sign.abs().min() > 0) if len(sign) else False
     if not same:
         note = "; ".join(x for x in (note, "det M vanishes or changes sign over the samples") if x)

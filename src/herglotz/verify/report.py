@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from textwrap import fill
 from typing import Any
 
-COLUMNS = 80
+COLUMNS = 80  # of a terminal as it opens
 
 
 @dataclass(frozen=True)

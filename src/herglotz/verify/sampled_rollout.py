@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from herglotz.mechanics import Forces, contact_defect, contact_form, flow_derivative
-from herglotz.stepping import State, Status
+from herglotz.mechanics.newton import select
+from herglotz.stepping import State, Status, Step
 from herglotz.verify.report import Check
-from herglotz.verify.subject import Subject
+from herglotz.verify.subject import Map, Subject
 
 
 @dataclass(frozen=True)
@@ -38,28 +41,29 @@ class SampledRollout:
 
 def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
     """Roll out from the subject's states and differentiate every step by autograd."""
-    states, c, status = [subject.states], [], []
+    held = _Held(subject.step, subject.h)
     with torch.no_grad():
-        for _ in range(steps):
-            step = subject.step(states[-1], subject.h)
-            # A failed sample keeps its last state: its status counts it, and a batch needs finite inputs.
-            bad = ~(torch.isfinite(step.state.q).all(-1) & torch.isfinite(step.state.p).all(-1))
-            bad = bad | ~torch.isfinite(step.state.s)
-            old = states[-1]
-            states.append(
-                State(
-                    torch.where(bad[:, None], old.q, step.state.q),
-                    torch.where(bad[:, None], old.p, step.state.p),
-                    torch.where(bad, old.s, step.state.s),
-                )
-            )
-            c.append(step.c)
-            status.append(torch.where(bad & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status))
-    q, p = (torch.stack([getattr(x, name) for x in states], 1) for name in ("q", "p"))
-    s = torch.stack([x.s for x in states], 1)
-    start = (x[:, :-1].flatten(0, 1) for x in (q, p, s))
-    _, D = flow_derivative(subject.flow(), *start)
-    return SampledRollout(q, p, s, torch.stack(c, 1), torch.stack(status, 1), D.unflatten(0, (-1, steps)))
+        out = held.rollout(*subject.states, h=subject.h, steps=steps)
+    _, D = flow_derivative(subject.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
+    c = torch.stack(held.factors, 1)
+    return SampledRollout(out.q, out.p, out.s, c, out.status, D.unflatten(0, (-1, steps)))
+
+
+class _Held(Map):
+    """The map, where a sample whose step failed stays where it was: a batch needs finite inputs."""
+
+    def __init__(self, one: Callable[[State, float], Step], h: float):
+        super().__init__(one, h)
+        self.factors: list[Tensor] = []  # c of every step
+
+    def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """One step; what is not finite has a status."""
+        step = self.one(state, self.h)
+        self.factors.append(step.c)
+        good = torch.isfinite(torch.cat([*step.state[:2], step.state.s[:, None]], -1)).all(-1)
+        status = torch.where(~good & (step.status == Status.CONVERGED), int(Status.DIVERGED), step.status)
+        state = State(*select(good, tuple(step.state), tuple(state)))
+        return Step(state, torch.where(good, step.c, 1.0), status, step.residual, step.iterations)
 
 
 ROUNDINGS = 8.0  # of q in one step; the oscillator moved to q = 1e5 leaves a third of one, D2S^k half of one

@@ -11,13 +11,14 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from herglotz.data.simulate import uniform
 from herglotz.errors import InputError
 from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
 from herglotz.scenes import Scene, scene, scene_names
-from herglotz.stepping import State, Step, Stepper
+from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
 from herglotz.training import Run, load_run
 from herglotz.verify.draw import drawn_states
 
@@ -51,14 +52,22 @@ class Subject:
 
     def flow(self, k: int = 1) -> Flow:
         """Return the k-step map (q, p, s) → (q_k, p_k, s_k); a sample whose step failed is NaN."""
+        return lambda q, p, s: self.rollout(State(q, p, s), k).final
 
-        def flow_k(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            state = State(q, p, s)
-            for _ in range(k):
-                state = self.step(state, self.h).state
-            return state
+    def rollout(self, start: State, steps: int) -> Rollout:
+        """Steps of the map."""
+        return Map(self.step, self.h).rollout(*start, h=self.h, steps=steps)
 
-        return flow_k
+
+class Map(OneStepMethod):
+    """A step map at one h, a number, as a stepper for the one driver of rollouts."""
+
+    def __init__(self, one: Callable[[State, float], Step], h: float):
+        self.one, self.h = one, h
+
+    def step(self, state: State, h: Any, guess: Tensor | None = None) -> Step:  # noqa: ARG002
+        """One step."""
+        return self.one(state, self.h)
 
 
 def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
@@ -155,14 +164,8 @@ def _step_size(h: float | None, default: float) -> float:
 
 
 def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
-    """Draw states uniformly; a range is two numbers for all coordinates, or (low, high) of n numbers each."""
-    shape = (samples, scene.dof)
-
-    def draw_from(limits: Any) -> Tensor:
-        low, high = (torch.as_tensor(x, dtype=torch.float64) for x in limits)
-        return low + (high - low) * torch.rand(shape, dtype=torch.float64, generator=make)
-
-    q, v = draw_from(scene.q_range), draw_from(scene.v_range)
+    """Draw states uniformly in the ranges of a scene."""
+    q, v = (uniform(name, getattr(scene, name), (samples, scene.dof), make) for name in ("q_range", "v_range"))
     s = torch.empty(samples, dtype=torch.float64).uniform_(-1.0, 1.0, generator=make)
     return State(q, scene.momentum(q, v, s), s)
 

@@ -9,10 +9,12 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces, partials
+from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.derivative import derivative
+from herglotz.verify.explicit_time import in_time
 from herglotz.verify.legendre import (
     NO_H_MINUS,
     NO_H_PLUS,
@@ -57,7 +59,8 @@ def verify(
 
     Rollouts of `steps` steps from `samples` states give convergence, c > 0, DΦ̃ᵀη = cη, det DΦ̃ = c^{n+1}, momentum
     matching and regularity. Fans of solutions give D2S^k = p_k, D1S^k = −σ_k p̂0, 1 + D3S^k = σ_k and the discrete
-    Hamilton–Jacobi equation. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
+    Hamilton–Jacobi equation. A time-dependent L_d (`theory.TimeDependent`) steps at its own times, and the form
+    η + E dt is measured beside. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
     scene with an exact L_d its closed-form flow, a run its data. The step of an L_d with forces is not a contact map:
     then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out.
 
@@ -103,6 +106,9 @@ def verify(
     identity = usual[dtype] if tolerance is None else tolerance
     strict = CONTACT[dtype] if tolerance is None and known.L_d is not None else identity
 
+    if isinstance(known.L_d, TimeDependent):
+        details = _details(known, steps, seed)
+        return Report(known.name, tuple(in_time(known, known.L_d, steps, strict, identity)), details)
     w = sampled_rollout(known, steps)
     behind = replace(known, L_d=model) if known.forced else known
     force = _forces(behind, w)
@@ -128,17 +134,7 @@ def verify(
             checks += NO_H_MINUS
     else:  # not a contact map: no generating function, and the volume is not c^{n+1}
         checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
-    details = {
-        "kind": known.kind,
-        "dof": known.dof,
-        "dtype": str(dtype).removeprefix("torch."),
-        "h": known.h,
-        "samples": len(known.states.s),
-        "steps": steps,
-        "seed": seed,
-        "torch": str(torch.__version__),
-        "not_judged": _not_judged(known),
-    }
+    details = _details(known, steps, seed)
     if known.scene is not None and known.scene.exact:
         checks.append(_exact_flow(known, w, identity))
     if known.run is not None:
@@ -146,6 +142,20 @@ def verify(
         checks += more
         details["data"] = numbers
     return Report(known.name, tuple(checks), details, missing)
+
+
+def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:
+    return {
+        "kind": known.kind,
+        "dof": known.dof,
+        "dtype": str(known.states.q.dtype).removeprefix("torch."),
+        "h": known.h,
+        "samples": len(known.states.s),
+        "steps": steps,
+        "seed": seed,
+        "torch": str(torch.__version__),
+        "not_judged": _not_judged(known),
+    }
 
 
 def _not_judged(known: Subject) -> str:

@@ -28,11 +28,6 @@ def test_rules_show_their_orders(tmp_path):
         slope = math.log(coarse["median"] / fine["median"], 2)  # twice as many steps
         assert slope > coarse["order"] - 0.4, (kind, slope)
         assert fine["evaluations_per_time"] > 1.5 * coarse["evaluations_per_time"]
-    # a better guess costs fewer evaluations for the same motion, and one iteration from a bad one is not enough
-    guesses = {p["setting"]: p for p in points if p["kind"] == "guess order"}
-    far, near = (guesses[f"midpoint_heun, guess of order {k}, ≤ 30 iterations"] for k in (0, 3))
-    assert near["evaluations_per_time"] <= far["evaluations_per_time"]
-    assert near["median"] == pytest.approx(far["median"], rel=1e-6)
     # what is done is not done again
     before = out.read_text()
     work_precision.main([*options, "--resume"])
@@ -107,8 +102,8 @@ def test_a_network_in_c_is_the_network(layers):
     assert float((q[:, 0] - wanted[:, :n]).abs().max()) < 1e-6
 
 
-def test_fronts_and_ratios():
-    # fails if a dominated point is kept, or a rival that misses the error is compared with
+def test_the_front():
+    # fails if a dominated point is kept
 
     def point(kind, us, error):
         return {"kind": kind, "setting": f"{us}", "us_per_time": us, "spread": 0.0, "median": error, "q95": error}
@@ -117,8 +112,6 @@ def test_fronts_and_ratios():
               point("neural ODE, DOP853", 30.0, 5e-5), point("DOP853, true equations", 8.0, 1e-4),
               point("RK4, true equations", 1.0, None)]  # fmt: skip
     assert [p["us_per_time"] for p in work_precision.front(points)] == [1.0, 2.0, 30.0]
-    (row,) = work_precision.headline(points)
-    assert (row["neural ODE"], row["DOP853"], row["RK4"]) == (15.0, 4.0, None)
 
 
 def test_a_setting_is_chosen_on_other_starts_than_it_is_judged_on():

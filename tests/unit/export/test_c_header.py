@@ -370,7 +370,7 @@ def test_wrong_states_are_refused(tmp_path):
     assert isinstance(compiled, ExportedStepper)
     q, p, s = states_of(2, 3)
     for state, h, message in (
-        (State(q.float(), p, s), 0.1, "must be torch.float64"),
+        (State(q.float(), p.float(), s.float()), 0.1, "must be torch.float64"),
         (State(q[:, :1], p, s), 0.1, "need shapes"),
         (State(q, p * math.nan, s), 0.1, "must be finite"),
         (State(q.clone().requires_grad_(), p, s), 0.1, "without gradient"),

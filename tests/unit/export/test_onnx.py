@@ -129,15 +129,15 @@ def test_wrong_states_are_refused(written):
     # fails if the loader leaves the checks to onnxruntime
     exported = written[2]
     q, p, s = states_of(2, 4)
-    with pytest.raises(InputError, match=r"q must be torch.float64, got torch.float32"):
-        exported.step(State(q.float(), p, s), 0.1)
+    with pytest.raises(InputError, match=r"q must be torch.float64, as the model is, got torch.float32"):
+        exported.step(State(q.float(), p.float(), s.float()), 0.1)
     with pytest.raises(InputError, match="need shapes"):
         exported.step(State(q, p[:3], s), 0.1)
     with pytest.raises(InputError, match="p must be finite"):
         exported.rollout(q, p * torch.nan, s, h=0.1, steps=2)
     with pytest.raises(InputError, match="has no derivatives"):
         exported.step(State(q.requires_grad_(), p, s), 0.1)
-    with pytest.raises(InputError, match="h must be finite and > 0"):
+    with pytest.raises(InputError, match="h must be"):
         exported.step(State(q.detach(), p, s), -0.1)
     with pytest.raises(InputError, match="q0 must be finite"):
         exported.init(q.detach() * torch.nan, p, s, 0.1)

@@ -10,7 +10,6 @@ from herglotz.scenes import (
     NumericallyExact,
     Reason,
     exact_discrete_lagrangian,
-    hamiltonian_motion,
     herglotz_motion,
     scene,
     scene_names,
@@ -48,16 +47,14 @@ def assert_same(P, A, atol):
 
 
 @pytest.mark.parametrize("name", ["damped_oscillator", "quadratic_drag"])
-@pytest.mark.parametrize("door", ["lagrangian", "hamiltonian"])
-def test_closed_forms(name, door):
+def test_closed_forms(name):
     # fails if any of the ten formulas in the sensitivities is wrong, if v is not turned into p = L_v (which depends on
     # s for the drag), or if a constant c hides its gradient (c = e^{2λΔ} there)
     system = scene(name, **scene(name).examples[0])
     q, p, s = starts(system, 2)
     h = f64(0.3, 0.8)
     q1 = system.flow(q, p, s, h)[0] + 0.05
-    motion = hamiltonian_motion(system.hamiltonian, system.momentum) if door == "hamiltonian" else system.lagrangian
-    P = partials(exact_discrete_lagrangian(motion), q, q1, s, h, 2)
+    P = partials(exact_discrete_lagrangian(system.lagrangian), q, q1, s, h, 2)
     assert_same(P, partials(system.L_d, q, q1, s, h, 2), atol=2e-11 if name == "quadratic_drag" else 1e-13)
 
 
@@ -136,7 +133,7 @@ def test_beyond_a_conjugate_point_is_nan_with_a_reason():
     # fails if a motion past a conjugate point (a wrong branch of L_d) is returned: for the oscillator that is h > π/ω,
     # also past the second one; in the plane det ∂q/∂p = (sin ωh/ω)² never changes its sign
     system = scene("damped_oscillator")
-    L_d = exact_discrete_lagrangian(hamiltonian_motion(system.hamiltonian, system.momentum))
+    L_d = exact_discrete_lagrangian(system.lagrangian)
     q = torch.zeros(4, 2, dtype=torch.float64) + 0.5
     h = f64(3.0, 3.3, 6.0, 7.0)  # π/ω = 3.157, 2π/ω = 6.315
     shot = L_d.shoot(q, q + 0.3, torch.zeros(4).double(), h)

@@ -172,5 +172,5 @@ def test_a_state_in_another_dtype_than_the_model_is_refused():
     model = ContactLagrangian(ModelConfig())
     state = State(torch.ones(1), torch.ones(1), torch.tensor(0.0))
     for step in (lambda: Stepper(model).step(state, 0.1), lambda: Stepper(model).rollout(*state, h=0.1, steps=2)):
-        with pytest.raises(InputError, match=r"the state is torch\.float32 and the model torch\.float64"):
+        with pytest.raises(InputError, match=r"q must be torch\.float64, as the model is, got torch\.float32"):
             step()

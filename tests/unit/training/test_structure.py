@@ -52,7 +52,7 @@ def test_one_linear_problem_finds_the_double_pendulum(gaps):
     # step like the others
     data = double_pendulum(gaps=gaps)
     names = revolute(data.angles)
-    found = LinearFit.of(data.angles, names, data.triples(1.5 * data.typical_step))
+    found = LinearFit.of(data.angles, names, data.triples(1.5 * data.typical_step), data.balance)
     x = found.solve(torch.ones(len(found.names), dtype=torch.bool))
     start = found.start(x)
     assert start is not None

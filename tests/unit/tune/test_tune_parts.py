@@ -67,11 +67,9 @@ def test_too_few_starts_are_refused():
     ("wrong", "words"),
     [
         ({"multiples": (0.5,)}, "whole numbers"),
-        ({"multiples": (0.3,), "reference": "limit"}, "multiples of 1/4"),
         ({"multiples": ()}, "empty"),
         ({"widths": (0,)}, "widths must be >= 1"),
         ({"artefacts": ("rust",)}, "artefacts must be some of"),
-        ({"reference": "truth"}, "unknown reference"),
         ({"quantile": 1.0}, "quantile must be in"),
         ({"rounds": 0}, "rounds must be >= 1"),
     ],
@@ -115,35 +113,11 @@ def test_starts_lie_in_the_box_and_differ_with_the_seed():
     assert not torch.isin(a.q, run.states.q).all()
 
 
-def test_limit_reference_is_the_limit():
-    # fails if Richardson's weights or the recorded times are wrong: h/4 is 16 times nearer to the limit than h
-    run = run_of()
-    motions = record(run, draw_starts(run, 8, 0), 1.2, "limit")
-    errors = []
-    for stride, h in ((4, H), (1, H / 4)):
-        reference = motions.every(stride)
-        with torch.no_grad():
-            out = run.stepper.rollout(*motions.starts(), h=h, steps=reference.s.shape[1] - 1)
-        errors.append(float((out.q - reference.q).abs().max()))
-    assert errors[0] / errors[1] == pytest.approx(16, rel=0.1)
-    assert motions.error < 1e-2 * errors[1]
-    with torch.no_grad():  # another 1/128 of the step: 1/16384 of the error is left
-        fine = run.stepper.rollout(*motions.starts(), h=H / 512, steps=6 * 512, every=128).q
-    assert float((fine - motions.states.q).abs().max()) < 1e-3 * errors[1]
-
-
-def test_a_corrected_model_has_no_limit():
-    # fails if a correction that is right at one step is stepped at another and called a reference
-    run = run_of(width=4)
-    with pytest.raises(InputError, match="right at its own step only"):
-        record(run, draw_starts(run, 8, 0), 2.4, "limit")
-
-
 @pytest.mark.parametrize("level", ["conservative", "linear", "affine"])
 def test_a_flow_of_the_model_itself_has_no_residual(level):
     # fails if a residual of the distillation is not zero at the model that made the motions
     run = run_of(level)
-    motions = record(run, draw_starts(run, 8, 0), 2.4, "own")
+    motions = record(run, draw_starts(run, 8, 0), 2.4)
     problem = FlowProblem(run.model, *pairs_of(motions.states, 1, 40, 0), H)
     assert float(problem.residuals(problem.start()).abs().max()) < 1e-13
     moved = problem.start() + 1e-3
@@ -154,7 +128,7 @@ def test_a_flow_of_the_model_itself_has_no_residual(level):
 def test_each_part_of_the_state_has_its_residual(part, column):
     # fails if p or s of the second state are not asked for
     run = run_of()
-    motions = record(run, draw_starts(run, 8, 0), 2.4, "own")
+    motions = record(run, draw_starts(run, 8, 0), 2.4)
     before, after = pairs_of(motions.states, 1, 20, 0)
     wrong = State(*(x + 1e-3 * (k == part) for k, x in enumerate(after)))
     problem = FlowProblem(run.model, before, wrong, H)
@@ -165,7 +139,7 @@ def test_each_part_of_the_state_has_its_residual(part, column):
 def test_distilled_model_steps_two_at_a_time_in_the_same_coordinates():
     # fails if p or s are left out of the objective: the states of the run would mean something else to the new model
     run = run_of()
-    motions = record(run, draw_starts(run, 60, 0), 2.4, "own")
+    motions = record(run, draw_starts(run, 60, 0), 2.4)
     before, after = pairs_of(motions.states, 2, 200, 0)
     model, rms = distil(widened(run.model, 6), before, after, 2 * H, iterations=100)
     assert rms < 1e-5

@@ -6,12 +6,13 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
+from herglotz.data.roughness import precisions
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State
 from herglotz.training import FitConfig, Run, save_run
 from herglotz.verify import verify
-from herglotz.verify.data_checks import data_checks, noise_level
+from herglotz.verify.data_checks import data_checks
 
 
 def run_of(noise=0.0, h=0.1, stiffness=1.0, prediction=None, rate=0.2, **options):
@@ -143,14 +144,14 @@ def test_the_noise_estimate(irregular):
     t = h.cumsum(0)
     q = torch.sin(t) + 0.01 * torch.randn(2000, generator=make, dtype=torch.float64)
     data = Trajectories.of(t, q)
-    assert float(noise_level(data.t, data.q, data)) == pytest.approx(0.01, rel=0.1)
+    assert float(precisions(data)) == pytest.approx(0.01, rel=0.1)
 
 
 def test_the_noise_estimate_of_clean_coarse_data_is_small():
     # fails if the motion itself counts as noise: six samples a period
     t = torch.arange(200, dtype=torch.float64)
     data = Trajectories.of(t, torch.sin(t))
-    assert float(noise_level(data.t, data.q, data)) < 0.02
+    assert float(precisions(data)) < 0.02
 
 
 def test_a_run_folder(tmp_path):

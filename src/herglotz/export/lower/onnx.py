@@ -19,7 +19,7 @@ from herglotz.export.programs import programs_of, quiet
 from herglotz.export.write import writes
 from herglotz.models import ContactLagrangian
 
-OPSET = 20
+OPSET = 20  # of 2023: onnxruntime 1.17 and later
 OUTPUTS = ("q_out", "p_out", "s_out", "c", "residual", "status", "outside")
 
 

@@ -120,6 +120,7 @@ def _is_zero(x: Any) -> bool:
     return isinstance(x, fx.Node) and x.target == aten.zeros.default
 
 
+# One line an operation; those that are one of ONNX are in SIMPLE.
 TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     torch.ops.higher_order.while_loop: _while,
     torch.ops.higher_order.scan: _scan,

@@ -30,7 +30,7 @@ class LeastSquares:
     data
         Trajectories of positions, and of inputs where the model takes them.
     sigma
-        Standard deviation of the noise of q, in units of q.
+        Standard deviation of the noise of q over its `balance`.
     prior
         Penalty on the parameters; None: there is none.
     freedom
@@ -49,6 +49,7 @@ class LeastSquares:
         self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
         self.P = len(self.parameters.get())
         self.sigma, self.prior, self.freedom = sigma, prior, freedom
+        self.deviations = sigma * data.balance  # (n,) of each coordinate, in its unit
         self.u = step_inputs(model, data)  # (N, m)
 
     def loss(self, *residuals: Tensor) -> Tensor:

@@ -77,7 +77,7 @@ class OneStep(LeastSquares, ABC):
             return self._local(self._theta(x), *self._rows(slice(None), self._carried(x, derivative=False)))
 
     def residuals(self, x: Tensor) -> Tensor:
-        """The errors of the recorded positions, (T, n), in units of q (of p for the raw metric)."""
+        """The errors of the recorded positions, (T, n), over the balance of the coordinates (of p: the raw metric)."""
         return self.all_residuals(x)[:, : self.n]
 
     def cost(self, x: Tensor) -> Tensor:
@@ -196,7 +196,7 @@ class ResidualProblem(OneStep):
         return torch.cat([theta, theta.new_zeros(self.latents)])
 
     def residuals(self, x: Tensor) -> Tensor:
-        """R of the recorded triples, (T, n), in units of q (or of p for the raw metric)."""
+        """Those of the recorded triples, (T, n); see `OneStep`."""
         return self.all_residuals(x)[: self.recorded]
 
     def cost_and_gradient(self, x: Tensor, rows: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -238,7 +238,7 @@ class ResidualProblem(OneStep):
         return r, J + r_s[..., None] * carried[1][self.triples.index[part]][:, None, :]
 
     def _local(self, x: Tensor, *rows: Any) -> Tensor:
-        """J⁻¹R (or R) of one triple or of a batch of them."""
+        """J⁻¹R over the balance of the coordinates (or R) of one triple or of a batch of them."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
         before = self.parameters.partials(x, q0, q1, s0, h0, 1, u0)
         after = self.parameters.partials(x, q1, q2, s0 + before.L, h1, 2, u1)
@@ -246,7 +246,7 @@ class ResidualProblem(OneStep):
         R = momentum_residual(after, p)
         if self.metric == "raw":
             return R
-        return solve(momentum_jacobian(after, p), R)
+        return solve(momentum_jacobian(after, p), R) / self.data.balance
 
     def _jacobian_of_many(self, theta: Tensor, *rows: Any) -> Tensor:
         """J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
@@ -262,4 +262,4 @@ class ResidualProblem(OneStep):
         with torch.no_grad():
             p = momentum_plus(self.parameters.partials(theta, q0, q1, s0, h0, 1, u0))
             J = momentum_jacobian(self.parameters.partials(theta, q1, q2, s0, h1, 2, u1), p)
-        return torch.linalg.solve_ex(J, R)[0]
+        return torch.linalg.solve_ex(J, R)[0] / self.data.balance[:, None]

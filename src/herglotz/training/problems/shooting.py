@@ -2,7 +2,7 @@
 
 Unknowns are the parameters and the state (q, p[, s]) at the start of every segment. Residuals are
 
-    (q_model − q_data) / σ     at every sample,
+    (q_model − q_data) / σ     at every sample, σ of each coordinate being one number times its `balance`,
     (end of a segment − start of the next) / weight     between segments,
     (s − s_known or 0) / weight                         at the start of a trajectory, where the motion depends on s,
 
@@ -57,7 +57,7 @@ class ShootingProblem(StatesProblem):
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
         self.weight = self.used[grid.sample].to(data.q)[:, None]  # (N', 1)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
-        relative = self.sigma / self.scale
+        relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
         self.s = s
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
@@ -134,7 +134,7 @@ class ShootingProblem(StatesProblem):
         S = grid.segments
         A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
         segment = grid.node // (grid.h.shape[1] + 1)
-        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.sigma)[..., None]  # (N', n, P + d)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N', n, P + d)
         for k in range(S):
             own = segment == k
             self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
@@ -199,8 +199,11 @@ class ShootingProblem(StatesProblem):
         self.path = Path(x, x[..., None])
 
     def misfit(self, path: Path) -> Tensor:
-        """q_model − q_data at every sample, (N', n), in units of q."""
-        return path.x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+        """q_model − q_data over the balance of the coordinates at every sample, (N', n)."""
+        return self._missed(path.x) / self.data.balance
+
+    def _missed(self, x: Tensor) -> Tensor:
+        return x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
 
     def joint_residuals(self, path: Path) -> Tensor:
         """End of each segment less the start of the next, (S, d), over the joint's weight."""
@@ -213,7 +216,8 @@ class ShootingProblem(StatesProblem):
         """
         r = self.misfit(path) / self.sigma
         by = self.weight * self.root_weights(r)
-        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n] * (by / self.sigma)[..., None]
+        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
+        Z = Z * (by / self.deviations)[..., None]
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
@@ -224,8 +228,7 @@ class ShootingProblem(StatesProblem):
 
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
-        miss = x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
-        fit = self.weight * miss / self.sigma
+        fit = self.weight * self._missed(x) / self.deviations
         before = self.grid.joined_to.clamp_min(0)
         ends = x[before, self.grid.end[before], : self.d]
         joints = (ends - x[:, 0, : self.d]) / self.joint_weight

@@ -59,9 +59,9 @@ class SmoothingProblem(StatesProblem):
         self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
         scale, speed = self.scale, self.speed
         # What a force that the model does not know adds to p in a step, to q by the way, and to s.
-        p = (speed / scale).expand(*grid.h.shape, n)
-        s = (scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
-        self.w = process * self.sigma * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
+        p = (self.deviations * speed / scale).expand(*grid.h.shape, n)
+        s = (self.sigma * scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
+        self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
         self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
 
     def start(self) -> Tensor:
@@ -112,7 +112,7 @@ class SmoothingProblem(StatesProblem):
             return x.new_full((), torch.inf), Bordered(corner, border, (diagonal, upper, lower)), unknown
         y, A = stepped[0], stepped[1][..., :d, :d]
         fit, defect = self._residuals(states, y)
-        by_fit = self.seen * self.root_weights(fit) / self.sigma  # (S, M, n)
+        by_fit = self.seen * self.root_weights(fit) / self.deviations  # (S, M, n)
         by_step = self.inside[:, 1:] * self.root_weights(defect) / self.w  # (S, K, d)
         weighted, weight = by_step * self.root_weights(defect) * defect, by_step.square()[..., None]
         WA = weight * A
@@ -144,8 +144,8 @@ class SmoothingProblem(StatesProblem):
         return cost, Bordered(corner, border, (diagonal, upper, lower)), torch.cat([top, gradient.flatten()])
 
     def misfit(self, x: Tensor) -> Tensor:
-        """Q − q_data at every sample, (N, n), in units of q."""
-        return self.unpack(x)[1].flatten(0, 1)[self.node, : self.n] - self.data.q
+        """Q − q_data over the balance of the coordinates at every sample, (N, n)."""
+        return (self.unpack(x)[1].flatten(0, 1)[self.node, : self.n] - self.data.q) / self.data.balance
 
     def defects(self, x: Tensor) -> Tensor:
         """(Φ̃(X_k) − X_{k+1})/w of every step, (S, K, d); 0 where there is none."""
@@ -176,7 +176,7 @@ class SmoothingProblem(StatesProblem):
 
     def _residuals(self, states: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:
         """Of the data, (S, M, n), and of the steps, (S, K, d); 0 where there is no sample or no step."""
-        fit = self.seen * (states[..., : self.n] - self.target) / self.sigma
+        fit = self.seen * (states[..., : self.n] - self.target) / self.deviations
         return fit, self.inside[:, 1:] * (y[..., : self.d] - states[:, 1:]) / self.w
 
     def _anchor(self, states: Tensor) -> Tensor:

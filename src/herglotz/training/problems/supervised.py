@@ -94,7 +94,7 @@ class SupervisedProblem(OneStep):
         before = self.parameters.partials(theta, q0, q1, s0 * per_unit, h0, 1, u0)
         after = self.parameters.partials(theta, q1, q2, s1 * per_unit, h1, 2, u1)
         p = momentum_plus(before)
-        r_q = solve(momentum_jacobian(after, p), momentum_residual(after, p))
+        r_q = solve(momentum_jacobian(after, p), momentum_residual(after, p)) / self.data.balance
         r_s = ((s1 - s0) * per_unit - before.L) * self.of_s
         parts = [r_q, r_s[..., None]]
         if p1 is not None:

@@ -1,0 +1,91 @@
+"""Translations that a model has by construction: nothing in it that depends on the position sees them.
+
+A translation is named by what moves together, "q1 + q2" or "q1 - 0.5 q2": q ↦ q + ε d, with d the numbers of that form.
+Networks read their features through the projection on the complement of d, features must be functions of what d leaves
+alone, and the baseline has no spring on what moves. L_d is then invariant, so that J = p·d obeys J_{k+1} = c_k J_k to
+rounding at every step (`herglotz.theory.symmetries` finds what to ask for).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.models.feature_grammar import parse
+from herglotz.models.features import expand
+
+HOW = "name what moves together, as 'q1 + q2'"
+
+
+def directions(texts: Sequence[str], angles: Sequence[bool]) -> list[tuple[float, ...]]:
+    """The d of every translation, n numbers each.
+
+    Raises
+    ------
+    InputError
+        If a text is no linear form of coordinates, or moves an angle together with another coordinate.
+    """
+    found = []
+    for text in texts:
+        try:
+            d = parse(f"sin({text})", angles)[0].form  # the sine of a form may hold angles
+        except InputError as error:
+            raise InputError(f"translation '{text}': {str(error).split(': ', 1)[-1]}; {HOW}") from None
+        if not any(d):
+            raise InputError(f"translation '{text}': is no direction; {HOW}")
+        if any(w and a for w, a in zip(d, angles, strict=True)) and sum(map(bool, d)) > 1:
+            raise InputError(
+                f"translation '{text}': an angle is translated alone; name features of differences instead"
+            )
+        found.append(d)
+    return found
+
+
+def check_translations(config: Any) -> None:
+    """Raise `InputError` where a term of the model would see a translation that the model is to have."""
+    moved = directions(config.translations, config.angles)
+    if not moved:
+        return
+    sees = {
+        "a mass that depends on position": config.mass_width > 0,
+        "the level full": config.level == "full",
+        "order 4": config.order == 4,
+        "terms by name": bool(config.terms),
+        "drag that depends on position": any("q" in text for text in config.drag),
+    }
+    for what in (name for name, is_there in sees.items() if is_there):
+        raise InputError(f"translations: {what} would see them; leave it out, or the translations")
+    for text in expand((*config.features, *config.known), config.angles):
+        for product in parse(text, config.angles):
+            changes = product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) for d in moved)
+            if changes and (product.power or any(product.form)):
+                raise InputError(f"feature '{text}': changes under the translation; name one of differences")
+
+
+def unmoved(config: Any, values: tuple[float, ...]) -> tuple[float, ...]:
+    """Stiffness or tilt, zero where a coordinate is moved."""
+    moved = directions(config.translations, config.angles)
+    return tuple(0.0 if any(d[i] for d in moved) else x for i, x in enumerate(values))
+
+
+def blind(config: Any, velocities: int) -> Tensor | None:
+    """What networks may see of their features (position, then so many velocities): a projection (m, m), or None."""
+    moved = directions(config.translations, config.angles)
+    if not moved:
+        return None
+    columns = [[] for _ in moved]
+    for i, (angle, scale) in enumerate(zip(config.angles, config.scale, strict=True)):
+        for column, d in zip(columns, moved, strict=True):
+            column += [d[i], d[i]] if angle else [d[i] / scale]
+    rows = []
+    for column, d in zip(columns, moved, strict=True):
+        lone = any(w and a for w, a in zip(d, config.angles, strict=True))
+        at = [i for i, x in enumerate(column) if x]
+        rows += [[float(i == j) for j in range(len(column))] for i in at] if lone else [column]
+    seen = torch.tensor(rows, dtype=torch.float64)
+    seen = torch.cat([seen, seen.new_zeros(len(seen), velocities)], 1)
+    return torch.eye(seen.shape[1], dtype=torch.float64) - torch.linalg.pinv(seen) @ seen

@@ -1,0 +1,338 @@
+"""The affine point symmetries of a discrete Lagrangian, found as a null space, and the quantities that they keep.
+
+A generator ξ(q) = A q + b moves positions, and the action by s ↦ s + ε (a s + χ(q)), χ(q) = k + w·q + ½ q·B q. It is
+a symmetry of L_d where
+
+    D1·ξ(q0) + D2·ξ(q1) + c (a s0 + χ(q0)) − (a s1 + χ(q1)) = 0,        s1 = s0 + L_d,
+
+at every (q0, q1, s0) of an open set. χ = a = 0 is invariance. χ ≠ 0 is invariance up to a boundary term, which a
+translation in a magnetic field needs, and one along gravity with damping (χ = −mg/γ). a = 2 and A = 1 scale the
+solutions of a linear equation. By −D1 = c p_k and D2 = p_{k+1} the left-hand side is J_{k+1} − c_k J_k for
+
+    J(q, p, s) = p·ξ(q) − a s − χ(q),
+
+so that J_{k+1} = c_k J_k is not a consequence of the symmetry but the symmetry itself (`herglotz.theory.noether`), and
+J_k = σ_k J_0. With forces the same holds of L_d, and J changes by F⁻·ξ(q0) + F⁺·ξ(q1) beside.
+
+The condition is linear in (A, b, a, k, w, B). Its defects are summed along motions of K steps, J_k − σ_k J_0, so that
+what is no symmetry is broken by its whole rate of change and not by h times it; χ is chosen best for every ξ by
+projection; a singular value is then an RMS defect over the RMS of what no boundary term explains of p·ξ − a s, a number
+without a unit that s ↦ s + b(q), b quadratic, does not change: the **drift**. A generator is a symmetry where its drift
+is at most `precision`: rounding of an L_d that is known, the relative error of the free run of a learned one (J is then
+kept as precisely as the model keeps its positions). Positions alone determine L_d up to a gauge (trap 3): a network
+that was fitted to them may hide a symmetry behind a boundary term that is not quadratic; named terms do not.
+
+Sources: E. Lishkova, P. Scherer, S. Ridderbusch, M. Jamnik, P. Liò, S. Ober-Blöbaum, C. Offen, Discrete Lagrangian
+neural networks with automatic symmetry discovery, IFAC-PapersOnLine 56 (2023) 3203; contact Noether theorem: section 1
+of `docs/mathematics.md`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from herglotz.errors import InputError
+from herglotz.mechanics.partials import DiscreteLagrangian, partials
+from herglotz.stepping import State, Status, Stepper
+from herglotz.theory.symmetry_words import formula, name_of
+
+# Of drift. Symmetries of an L_d that is known leave 1e-16 to 1e-13; breaking one by 1e-7 of the force leaves more
+# (`tests/unit/theory/test_symmetries.py`).
+PRECISION = 1e-9
+SEEN = 1e-7  # of the largest: a generator whose p·ξ − a s is smaller on all motions is not determined by them
+FLAT = 1e-12  # of its terms: a boundary term whose defect is smaller is trivial, as a constant where c = 1
+NEAR = 0.05  # of its largest entry: entries so near to ½, 1, … are tried there
+
+
+@dataclass(frozen=True)
+class Symmetries:
+    """r generators in the order translations, rotations and others; `print` says each in words, with its J.
+
+    `len` is r. A basis of the algebra is reduced to entries 0 and 1 as far as it can be.
+    """
+
+    A: Tensor  # (r, n, n) ξ(q) = A q + b
+    b: Tensor  # (r, n)
+    a: Tensor  # (r) s ↦ s + ε (a s + χ)
+    k: Tensor  # (r) χ(q) = k + w·q + ½ q·B q
+    w: Tensor  # (r, n)
+    B: Tensor  # (r, n, n)
+    drift: Tensor  # (r) RMS of J_k − σ_k J_0 over that of p·ξ − a s without boundary terms
+    spectrum: Tensor  # (m) drifts of all directions that were tried, the smallest first
+    precision: float  # the drift up to which a generator is a symmetry
+    unseen: int  # directions that the motions do not determine
+    coordinates: tuple[str, ...]
+
+    def __len__(self) -> int:
+        return len(self.a)
+
+    @property
+    def gap(self) -> float:
+        """The drift of the best direction that is no symmetry, over `precision`; infinite where there is none."""
+        rest = self.spectrum[len(self) :]
+        return float(rest[0]) / self.precision if len(rest) else float("inf")
+
+    def generator(self, q: Tensor) -> Tensor:
+        """ξ(q) of every symmetry, (..., n) → (..., r, n)."""
+        return (self.A.to(q) @ q[..., None, :, None])[..., 0] + self.b.to(q)
+
+    def shift(self, q: Tensor, s: Tensor) -> Tensor:
+        """What a generator adds to s: a s + χ(q), (..., n) and (...) → (..., r)."""
+        bent = (q[..., None, None, :] @ self.B.to(q) @ q[..., None, :, None])[..., 0, 0]
+        return self.a.to(s) * s[..., None] + self.k.to(q) + q @ self.w.to(q).mT + 0.5 * bent
+
+    def momentum(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        """J = p·ξ(q) − a s − χ(q) of every symmetry, (..., r): J_{k+1} = c_k J_k."""
+        return (p[..., None, :] * self.generator(q)).sum(-1) - self.shift(q, s)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Every symmetry in words, such as "translation along x" or "rotation in the plane (x, y)"."""
+        return tuple(name_of(self.A[i], self.b[i], float(self.a[i]), self.coordinates) for i in range(len(self)))
+
+    def to_dict(self) -> dict[str, object]:
+        """Plain dictionary for JSON."""
+        numbers = {name: getattr(self, name).tolist() for name in ("A", "b", "a", "k", "w", "B", "drift", "spectrum")}
+        more = {"names": self.names, "precision": self.precision, "unseen": self.unseen, "gap": self.gap}
+        return {**numbers, **more, "coordinates": self.coordinates}
+
+    def __str__(self) -> str:
+        lines = [f"affine point symmetries: {len(self) or 'none'}"]
+        for i, name in enumerate(self.names):
+            J = formula(self.A[i], self.b[i], self.a[i], self.k[i], self.w[i], self.B[i], self.coordinates)
+            lines.append(f"  {name}: J = {J}, drift {float(self.drift[i]):.1e}")
+        rest = self.spectrum[len(self) :]
+        lines.append(f"  a symmetry keeps J_k = σ_k J_0 within {self.precision:.1e} of p·ξ")
+        if len(rest):
+            lines.append(f"  the best other direction drifts by {float(rest[0]):.1e}")
+        if self.unseen:
+            lines.append(f"  {self.unseen} directions are not determined by these motions")
+        return "\n".join(lines)
+
+
+def symmetries(
+    L_d: DiscreteLagrangian,
+    states: tuple[Tensor, Tensor, Tensor],  # (q, p, s): (B, n), (B, n), (B)
+    h: Tensor | float,
+    *,
+    steps: int = 40,
+    precision: float = PRECISION,
+    angles: Sequence[bool] = (),
+    coordinates: Sequence[str] = (),
+) -> Symmetries:
+    """The Lie algebra of affine point symmetries of L_d, and the quantities J with J_{k+1} = c_k J_k.
+
+    Parameters
+    ----------
+    L_d
+        The discrete Lagrangian, also one with forces.
+    states
+        Starts of motions that fill an open set; of a single motion not every direction is determined (`unseen`).
+    h
+        Time step.
+    steps
+        K, the steps of each motion; the motions should last long enough for what is no symmetry to change.
+    precision
+        Largest drift of a symmetry.
+    angles
+        Which coordinates are angles: ξ and χ do not depend on those, which keeps them single-valued.
+    coordinates
+        Names for the words; by default q1, q2, ….
+
+    Returns
+    -------
+    Symmetries
+
+    Raises
+    ------
+    InputError
+        If the shapes do not fit, or no motion could be stepped.
+    """
+    q, p, s = states
+    if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
+        raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
+    n = q.shape[-1]
+    names = tuple(coordinates) or tuple(f"q{i + 1}" for i in range(n))
+    for what, given in (("angles", angles), ("coordinates", names)):
+        if len(given) not in (0, n):
+            raise InputError(f"{what} needs one entry a coordinate ({n}), got {len(given)}")
+    straight = [i for i in range(n) if not (angles and angles[i])]
+    return _null_space(_columns(L_d, State(q, p, s), h, steps, straight), precision, names)
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """A column a basis generator: A (of the straight coordinates, row by row), b, a; and a boundary term: k, w, B.
+
+    The columns are functions of q − q̄ and s − s̄.
+    """
+
+    defect: Tensor  # (R, m) J_k − σ_k J_0
+    size: Tensor  # (R, m) p·ξ − a s without what boundary terms explain
+    shift: Tensor  # (R, m') J_k − σ_k J_0 of the boundary terms
+    terms: Tensor  # (m') RMS of the boundary terms
+    centre: Tensor  # (n) q̄
+    middle: Tensor  # () s̄
+    straight: list[int]  # coordinates that are no angles
+
+    @property
+    def usable(self) -> Tensor:
+        """Which boundary terms change anything, (m')."""
+        return _rms(self.shift) > FLAT * self.terms
+
+    def chi(self, rows: Tensor) -> Tensor:
+        """The boundary terms that leave least of the defects of generators, (r, m) → (r, m')."""
+        usable = self.usable
+        U, S, V = torch.linalg.svd(self.shift[:, usable] / self.terms[usable], full_matrices=False)
+        own = FLAT * (S.amax() if len(S) else 1.0) < S
+        left = (rows @ self.defect.mT) @ (U[:, own] / S[own]) @ V[own]
+        chi = rows.new_zeros(len(rows), len(usable))
+        chi[:, usable] = -left / self.terms[usable]
+        return chi
+
+    def drift(self, rows: Tensor) -> Tensor:
+        """RMS of what is left over RMS of the size, (r)."""
+        left = rows @ self.defect.mT + self.chi(rows) @ self.shift.mT
+        return _rms(left.mT) / _rms(self.size @ rows.mT)
+
+    def about(self, rows: Tensor, point: Tensor) -> Tensor:
+        """The same generators with their b taken at another point: ξ = A (q − q̄) + b = A (q − q̄ − point) + b′."""
+        n, wide = len(point), len(point) * len(self.straight)
+        A = rows[:, :wide].unflatten(-1, (n, -1))
+        moved = rows.clone()
+        moved[:, wide : wide + n] += A @ point[self.straight]
+        return moved
+
+
+def _columns(L_d: DiscreteLagrangian, start: State, h: Tensor | float, steps: int, straight: list[int]) -> _Columns:
+    """Step the motions, and add up the defects of every basis generator along them."""
+    with torch.no_grad():
+        out = Stepper(L_d).rollout(*start, h=h, steps=steps)
+        whole = (out.status == Status.CONVERGED).all(-1)
+        if not bool(whole.any()):
+            raise InputError(f"no motion could be stepped {steps} times; give other states, a shorter h or fewer steps")
+        q, s = out.q[whole], out.s[whole]
+        P = partials(L_d, q[:, :-1], q[:, 1:], s[:, :-1], h)
+    centre, middle = q.mean((0, 1)), s.mean()
+    (q0, q1), (s0, s1) = ((x[:, :-1], x[:, 1:]) for x in (q - centre, s - middle))
+    chi0, chi1 = _boundary(q0[..., straight]), _boundary(q1[..., straight])
+    pair = lambda x, y: (x[..., :, None] * y[..., None, straight]).flatten(-2)  # noqa: E731
+    moved = [pair(P.D1, q0) + pair(P.D2, q1), P.D1 + P.D2, (P.c * s0 - s1)[..., None]]
+    step = torch.cat([*moved, P.c[..., None] * chi0 - chi1], -1)
+    rows = [step[:, 0]]
+    for k in range(1, steps):  # J_{k+1} − σ_{k+1} J_0 = c_k (J_k − σ_k J_0) + the defect of step k
+        rows.append(P.c[:, k, None] * rows[-1] + step[:, k])
+    defect = torch.stack(rows, 1).flatten(0, 1)
+    size = torch.cat([pair(P.D2, q1), P.D2, -s1[..., None]], -1).flatten(0, 1)
+    chi, m = chi1.flatten(0, 1), size.shape[-1]
+    # what a boundary term explains is no size, as a gauge adds it to p; nor is what s keeps of its start
+    sigma = P.c.cumprod(-1)
+    kept = torch.stack([sigma, sigma * s0[:, :1]], -1).flatten(0, 1)
+    size = torch.cat([_beside(chi, size[:, :-1]), _beside(torch.cat([chi, kept], -1), size[:, -1:])], -1)
+    if len(size) < 2 * defect.shape[-1]:
+        raise InputError(f"{len(size)} steps do not determine {defect.shape[-1]} numbers; give more states or steps")
+    return _Columns(defect[:, :m], size, defect[:, m:], _rms(chi), centre, middle, straight)
+
+
+def _beside(known: Tensor, columns: Tensor) -> Tensor:
+    """What columns have beside the span of others."""
+    U, S, _ = torch.linalg.svd(known / _rms(known).clamp_min(FLAT), full_matrices=False)
+    U = U[:, FLAT * S[0] < S]
+    return columns - U @ (U.mT @ columns)
+
+
+def _null_space(x: _Columns, precision: float, names: tuple[str, ...]) -> Symmetries:
+    """The generators whose drift is at most the precision, in a reduced basis: translations, then the others."""
+    n, wide = len(x.centre), len(x.centre) * len(x.straight)
+    basis, drift, unseen = _small(x, list(range(wide + n + 1)), precision)
+    moved, _, _ = _small(x, list(range(wide, wide + n)), precision)
+    moved = _reduced(moved, range(wide, wide + n))
+    # what is left beside the translations: the directions of the basis that are furthest from them
+    Q, _ = torch.linalg.qr(x.size @ moved.mT)
+    beside = x.size @ basis.mT
+    _, _, V = torch.linalg.svd(beside - Q @ (Q.mT @ beside), full_matrices=False)
+    rest = x.about(V[: len(basis) - len(moved)] @ basis, -x.centre)  # ξ = A q + b
+    rest = _reduced(rest, [wide + n, *range(wide)])
+    for row in moved:
+        at = int(row.abs().argmax())
+        rest = rest - rest[:, at, None] * row / row[at]
+    rows = torch.stack([_snapped(x, row, precision) for row in (*moved, *rest)]) if len(basis) else basis
+    about = x.about(rows, x.centre)
+    chi, A = x.chi(about), rows.new_zeros(len(rows), n, n)
+    A[:, :, x.straight] = rows[:, :wide].unflatten(-1, (n, -1))
+    k, w, B = _expanded(chi, x, rows[:, -1])
+    return Symmetries(A, rows[:, wide:-1], rows[:, -1], k, w, B, x.drift(about), drift, precision, unseen, names)
+
+
+def _small(x: _Columns, columns: list[int], precision: float) -> tuple[Tensor, Tensor, int]:
+    """Generators of some columns whose drift is at most the precision (r, m), all drifts, and the unseen directions."""
+    size = x.size[:, columns]
+    scale = _rms(size)
+    scale = torch.where(scale > 0, scale, 1.0)
+    _, G, W = torch.linalg.svd(size / scale, full_matrices=False)
+    seen = SEEN * G.amax() < G
+    unit = size.new_zeros(int(seen.sum()), x.size.shape[1])  # generators of size 1
+    unit[:, columns] = W[seen] / G[seen, None] * len(size) ** 0.5 / scale
+    U, drift, _ = torch.linalg.svd(unit @ x.defect.mT + x.chi(unit) @ x.shift.mT, full_matrices=False)
+    drift, U = (drift / len(size) ** 0.5).flip(0), U.flip(1)
+    return U[:, : int((drift <= precision).sum())].mT @ unit, drift, int((~seen).sum())
+
+
+def _reduced(rows: Tensor, columns: Sequence[int]) -> Tensor:
+    """Reduced rows of the same span, their pivots in these columns."""
+    rows, done, columns = rows.clone(), [], list(columns)
+    for _ in rows:
+        part = rows[:, columns].abs()
+        part = part / part.amax(1, keepdim=True).clamp_min(torch.finfo(rows.dtype).tiny)
+        part[done] = 0.0
+        i, j = int(part.argmax()) // len(columns), columns[int(part.argmax()) % len(columns)]
+        rows[i] = rows[i] / rows[i, j]
+        others = torch.arange(len(rows)) != i
+        rows[others] -= rows[others, j, None] * rows[i]
+        done.append(i)
+    return rows[done]
+
+
+def _snapped(x: _Columns, row: Tensor, precision: float) -> Tensor:
+    """A generator with its largest entry 1, and entries near halves of whole numbers put there if it stays one."""
+    n = len(x.centre)
+    A, b = row[: -n - 1], row[-n - 1 : -1]
+    for lead in (A, b, row[-1:]):
+        size = lead.abs().amax() if len(lead) else row.new_zeros(())
+        if float(size) > NEAR * float(row.abs().amax()):
+            row = row / lead[int((lead.abs() > 0.999 * size).nonzero()[-1])]  # of equal ones the last: x p_y − y p_x
+            break
+    whole = torch.round(2 * row) / 2
+    snapped = torch.where((row - whole).abs() < NEAR, whole, row)
+    return snapped if float(x.drift(x.about(snapped[None], x.centre))) <= precision else row
+
+
+def _boundary(q: Tensor) -> Tensor:
+    """1, q and the products q_i q_j, i ≤ j: (..., k) → (..., 1 + k + k (k + 1)/2)."""
+    i, j = torch.triu_indices(q.shape[-1], q.shape[-1])
+    return torch.cat([q.new_ones(*q.shape[:-1], 1), q, q[..., i] * q[..., j]], -1)
+
+
+def _expanded(chi: Tensor, x: _Columns, a: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """k, w, B of χ(q) = k + w·q + ½ q·B q from its terms about q̄, and of a s from those about s̄."""
+    n, size = len(x.centre), len(x.straight)
+    slope, B = chi.new_zeros(len(chi), n), chi.new_zeros(len(chi), n, n)
+    i, j = (torch.tensor(x.straight, dtype=torch.int64)[y] for y in torch.triu_indices(size, size))
+    slope[:, x.straight] = chi[:, 1 : 1 + size]
+    B[:, i, j] += chi[:, 1 + size :]
+    B[:, j, i] += chi[:, 1 + size :]
+    k = chi[:, 0] - slope @ x.centre + 0.5 * (B @ x.centre) @ x.centre - a * x.middle
+    return (
+        k if bool(x.usable[0]) else torch.zeros_like(k),
+        slope - B @ x.centre,
+        B,
+    )  # where c = 1 a constant belongs to J
+
+
+def _rms(x: Tensor) -> Tensor:
+    """Root mean square of every column."""
+    return x.square().mean(0).sqrt()

@@ -1,0 +1,84 @@
+"""A generator of an affine point symmetry, and the quantity that belongs to it, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+SMALL = 1e-6  # of the largest entry: not written
+
+
+def name_of(A: Tensor, b: Tensor, a: float, coordinates: Sequence[str]) -> str:
+    """Words for ξ(q) = A q + b with s ↦ s + ε a s, such as "translation along x"."""
+    A, b = _clean(A, b)
+    moved = [coordinates[i] for i in range(len(b)) if b[i] != 0]
+    if not bool(A.any()) and abs(a) <= SMALL:
+        if len(moved) == 1:
+            return f"translation along {moved[0]}"
+        if len(set(b[b != 0].tolist())) == 1:
+            return f"translation of {_and(moved)} together"
+        return f"translation along ({', '.join(f'{x:.4g}' for x in b.tolist())})"
+    about = _fixed_point(A, b)
+    turned = (A != 0).nonzero().tolist()
+    if abs(a) <= SMALL and len(turned) == 2 and bool((A * A.mT).sum() < 0) and about is not None:
+        i, j = turned[0]
+        kind = "rotation" if bool(torch.allclose(A, -A.mT)) else "elliptic rotation"
+        return f"{kind} in the plane ({coordinates[i]}, {coordinates[j]}){_around(about)}"
+    eye = torch.eye(len(b), dtype=A.dtype)
+    if about is not None and abs(a - 2) <= 1e-6 and bool(torch.allclose(A, eye)):
+        return f"scaling of q, and of s by its square{_around(about)}"
+    parts = [f"{name}′ = {_sum([*zip(A[i].tolist(), coordinates, strict=True), (float(b[i]), '')])}"
+             for i, name in enumerate(coordinates) if bool(A[i].any()) or b[i] != 0]  # fmt: skip
+    parts += [f"s′ = {a:.4g} s"] if abs(a) > SMALL else []
+    return f"affine motion {', '.join(parts)}"
+
+
+def formula(A: Tensor, b: Tensor, a: Tensor, k: Tensor, w: Tensor, B: Tensor, coordinates: Sequence[str]) -> str:
+    """J = p·(A q + b) − a s − χ(q) as text; entries below a millionth of the largest are left out."""
+    terms = []
+    for i, name in enumerate(coordinates):
+        terms.append((float(b[i]), f"p_{name}"))
+        terms += [(float(A[i, j]), f"{other} p_{name}") for j, other in enumerate(coordinates)]
+    terms.append((-float(a), "s"))
+    chi = [(-float(w[i]), name) for i, name in enumerate(coordinates)]
+    for i, name in enumerate(coordinates):
+        for j in range(i, len(coordinates)):
+            text = f"{name}²" if i == j else f"{name} {coordinates[j]}"
+            chi.append((-float(B[i, j]) * (0.5 if i == j else 1.0), text))
+    return _sum([*terms, *chi, (-float(k), "")])
+
+
+def _sum(terms: list[tuple[float, str]]) -> str:
+    """Return `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
+    least = SMALL * max(abs(x) for x, _ in terms)
+    terms = [(x, what) for x, what in terms if abs(x) > least]
+    first = next((i for i, (x, _) in enumerate(terms) if x > 0), 0)
+    text = ""
+    for x, what in [*terms[first : first + 1], *terms[:first], *terms[first + 1 :]]:
+        number = f"{abs(x):.4g}" if abs(abs(x) - 1) > SMALL or not what else ""
+        sign = " − " if x < 0 else " + "
+        text += (sign if text else sign.strip().replace("+", "")) + " ".join(y for y in (number, what) if y)
+    return text or "0"
+
+
+def _clean(A: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
+    least = SMALL * max(float(A.abs().max()), float(b.abs().max()))
+    return torch.where(A.abs() > least, A, 0.0), torch.where(b.abs() > least, b, 0.0)
+
+
+def _fixed_point(A: Tensor, b: Tensor) -> Tensor | None:
+    """The point q with A q + b = 0 nearest to 0, or None."""
+    point = torch.linalg.lstsq(A, -b[:, None], driver="gelsd").solution[:, 0]
+    return point if float((A @ point + b).abs().max()) <= SMALL * max(1.0, float(b.abs().max())) else None
+
+
+def _around(point: Tensor) -> str:
+    if float(point.abs().max()) <= SMALL:
+        return ""
+    return f" about ({', '.join(f'{x:.4g}' for x in point.tolist())})"
+
+
+def _and(names: Sequence[str]) -> str:
+    return ", ".join(names[:-1]) + f" and {names[-1]}"

@@ -1,0 +1,100 @@
+"""The symmetries of a scene, a run or a discrete Lagrangian: `theory.symmetries` with states and a precision."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from herglotz.errors import InputError
+from herglotz.stepping import State
+from herglotz.theory import Symmetries
+from herglotz.theory import symmetries as of_lagrangian
+from herglotz.theory.symmetries import PRECISION
+from herglotz.threads import one_thread
+from herglotz.training import Run
+from herglotz.verify.subject import subject
+
+OPENING = 0.3  # standard deviation of what is added to p, in standard deviations of p
+SURE = 3.0  # standard deviations of the free run's error within which J is kept
+STEPS, MOST = 40, 200  # of a motion: those of a scene, and at most of the unseen part of a recording
+
+
+@one_thread()
+def symmetries(
+    target: Any,
+    *,
+    h: float | None = None,
+    samples: int = 64,
+    steps: int | None = None,
+    seed: int = 0,
+    precision: float | None = None,
+) -> Symmetries:
+    """Find the affine point symmetries of a target, and the quantities J with J_{k+1} = c_k J_k.
+
+    Parameters
+    ----------
+    target, h, samples, seed
+        As for `herglotz.verify.verify`: a scene or its name, a run or its folder, an L_d with h, or (L_d, states).
+    steps
+        Steps of each motion; by default 40, and of a run those of the unseen part, at most 200.
+    precision
+        Largest drift of a symmetry. By default 1e-9 for an L_d that is known, and for a run three times the RMS
+        error of its free run over the unseen part (of the training part where nothing is unseen), relative to the RMS
+        size of the motion.
+
+    Returns
+    -------
+    herglotz.theory.Symmetries
+        `print` says each in words.
+
+    Raises
+    ------
+    InputError
+        If the target has no L_d, as an exported file, or its motions cannot be stepped.
+    """
+    known = subject(target, h, samples, seed)
+    states = known.states
+    if known.L_d is None:
+        raise InputError(f"{known.name}: has no L_d to look into; give the run that it was exported from")
+    angles: tuple[bool, ...] = ()
+    names: tuple[str, ...] = ()
+    length, exact = STEPS, PRECISION
+    if known.scene is not None:
+        angles, names = known.scene.angles, known.scene.coordinates
+    if known.run is not None:
+        angles, names = known.run.data.angles, known.run.data.names
+        length, exact = _unseen_steps(known.run), precision or max(_precision(known.run), PRECISION)
+        states = _opened(states, torch.Generator().manual_seed(seed))
+    return of_lagrangian(
+        known.L_d,
+        states,
+        torch.tensor(known.h, dtype=states.q.dtype),
+        steps=length if steps is None else steps,
+        precision=exact if precision is None else precision,
+        angles=angles,
+        coordinates=names,
+    )
+
+
+def _opened(states: State, make: torch.Generator) -> State:
+    """The states with p spread by `OPENING`: on the recorded motions alone J may be one number."""
+    q, p, s = states
+    offset = torch.randn(p.shape, generator=make, dtype=torch.float64).to(p)
+    return State(q, p + OPENING * p.std(0, correction=0) * offset, s)
+
+
+def _unseen_steps(run: Run) -> int:
+    """Model steps of the longest unseen part, at most `MOST`; `STEPS` where nothing is unseen."""
+    unseen = max(length - seen for length, seen in zip(run.data.lengths, run.train_lengths, strict=True))
+    return min(unseen * run.config.substeps, MOST) or STEPS
+
+
+def _precision(run: Run) -> float:
+    """`SURE` RMS errors of the free run over the unseen part, or of the training part, over the motion's RMS size."""
+    errors = (run.metrics.get(name) for name in ("extrapolation_rms", "train_rms"))
+    error = next((x for x in errors if x is not None), None)
+    spread = run.metrics.get("spread")
+    if error is None or not spread:
+        raise InputError("the run does not say how precise it is; give precision=, the largest drift of a symmetry")
+    return SURE * error / spread

@@ -1,0 +1,64 @@
+"""Long recordings of driven machines: the part a search begins with, segments, and errors of held-out time."""
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.stepping import Stepper
+from herglotz.training import Prior, ShootingProblem
+from herglotz.training.cross_validation import held_out_errors
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.trajectory_fit import segment_lengths
+
+
+def line(lengths):
+    t = torch.cat([torch.arange(n, dtype=torch.float64) / 10 for n in lengths])
+    return Trajectories.of(t, t.sin(), tuple(lengths))
+
+
+@pytest.mark.parametrize("lengths", [(31,), (1400, 60), (6670,), (20,)])
+def test_the_longest_segments_are_the_only_whole_trajectories(lengths):
+    # fails if a length above two thirds of a trajectory fits the whole of it, and the last stage fits it again
+    found = segment_lengths(line(lengths))
+    pieces = [max(1, round((max(lengths) - 1) / length)) for length in found]
+    assert pieces[-1] == 1
+    assert 1 not in pieces[:-1]
+
+
+def test_the_liveliest_part_is_where_the_motion_is():
+    # fails if a search begins with the seconds before the machine starts, or with a part of another trajectory
+    t = torch.arange(3000, dtype=torch.float64) / 100
+    q = torch.where((t > 12) & (t < 20), (5 * t).sin(), 1e-3 * t.sin())
+    part = Trajectories.of(t, q).liveliest(500)
+    assert part.samples == 500
+    assert 11.9 < float(part.t[0]) < float(part.t[-1]) < 20.1
+    many = line([900] * 20)
+    assert many.liveliest(2000).lengths == (200,) * 10
+    assert many.liveliest(20_000) is many
+
+
+def test_held_out_time_at_the_start_is_predicted_from_its_start():
+    # fails if the first block has to tell its start from what comes after: friction has forgotten it by then, and the
+    # error grows as e^{γT/5} (7e11 times the noise here), so that no other block has a say
+    make = torch.Generator().manual_seed(0)
+    K, h, noise = 200, 0.1, 1e-3
+    model = ContactLagrangian(
+        ModelConfig(level="forced", inputs=1, input_map=(1.0,), stiffness=(1.0,), potential_width=0)
+    )
+    assert model.friction is not None
+    model.friction.viscous.data.fill_(6.0)
+    u = torch.randn(1, K + 1, 1, generator=make, dtype=torch.float64).cumsum(1)
+    q0 = torch.zeros(1, 1, dtype=torch.float64)
+    with torch.no_grad():
+        out = Stepper(model).rollout(q0, q0, q0[:, 0], h=h, steps=K, inputs=u[:, :-1])
+    q = out.q[0] + noise * torch.randn(K + 1, 1, generator=make, dtype=torch.float64)
+    data = Trajectories.of(torch.arange(K + 1, dtype=torch.float64) * h, q, u=u[0])
+    prior = Prior(model, data.q.amin(0), data.q.amax(0), departure=None)
+    problem = ShootingProblem(model, data, segment_grid(data, K, 1.5 * h), sigma=noise, prior=prior)
+    theta = problem.parameters.get()
+    problem.path = problem.solve(problem.pack(theta, problem.states(q0, q0)))
+    assert problem.path is not None
+    _, A, _ = problem.normal_equations(problem.pack(theta, problem.states(q0, q0)))
+    errors = held_out_errors(problem, problem.path, theta, A)
+    assert float(errors.max()) < 10 * noise  # largest of ten seeds: 2.2

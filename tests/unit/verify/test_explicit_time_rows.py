@@ -1,0 +1,40 @@
+"""Rows of `verify` for a time-dependent L_d."""
+
+import pytest
+import torch
+
+from herglotz.scenes import ExactForcedOscillator
+from herglotz.theory import TimeDependent
+from herglotz.verify import verify
+
+EXACT = ExactForcedOscillator(0.9, 1.7, 0.6, m=1.4, omega0=1.3, gamma=0.4)
+
+
+def pendulum(q0, q1, s0, t0, h):
+    """Midpoint rule for a pendulum whose pivot and damping change with time."""
+    v, q, t = (q1 - q0) / h[..., None], 0.5 * (q0 + q1), t0 + 0.5 * h
+    L = (0.5 * v * v * (1 + 0.3 * torch.sin(q)) + torch.cos(q) * (1 + 0.5 * torch.cos(2 * t)[..., None])).sum(-1)
+    return h * (L - 0.2 * s0 - 0.1 * torch.sin(s0) * torch.sin(t))
+
+
+@pytest.mark.parametrize("L_d", [EXACT, pendulum])
+def test_verify_has_rows_of_time(L_d):
+    # fails if a row is computed at another step's time; measured ≤ 2e-14
+    report = verify(TimeDependent(L_d, 0.7), h=0.3, samples=24, steps=5)
+    assert report.passed
+    assert {"time", "momentum", "D2S", "hamilton_jacobi", "left_hamilton_jacobi"} <= {c.name for c in report.checks}
+    assert "η + E dt" in report.table()
+
+
+class Late(TimeDependent):
+    """A family whose members are those of a wrong time."""
+
+    def at(self, u):
+        return TimeDependent(self.L_d, 0.9 * u[..., 0])
+
+
+def test_verify_refuses_a_family_at_wrong_times():
+    # fails if the row of time looks at the step alone: this null model's step is that of 0.9 t
+    report = verify(Late(pendulum, 0.7), h=0.3, samples=24, steps=5)
+    assert not report["time"].passed
+    assert report["contact"].passed  # at a fixed time it is a contact map all the same
