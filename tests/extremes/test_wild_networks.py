@@ -23,7 +23,7 @@ def wild(name):
 
 @pytest.mark.parametrize("name", WILD)
 def test_a_failed_sample_is_named_and_alone(name):
-    # fails if one sample's failed Newton changes a neighbour by a bit, or has no reason
+    # fails if one sample's failed Newton changes a neighbour by a bit
     model, start = wild(name), starts(16)
     with torch.no_grad():
         out = Stepper(model, max_iterations=12).rollout(*start, h=0.5, steps=1)
@@ -33,6 +33,13 @@ def test_a_failed_sample_is_named_and_alone(name):
         alone = Stepper(model, max_iterations=12).rollout(*(x[ok] for x in start), h=0.5, steps=1)
     assert torch.equal(alone.q[:, 1], out.q[ok][:, 1])
     assert torch.equal(alone.p[:, 1], out.p[ok][:, 1])
+
+
+def test_the_first_failed_sample_is_named():
+    # fails if a step that fails names another sample, or no reason
+    model, start = wild("forced"), starts(16)
+    with torch.no_grad():
+        ok = Stepper(model, max_iterations=12).rollout(*start, h=0.5, steps=1).ok
     first = int((~ok).nonzero()[0])
     with pytest.raises(StepError, match=rf"step failed at sample \({first},\): [A-Z_]+, residual"), torch.no_grad():
         Stepper(model, max_iterations=12, throw=True).step(start, 0.5)

@@ -1,8 +1,13 @@
 """What computes small matrices does so on one thread, and gives the caller's number back."""
 
+import os
+import sys
+from types import SimpleNamespace
+
 import pytest
 import torch
 
+from herglotz import cli
 from herglotz.threads import one_thread
 from herglotz.training import ensemble_bands, fit, laplace, select
 from herglotz.training.predict import predict
@@ -36,3 +41,20 @@ def test_a_user_who_chose_keeps_the_number(recorded, monkeypatch):
     with one_thread():
         pass
     assert recorded == [7]
+
+
+@pytest.mark.parametrize(("chosen", "loaded", "expected"), [(None, False, "1"), ("3", False, "3"), (None, True, None)])
+def test_a_command_leaves_no_choice_behind(recorded, monkeypatch, chosen, loaded, expected):
+    # fails if `main`, called from a program, sets OMP_NUM_THREADS for good: every later fit would take it for the
+    # user's choice and compute on all cores; or if a command computes on all cores itself
+    if chosen:
+        monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+    if not loaded:
+        monkeypatch.delitem(sys.modules, "torch")
+    seen = []
+    of = SimpleNamespace(run=lambda _: seen.append(os.environ.get("OMP_NUM_THREADS")))
+    monkeypatch.setattr(cli, "build_parser", lambda: SimpleNamespace(parse_args=lambda _: of))
+    assert cli.main([]) == 0
+    assert seen == [expected]
+    assert os.environ.get("OMP_NUM_THREADS") == chosen
+    assert recorded == ([1, 7] if loaded else [])

@@ -11,7 +11,8 @@ import os
 import shlex
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import herglotz
@@ -35,11 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     int
         The exit code: 0, 1 (a check failed), 2 (wrong input), 70 (a fault of the package) or 130 (interrupted).
     """
-    # Small matrices are fastest on one thread: on a busy machine a second thread waits for the first (9 times slower
-    # was measured). PyTorch reads the variable when it is imported; a value that the user has set stays.
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
     try:
-        with orderly():
+        with orderly(), _one_thread():
             arguments = build_parser().parse_args(argv)
             return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
@@ -53,6 +51,28 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _say(f"error: {error}", WRONG_INPUT)
     except Exception as error:
         return _say(_internal(error, argv), INTERNAL)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Compute on one thread inside, unless the user has set `OMP_NUM_THREADS`; the environment is given back.
+
+    Small matrices are fastest on one thread: on a busy machine a second thread waits for the first (9 times slower was
+    measured). PyTorch reads the variable when it is imported, and never again.
+    """
+    if "torch" in sys.modules:  # a program that calls `main`
+        from herglotz.threads import one_thread
+
+        with one_thread():
+            yield
+        return
+    chosen = "OMP_NUM_THREADS" in os.environ
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+    try:
+        yield
+    finally:
+        if not chosen:  # `one_thread` would take it for the user's choice
+            os.environ.pop("OMP_NUM_THREADS", None)
 
 
 def _internal(error: Exception, argv: Sequence[str] | None) -> str:

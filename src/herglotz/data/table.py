@@ -20,7 +20,7 @@ def from_table(
     path: Path,  # begins messages
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
-    labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one
+    labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one; whole numbers, or else names
     values: Any,  # (N, columns.numeric) numbers
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
@@ -31,8 +31,22 @@ def from_table(
         If the time of a trajectory does not increase, or a trajectory is too short.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
-    groups = group_rows(path, at, labels, values[:, 0].tolist(), _called(columns))
+    groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
     return _trajectories(path, columns, values[[i for group in groups for i in group]], tuple(map(len, groups)))
+
+
+def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
+    """Where all labels are whole numbers, those of equal value are one trajectory, as in `from_numbers`: 1, 01, 1.0."""
+    if any("_" in label for label in set(labels)):  # Python reads 1_000 as a number, and numpy does not
+        return labels
+    try:
+        value = {label: float(label) for label in set(labels)}
+    except ValueError:
+        return labels
+    if not all(abs(x) < EXACT and x.is_integer() for x in value.values()):
+        return labels
+    first: dict[float, str] = {}
+    return [first.setdefault(value[label], label) for label in labels]
 
 
 def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values: np.ndarray) -> Trajectories | None:

@@ -12,6 +12,7 @@ from herglotz.stepping.newton import solve_step
 from herglotz.stepping.state import State, Status
 
 ATTEMPTS, ESCAPE = 60, 4.0
+CORRECTIONS = 15  # Newton iterations of an extrapolated start; one that needs more took too long a stride
 STEPPING = ("finite", "c", "M", "pole")  # what a step needs; H⁺ and H⁻ may be lost
 
 
@@ -97,13 +98,13 @@ def longest_step(
 def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
     """The largest h' ≤ h to which q1(h') can be continued from q1(0) = q0, and that q1; strides in h, extrapolated."""
     q, p, s = (x.detach() for x in state)
-    tol = 64 * torch.finfo(q.dtype).eps
+    tol, most = 64 * torch.finfo(q.dtype).eps, min(max_iterations, CORRECTIONS)
     at, stride = torch.zeros_like(h), h / 4
     q1, slope = q.expand(*h.shape, q.shape[-1]), torch.zeros_like(q)
     for _ in range(ATTEMPTS):
         trial = torch.minimum(at + stride, h)
         moved = (trial - at)[..., None]
-        solution = solve_step(L_d, q, p, s, trial, q1 + slope * moved, tol, max_iterations)
+        solution = solve_step(L_d, q, p, s, trial, q1 + slope * moved, tol, most)
         good = (solution.status == Status.CONVERGED) & (at < h)
         slope = torch.where(good[..., None], (solution.q1 - q1) / moved, slope)
         q1 = torch.where(good[..., None], solution.q1, q1)

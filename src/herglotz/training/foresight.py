@@ -144,23 +144,23 @@ class _Ahead:
 
         They are the fitted model's own, which steps quicker than one with all terms.
         """
-        n, known, stepper = self.data.dof, states[self.rows], Stepper(model)
+        n, known, parts = self.data.dof, states[self.rows], []
         for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
-            own = torch.arange(first, first + length)
-            last = int((self.rows[own] >= 0).nonzero()[-1])
-            if last == length - 1:
-                continue
-            u = None if self.data.u is None else self.data.u[own[last:]]
-            t, q = self.data.t[own[last:]], self.data.q[own[last:]]
-            rest = replace(self.data, t=t, q=q, u=u, lengths=(length - last,))
-            grid, x = segment_grid(rest, length, max_step), known[first + last]
-            u = grid_inputs(model, rest, grid)
-            with torch.no_grad():
-                out = stepper.rollout(x[:n], x[n : 2 * n], x[2 * n], h=grid.h[0], inputs=None if u is None else u[0])
-            if not bool(out.ok.all()):
-                return None
-            known[own[last:]] = torch.cat([out.q, out.p, out.s[:, None]], -1)[grid.node]
-        return known
+            last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
+            if last < length - 1:
+                parts.append(torch.arange(first + last, first + length))
+        if not parts:
+            return known
+        at = torch.cat(parts)
+        u = None if self.data.u is None else self.data.u[at]
+        rest = replace(self.data, t=self.data.t[at], q=self.data.q[at], u=u, lengths=tuple(map(len, parts)))
+        grid = segment_grid(rest, rest.samples, max_step)
+        x = known[at[grid.start_sample]]
+        with torch.no_grad():
+            start, u = (x[:, :n], x[:, n : 2 * n], x[:, 2 * n]), grid_inputs(model, rest, grid)
+            out = Stepper(model).rollout(*start, h=grid.h, inputs=u)
+        known[at[grid.sample]] = torch.cat([out.q, out.p, out.s[..., None]], -1).flatten(0, 1)[grid.node]
+        return known if bool(torch.isfinite(known).all()) else None
 
 
 def _turn(data: Trajectories, states: Tensor) -> float:

@@ -2,11 +2,14 @@
 
 import json
 import shutil
+from argparse import Namespace
+from types import SimpleNamespace
 
 import pytest
 import torch
 
 from herglotz.cli import main
+from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
 from herglotz.export import load_exported
 from herglotz.training import load_run, save_run
@@ -33,6 +36,20 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, capsys):
     assert found["against"]["same_weights"] is True
     assert main(["verify", "damped_oscillator", "--against", str(tiny_run)]) == 2
     assert "is no file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("differing", [0, 1])
+def test_a_step_that_fails_in_one_of_both_is_no_agreement(differing, tiny_run, monkeypatch):
+    # fails if a file agrees with its run whose steps fail where those of the run do not: failed ones have no numbers
+    run = load_run(tiny_run)
+    row = {"q": 0.0, "p": 0.0, "s": 0.0, "c": 0.0, "failed": 0, "status": differing}
+    result = {**row, "per_batch": {1: row}, "same_weights": True}
+    monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: result)
+    said = {"level": run.model.config.level, "dof": run.model.config.dof, "model": run.model.config.to_dict()}
+    file = SimpleNamespace(dtype=torch.float64, metadata={"dtype": "float64", **said})
+    agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
+    assert agreement["passed"] is (differing == 0)
+    assert ("DOES NOT AGREE" in _table(agreement, tiny_run)) is (differing == 1)
 
 
 def test_the_file_holds_a_model_card(tiny_onnx, tiny_run):

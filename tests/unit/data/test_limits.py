@@ -129,3 +129,25 @@ def test_the_fast_reader_leaves_the_rest_to_the_careful_one(tmp_path, name):
     path = tmp_path / "motion.csv"
     path.write_bytes(ODD[name].encode("utf-8", "surrogateescape"))
     assert _read_numbers(path, Wanted()) is None
+
+
+@pytest.mark.parametrize(
+    ("labels", "lengths"),
+    [
+        (("1", "01", "2"), (6, 3)),
+        (("1", "1.0", "1e0"), (9,)),
+        (("-0", "0", "+0"), (9,)),
+        (("1", "01", "a"), (3, 3, 3)),
+        (("1", "01", "0.5"), (3, 3, 3)),
+        (("10", "1_0", "2"), (3, 3, 3)),
+    ],
+    ids=str,
+)
+def test_both_readers_tell_the_same_trajectories_apart(tmp_path, labels, lengths):
+    # fails if 1 and 01 are one trajectory in a file of numbers and two where a cell or a date is read by hand, or names
+    # that look alike become one
+    rows = [f"{label},{3 * i + k}" for i, label in enumerate(labels) for k in range(3)]
+    (tmp_path / "plain.csv").write_text("trajectory,t,q\n" + "".join(f"{row},0.5\n" for row in rows))
+    (tmp_path / "quoted.csv").write_text("trajectory,t,q\n" + "".join(f'{row},"0.5"\n' for row in rows))
+    assert _read_numbers(tmp_path / "quoted.csv", Wanted()) is None
+    assert read_csv(tmp_path / "plain.csv").lengths == read_csv(tmp_path / "quoted.csv").lengths == lengths

@@ -273,6 +273,18 @@ def test_a_singular_step_is_reported():
 
 
 @needs_compiler
+def test_coordinates_that_do_not_couple():
+    # fails if the smallest entry of a column is the pivot: J is diagonal here, and that entry is 0
+    ones = (1.0, 1.0)
+    model = ContactLagrangian(ModelConfig((False, False), "linear", ones, ones, ones, (0.0, 0.0), correction_width=3))
+    compiled, batch = compile_c(model), states_of(2, 5)
+    for states in (batch, State(*(x[0] for x in batch))):
+        out = compiled.rollout(*states, h=0.1, steps=3)
+        assert bool(out.ok.all())
+        assert relative(out.q, eager_rollout(model, states, h=0.1, steps=3).q) <= 1e-13
+
+
+@needs_compiler
 def test_a_failing_sample_does_not_touch_its_neighbours():
     # fails if a diverging sample stops the loop, or what follows a failure is not NaN with its status
     model, states = damped(2, "affine"), states_of(2, 3)

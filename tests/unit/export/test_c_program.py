@@ -79,6 +79,32 @@ def test_statuses_survive_fast_math(tmp_path, compiler, flags):
     assert " ".join(words) == "0 5 5 5 5 5 5 5 5 1 1 1 32 16 5 0 5 0"
 
 
+INIT = """
+#include <stdio.h>
+#include <stdlib.h>
+#include "stepper.h"
+int main(void) {
+  const double nan = strtod("nan", 0), inf = strtod("inf", 0);
+  const double q0[1] = {0.1}, q1[1] = {0.12}, bad[1] = {nan};
+  const double u[2] = {0.3, -0.2}, first[2] = {nan, 0.0}, last[2] = {0.0, inf};
+  arm_state x = {{7.0}, {7.0}, 7.0, 7.0};
+  printf("%d %d ", arm_init(bad, q1, 0.0, 0.1, u, &x), arm_init(q0, bad, 0.0, 0.1, u, &x));
+  printf("%d %d ", arm_init(q0, q1, inf, 0.1, u, &x), arm_init(q0, q1, 0.0, 0.0, u, &x));
+  printf("%d %d ", arm_init(q0, q1, 0.0, 0.1, first, &x), arm_init(q0, q1, 0.0, 0.1, last, &x));
+  printf("%d ", x.q[0] == 7.0 && x.p[0] == 7.0 && x.s == 7.0 && x.sigma == 7.0);
+  printf("%d %d\\n", arm_init(q0, q1, 0.0, 0.1, u, &x), arm_init(q0, q1, 0.0, 0.1, 0, &x));
+  return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("flags", [("-O0",), ("-O1", "-ffast-math")], ids=["O0", "fast-math"])
+def test_init_checks_all_it_is_given(tmp_path, flags):
+    # fails if positions, s0, h or an input that is not finite start a motion, or a refused start writes to the state
+    export_c(model(level="forced", inputs=2), tmp_path / "stepper.h", h=0.1, name="arm")
+    assert " ".join(run(tmp_path, INIT, COMPILERS[0], *flags)) == "5 5 5 5 5 5 1 0 0"
+
+
 ROLLOUT = """
 #include <stdio.h>
 #include "stepper.h"

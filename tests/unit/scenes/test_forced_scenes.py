@@ -39,9 +39,9 @@ def test_the_cycle_of_van_der_pol():
     q, p, s = (torch.tensor(x, dtype=torch.float64) for x in ([[0.01]], [[0.0]], [0.0]))
     h, positions = 0.05, []
     with torch.no_grad():
-        for k in range(1000):
+        for k in range(700):  # it grows for 11 units of time; one turn later the cycle is reached to 1e-3 of the rest
             q, p, s = system.flow(q, p, s, h)
-            if k > 700:
+            if k > 400:
                 positions.append(float(q))
     x = torch.tensor(positions)
     assert abs(float(x.abs().max()) - 2.00862) < 2e-3  # a sample every 0.05 misses the top by less

@@ -60,6 +60,16 @@ def test_a_collapsed_model_fails():
     assert not checks["one_step"].passed
 
 
+@pytest.mark.parametrize(("stiffness", "passes"), [(1.1, True), (1.5, False)])
+def test_a_model_that_follows_badly_fails(stiffness, passes):
+    # fails if the bound lets a free run pass that is off by a quarter of the spread, or refuses one off by a twentieth;
+    # no other check sees a potential that is too stiff: one step is predicted well
+    checks, numbers = named(run_of(stiffness=stiffness))
+    assert numbers["follow"] == pytest.approx(0.06 if passes else 0.28, abs=0.02)  # no fit: rounding changes nothing
+    assert checks["one_step"].passed
+    assert checks["follow"].passed is passes
+
+
 @pytest.mark.parametrize("factor", [-1.0, 2.0, -2.0, 0.3])
 def test_a_wrong_dissipation_fails(factor):
     # fails if a bound of 0.1 of the spread decides alone: weak damping of either sign stays below it (γ = 0.01: 0.013)

@@ -69,19 +69,19 @@ def test_a_forced_file(tmp_path):
     with torch.no_grad():
         for parameter in model.parameters():
             parameter += 0.1
-    path = export_pt2(model, tmp_path / "model.pt2", h=0.2, box=BOX)
-    alone = verify(path, samples=8, steps=4)
+    file = load_pt2(export_pt2(model, tmp_path / "model.pt2", h=0.2, box=BOX))
+    alone = verify(file, samples=8, steps=4)
     assert all(check.passed for check in alone.checks), alone.table()
     assert alone.missing == ("contact", "momentum")
     assert not alone.passed
     assert "the other checks need the model's forces" in alone["regularity"].note
-    report = verify(path, samples=8, steps=4, model=model)
+    report = verify(file, samples=8, steps=4, model=model)
     assert report.passed, report.table()
     assert report["contact"].statement.startswith("forced contact map")
     assert model.friction is not None
     with torch.no_grad():
         model.friction.viscous.copy_(2 * model.friction.viscous)
-    assert not verify(path, samples=8, steps=4, model=model)["contact"].passed
+    assert not verify(file, samples=8, steps=4, model=model)["contact"].passed
 
 
 class _MapOnly:

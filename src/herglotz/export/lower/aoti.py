@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-import torch._inductor
-from torch._inductor.package.package import package_aoti
 from torch.export import ExportedProgram
 
 from herglotz.data.seal import sealed_zip
@@ -49,6 +47,8 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
         If there is no C++ compiler, an argument is not usable, what was compiled does not step like the model, or the
         file cannot be written.
     """
+    from torch._inductor.package.package import package_aoti  # seconds, which only this format costs
+
     settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
     check_compiler()
     with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
@@ -63,6 +63,8 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
 
 def _compiled(program: ExportedProgram, settings: dict[str, Any]) -> Any:
     """The files of one program."""
+    import torch._inductor
+
     options = settings | {"aot_inductor.package": True}
     arguments, _ = program.example_inputs  # pyright: ignore[reportGeneralTypeIssues]  it has some
     return torch._inductor.aot_compile(program.module(check_guards=False), arguments, options=options)  # pyright: ignore
