@@ -74,7 +74,7 @@ def test_shares_count_what_lies_inside():
     n = 20000
     error = torch.randn(n, 1, generator=make, dtype=torch.float64)
     flat = torch.zeros_like(error)
-    bands = Bands(flat, 0.6 * torch.ones_like(error), sigma=0.8)
+    bands = Bands(flat, 0.6 * torch.ones_like(error), sigma=torch.tensor([0.8]))
     every = torch.ones(n, dtype=torch.bool)
     assert measured_sets.shares(bands, error, every) == pytest.approx(measured_sets.LEVELS, abs=0.01)
     true = measured_sets.shares(bands, 0.6 * error, every, measured=False)

@@ -123,7 +123,7 @@ def test_bands_of_one_unit_share_their_scale():  # fails if a panel of small res
     q = run.data.q.clone()
     q[: run.data.lengths[0]] += 0.5
     run = replace(run, data=replace(run.data, q=q))
-    figure = plot_bands(run, Bands(run.states.q, torch.full_like(q, 0.01), 0.01))
+    figure = plot_bands(run, Bands(run.states.q, torch.full_like(q, 0.01), torch.tensor([0.01])))
     assert len({ax.get_ylim() for ax in figure.axes}) == 1
     assert [ax.get_title(loc="left") for ax in figure.axes] == [f"trajectory {b}" for b in range(3)]
 
