@@ -97,10 +97,11 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     driven = data.u is not None and config.use_inputs
     forced = bool(terms.drag) or terms.dry or driven or data.dof > 1
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
+    order = order if still or data.dof > 1 else 2  # of a potential: without one it would add a spring
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
         diagonal=lengths and data.dof > 1, coupled=not lengths and data.dof > 1, order=order, substeps=substeps,
-        objective="trajectory", alike=data.dof == 1 and (still or order == 2),  # the potential holds features alone
+        objective="trajectory", alike=data.dof == 1,  # the potential holds features alone
     )  # fmt: skip
 
 
