@@ -14,7 +14,7 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
 FOLDS = 5  # held-out blocks: fifths of every trajectory, in time
-STAY = 20  # first samples of a trajectory, and half of its first fold at most, that are never left out
+STAY = 20  # first samples of a driven trajectory, and half of its first fold at most, that are never left out
 MARGIN = 1.05  # a weaker prior or a richer level must lower the error by more than this factor
 
 
@@ -64,10 +64,10 @@ def left_out_errors(
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).
 
-    The first samples of a trajectory stay: motion that forgets where it started does not tell its start.
+    The first samples of a driven trajectory stay: motion that forgets where it started does not tell its start.
     """
     parts = [torch.arange(length) * FOLDS // length for length in data.lengths]
-    for part in parts:
+    for part in parts if data.u is not None else []:
         part[: min(STAY, len(part) // (2 * FOLDS))] = -1
     fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
     errors = []

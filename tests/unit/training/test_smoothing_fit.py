@@ -103,16 +103,19 @@ def test_elimination_solves_the_whole_system():
     torch.testing.assert_close(_hat(A, rows, by), expected)
 
 
-def test_left_out_errors_are_those_of_fits_without_the_fold():
+@pytest.mark.parametrize("driven", [False, True])
+def test_left_out_errors_are_those_of_fits_without_the_fold(driven):
     # fails if the residuals of a fold are not freed of their own pull: least squares is the exact case
     make = torch.Generator().manual_seed(0)
     J, y = (torch.randn(20, *shape, generator=make, dtype=torch.float64) for shape in ((3,), ()))
-    data = Trajectories.of(torch.arange(20, dtype=torch.float64), y[:, None], (20,))
+    u = torch.ones(20, 1, dtype=torch.float64) if driven else None
+    data = Trajectories.of(torch.arange(20, dtype=torch.float64), y[:, None], (20,), u=u)
     inverse = torch.linalg.inv(J.T @ J)
     r = J @ (inverse @ (J.T @ y)) - y
     found = left_out_errors(r, data, lambda rows: J[rows] @ inverse @ J[rows].T)
     fold = torch.arange(20) // 4
-    fold[:2] = -1  # the first samples, half of their fold here, are never left out
+    if driven:
+        fold[:2] = -1  # the first samples, half of their fold here, are never left out
     for k in range(5):
         without = torch.linalg.lstsq(J[fold != k], y[fold != k, None]).solution[:, 0]
         expected = (J[fold == k] @ without - y[fold == k]).square().mean().sqrt()
