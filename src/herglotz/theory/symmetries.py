@@ -328,11 +328,9 @@ def _expanded(chi: Tensor, x: _Columns, a: Tensor) -> tuple[Tensor, Tensor, Tens
     B[:, i, j] += chi[:, 1 + size :]
     B[:, j, i] += chi[:, 1 + size :]
     k = chi[:, 0] - slope @ x.centre + 0.5 * (B @ x.centre) @ x.centre - a * x.middle
-    return (
-        k if bool(x.usable[0]) else torch.zeros_like(k),
-        slope - B @ x.centre,
-        B,
-    )  # where c = 1 a constant belongs to J
+    if not bool(x.usable[0]):  # where c = 1 a constant belongs to J
+        k = torch.zeros_like(k)
+    return k, slope - B @ x.centre, B
 
 
 def _rms(x: Tensor) -> Tensor:

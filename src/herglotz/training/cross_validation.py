@@ -67,8 +67,9 @@ def left_out_errors(
     The first samples of a driven trajectory stay: motion that forgets where it started does not tell its start.
     """
     parts = [torch.arange(length) * FOLDS // length for length in data.lengths]
-    for part in parts if data.u is not None else []:
-        part[: min(STAY, len(part) // (2 * FOLDS))] = -1
+    if data.u is not None:
+        for part in parts:
+            part[: min(STAY, len(part) // (2 * FOLDS))] = -1
     fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
     errors = []
     for k in range(FOLDS):

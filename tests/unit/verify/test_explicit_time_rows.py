@@ -38,3 +38,18 @@ def test_verify_refuses_a_family_at_wrong_times():
     report = verify(Late(pendulum, 0.7), h=0.3, samples=24, steps=5)
     assert not report["time"].passed
     assert report["contact"].passed  # at a fixed time it is a contact map all the same
+
+
+def test_every_step_has_its_own_time():
+    # fails if all steps of a motion begin at t0: from the third step on, at t = 1.3, this L_d is no number
+    def until(q0, q1, s0, t0, h):
+        return torch.where(t0 > 1.2, torch.nan, pendulum(q0, q1, s0, t0, h))
+
+    assert verify(TimeDependent(until, 0.7), h=0.3, samples=8, steps=2).passed
+    assert not verify(TimeDependent(until, 0.7), h=0.3, samples=8, steps=3).passed
+
+
+def test_rows_of_time_are_measured():
+    # fails if a row says 0 whatever it is given: rounding of 24 motions leaves something
+    report = verify(TimeDependent(pendulum, 0.7), h=0.3, samples=24, steps=5)
+    assert all(report[name].value > 0 for name in ("time", "momentum"))
