@@ -15,8 +15,7 @@ from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
 from herglotz.models.drag import Drag, parse_drag
-from herglotz.models.feature_kinetic import FeatureKinetic
-from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
+from herglotz.models.feature_kinetic import kinetic_term
 from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
@@ -24,7 +23,6 @@ from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
-from herglotz.models.translations import blind, unmoved
 
 
 @dataclass(frozen=True)
@@ -61,46 +59,18 @@ class ContactLagrangian(nn.Module):
 
     def __init__(self, config: ModelConfig):
         super().__init__()
-        self.config = config
-        make = torch.Generator().manual_seed(config.seed)
-        c = config
-        sizes, act = (c.angles, c.scale, c.speed), c.activation
-        own, values = baseline_features(c.angles, c.stiffness, c.tilt) if c.order == 4 and not c.alike else ([], [])
-        still, moving = sorted_features((*own, *(x for x in c.features if x not in own)), c.angles)
-        known_still, known_moving = sorted_features(c.known, c.angles)
-        fixed, zero = c.alike or c.order == 4 or bool(c.translations), (0.0,) * c.dof
-        stiffness, tilt = (zero, zero) if c.order == 4 else (unmoved(c, c.stiffness), unmoved(c, c.tilt))
-        self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike, c.diagonal)
-        self.potential = Potential(
-            *sizes, stiffness, tilt, c.potential_width, c.potential_depth, make, act,
-            FeaturePotential(still, known_still, c.dof) if still or known_still else None, fixed,
-        )  # fmt: skip
-        if values and self.potential.features is not None:
-            self.potential.features.sum.coefficient.data[: len(values)] = torch.tensor(values, dtype=torch.float64)
-        self.damping: LinearDamping | AffineDamping | None = None
-        if c.level in ("linear", "forced"):
-            self.damping = LinearDamping(c.rate)
-        elif c.level in ("affine", "full"):  # the full level's units read q̄ and v: no second network for them
-            width = c.damping_width if c.level == "affine" else 0
-            self.damping = AffineDamping(c.rate, *sizes, width, 1, make, act)
-        self.correction: Correction | None = None
-        if c.correction_width:
-            self.correction = Correction(*sizes, c.correction_width, c.correction_depth, make, not c.baseline, act)
-        if c.mass_width:
-            self.kinetic = PositionKinetic(c, make)
-        if moving or known_moving:
-            self.kinetic = FeatureKinetic(self.kinetic, moving, known_moving, c.dof)
+        self.config = c = config
+        make = torch.Generator().manual_seed(c.seed)
+        potential, damping = Potential(c, make), _damping(c, make)
+        correction = Correction(c, make) if c.correction_width else None
+        self.kinetic = kinetic_term(c, make)  # drawn after the others, but first of the parameters
+        self.potential, self.damping, self.correction = potential, damping, correction
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
         self.coupling = CoupledFriction(c) if c.coupled and c.dof > 1 else None
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
         self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
         self.potential.more = tuple(self.named_terms)
-        if self.potential.network is not None:
-            self.potential.network.blind = blind(c, 0)
-        for term in (self.damping, self.correction):
-            if isinstance(term, AffineDamping | Correction) and term.network is not None:
-                term.network.blind = blind(c, c.dof)
 
     @property
     def named_terms(self) -> list[Term]:
@@ -287,6 +257,14 @@ class ContactLagrangian(nn.Module):
         for term in self.forces_between:
             forces = with_force(forces, term, v, c, h)
         return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
+
+
+def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:
+    """The exponent g of c = e^g that a level has; None where c = 1."""
+    if config.level == "conservative":
+        return None
+    linear = config.level in ("linear", "forced")
+    return LinearDamping(config.rate) if linear else AffineDamping(config, generator)
 
 
 @dataclass(frozen=True)
