@@ -154,12 +154,10 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes) -> Found:
         if not mixed:  # a done sample's trial is its own x: nothing to select
             here = trial
         else:  # the point is that of no sample
-            here = _Here(*(old if isinstance(old, Point) else select(accept, new, old)
-                           for new, old in zip(trial, here, strict=True)))  # fmt: skip
+            values = (select(accept, new, old) for new, old in zip(trial[2:], here[2:], strict=True))
+            here = _Here(select(accept, trial.x, here.x), here.point, *values)
         if mixed or fraction is not None:
-            before = torch.ones_like(here.merit) if fraction is None else fraction
-            longer = (2 * before).clamp(max=1.0) if rules.natural else 1.0
-            fraction = torch.where(accept, longer, before / 2)
+            fraction = _next(fraction, accept, rules.natural, like=here.merit)
             done = done | (fraction < rules.shortest)
     x, point, J, delta, merit, residual = here
     return Found(x, point, merit, residual, done, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed)
@@ -173,6 +171,12 @@ def _evaluate(equation: Equation, x: Tensor, rules: Rules, J: Jacobian = None, f
         J = select(fresh, point.J, J) if rules.keep and fresh is not None else point.J
     delta = -(rules.solver or solve)(J, point.F)
     return _Here(x, point, J, delta, largest(point.F), rules.length(delta))
+
+
+def _next(fraction: Tensor | None, accept: Tensor, natural: bool, like: Tensor) -> Tensor:
+    """The fractions of the next move: halves after a refused trial; after an accepted one all, or twice as much."""
+    fraction = torch.ones_like(like) if fraction is None else fraction
+    return torch.where(accept, (2 * fraction).clamp(max=1.0) if natural else 1.0, fraction / 2)
 
 
 def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Tensor | float) -> Tensor:

@@ -34,24 +34,30 @@ def newton_one(equation: Equation, x: Tensor, rules: Rules, sizes: Numbers) -> F
     scale, floor = sizes(x, here.point, here.left)
     tiny, near = rules.tol * scale, NEAR * scale
     # A direction that is not finite can never be followed: such a sample is over.
-    done, fraction, slow, iterations = here.left <= tiny or not isfinite(here.left), 1.0, False, 0
+    done, fraction, slow, iterations = not tiny < here.left < inf, 1.0, False, 0
     while iterations < rules.max_iterations and not done:
         iterations += 1
-        fresh = slow or here.left > near  # at a trial that may be far off, the Jacobian is wanted as well
+        # At a trial that may be far off, the Jacobian is wanted as well.
+        fresh = slow or not rules.keep or here.left > near
         move = here.delta if fraction == 1.0 else fraction * here.delta
-        trial = _evaluate(equation, here.x + move, None if fresh or not rules.keep else here.J)
+        trial = _evaluate(equation, here.x + move, None if fresh else here.J)
         settled = trial.left <= tiny
         better = settled or trial.merit <= (1 - ARMIJO * fraction) * here.merit
         stalled = not better and here.left <= floor  # rounding, not a wrong direction
         done = settled or stalled
-        slow = rules.keep and not (fresh or settled) and CONTRACTION * here.left < trial.left < inf
+        slow = not (fresh or settled) and CONTRACTION * here.left < trial.left < inf
         if better or (slow and not stalled):
             here, fraction = trial, 1.0
         else:
             fraction /= 2
-    shape, healthy = x.shape[:-1], done and isfinite(here.merit + here.left)
-    merit, residual = x.new_full(shape, here.merit), x.new_full(shape, here.left)
-    return Found(here.x, here.point, merit, residual, torch.full(shape, done, device=x.device), iterations, healthy)
+    return _found(here, done, iterations)
+
+
+def _found(here: _Here, done: bool, iterations: int) -> Found:
+    shape, healthy = here.x.shape[:-1], done and isfinite(here.merit + here.left)
+    merit, residual = here.x.new_full(shape, here.merit), here.x.new_full(shape, here.left)
+    flag = torch.full(shape, done, device=here.x.device)
+    return Found(here.x, here.point, merit, residual, flag, iterations, healthy)
 
 
 def _evaluate(equation: Equation, x: Tensor, kept: Tensor | None) -> _Here:
