@@ -106,16 +106,20 @@ def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
 
 def _json(value: Any, depth: int) -> str:
     """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper; many alike as a table."""
-    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    alike = len(inside) > 0 and all(isinstance(x, dict) for x in inside)
+    inside = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
+    alike = bool(inside) and all(isinstance(x, dict) for x in inside)
     if alike and len(inside) >= PACKED:
-        columns = list(dict.fromkeys(k for x in inside for k in x))
-        rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
-        packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
-        return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
-    if (isinstance(value, dict) and depth < 2 and value) or (isinstance(value, list) and alike):
-        return _lines(value, depth + 1)
-    return json.dumps(_rounded(value), ensure_ascii=False)
+        return _packed(value, inside)
+    opened = depth < 2 and value if isinstance(value, dict) else alike
+    return _lines(value, depth + 1) if opened else json.dumps(_rounded(value), ensure_ascii=False)
+
+
+def _packed(value: Any, inside: list[dict]) -> str:
+    """Dictionaries alike as a table: their keys once, and a row each."""
+    columns = list(dict.fromkeys(k for x in inside for k in x))
+    rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
+    packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
+    return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
 
 
 def _lines(value: Any, depth: int) -> str:

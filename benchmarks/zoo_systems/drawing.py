@@ -8,6 +8,7 @@ of a method.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -25,7 +26,11 @@ KINDS = {
     "cart_pole": 0.12,
 }  # fmt: skip
 FRICTIONS = {"viscous": 0.35, "dry": 0.25, "quadratic": 0.2, "stribeck": 0.12, "none": 0.08}
-ATTAINABLE = 1.3
+# What is drawn instead: whether a joint sticks is decided by its own force, which a coupled mass does not have; and an
+# axis without dry friction is solved by hand.
+INSTEAD = {(kind, dry): "viscous" for kind in ("double_pendulum", "cart_pole") for dry in ("dry", "stribeck")}
+INSTEAD |= {("axis", smooth): "dry" for smooth in ("none", "quadratic")}
+ATTAINABLE = 1.3  # times the noise
 LARGEST, SMALLEST = 30.0, 0.03  # of a motion, in natural units: it neither runs away nor rests
 TURN = 2.8  # rad between two samples at the most: angles are unwrapped where they are read
 PERIOD = 2 * np.pi  # natural
@@ -115,44 +120,48 @@ def draw_mechanism(rng: Generator, kind: str) -> tuple[Mechanism, str, bool]:
     """A mechanism of this kind, the name of its friction, and whether it is driven."""
     n = {"chain": int(rng.integers(2, 4)), "pendulums": int(rng.integers(2, 4)), "double_pendulum": 2, "cart_pole": 2}
     mechanism = Mechanism(kind, n.get(kind, 1), {})
-    between = lambda low, high: float(rng.uniform(low, high))  # noqa: E731
-    values: Values = {}
-    if kind == "spring":
-        values = _spring(rng)
-    elif kind == "pendulum":
-        values = {"g": 1.0}
-        if rng.random() < 0.3:
-            values["g2"] = between(-0.4, 0.4)
-        if rng.random() < 0.2:
-            values["o0"] = between(0.1, 0.3)
-    elif kind == "axis":
-        values = {"o0": between(-0.05, 0.05)}
-    elif kind == "chain":
-        values = {f"k{j}": between(0.3, 1.5) for j in range(mechanism.n + 1)} | {"k3": between(0.0, 2.0)}
-    elif kind == "pendulums":
-        values = {f"g{i}": between(0.7, 1.3) for i in range(mechanism.n)} | {"k": between(0.1, 0.6)}
-    elif kind == "double_pendulum":
-        values = {"m": between(0.3, 1.0), "r": between(0.6, 1.2), "g": 1.0}
-    else:
-        values = {"m": between(0.1, 0.4), "r": between(0.5, 1.5), "g": 1.0}
-        if rng.random() < 0.5:
-            values["k"] = between(0.2, 1.0)
+    values = POTENTIALS[kind](rng, mechanism.n)
     if kind in ("chain", "pendulums"):
-        values |= {f"m{i}": between(0.5, 2.0) for i in range(1, mechanism.n)}
+        values |= {f"m{i}": _between(rng, 0.5, 2.0) for i in range(1, mechanism.n)}
     friction = "van der Pol" if "z0" in values else _choose(rng, FRICTIONS)
-    if mechanism.coupled_mass and friction in ("dry", "stribeck"):
-        friction = "viscous"
-    if kind == "axis" and friction in ("none", "quadratic"):
-        friction = "dry"
+    friction = INSTEAD.get((kind, friction), friction)
     for i in range(mechanism.n):
         values |= _friction(rng, friction, i, kind == "axis")
     driven = kind == "axis" or rng.random() < 0.35
     if driven:
-        values["b"] = between(0.5, 1.5)
+        values["b"] = _between(rng, 0.5, 1.5)
     return Mechanism(kind, mechanism.n, values), friction, driven
 
 
-def _spring(rng: Generator) -> Values:
+def _between(rng: Generator, low: float, high: float) -> float:
+    return float(rng.uniform(low, high))
+
+
+def _pendulum(rng: Generator, _: int) -> Values:
+    values: Values = {"g": 1.0}
+    if rng.random() < 0.3:
+        values["g2"] = _between(rng, -0.4, 0.4)
+    if rng.random() < 0.2:
+        values["o0"] = _between(rng, 0.1, 0.3)
+    return values
+
+
+def _chain(rng: Generator, n: int) -> Values:
+    return {f"k{j}": _between(rng, 0.3, 1.5) for j in range(n + 1)} | {"k3": _between(rng, 0.0, 2.0)}
+
+
+def _pendulums(rng: Generator, n: int) -> Values:
+    return {f"g{i}": _between(rng, 0.7, 1.3) for i in range(n)} | {"k": _between(rng, 0.1, 0.6)}
+
+
+def _cart_pole(rng: Generator, _: int) -> Values:
+    values: Values = {"m": _between(rng, 0.1, 0.4), "r": _between(rng, 0.5, 1.5), "g": 1.0}
+    if rng.random() < 0.5:
+        values["k"] = _between(rng, 0.2, 1.0)
+    return values
+
+
+def _spring(rng: Generator, _: int) -> Values:
     """Linear, hardening, lopsided, double well, or van der Pol's oscillator."""
     shape = rng.choice(["linear", "hardening", "lopsided", "double well", "van der Pol"], p=[0.15, 0.4, 0.2, 0.1, 0.15])
     if shape == "van der Pol":
@@ -165,6 +174,17 @@ def _spring(rng: Generator) -> Values:
     if shape == "lopsided":
         values["k2"] = float(rng.choice([-1, 1]) * rng.uniform(0.2, 0.8))
     return values
+
+
+POTENTIALS: dict[str, Callable[[Generator, int], Values]] = {
+    "spring": _spring,
+    "pendulum": _pendulum,
+    "axis": lambda rng, _: {"o0": _between(rng, -0.05, 0.05)},
+    "chain": _chain,
+    "pendulums": _pendulums,
+    "double_pendulum": lambda rng, _: {"m": _between(rng, 0.3, 1.0), "r": _between(rng, 0.6, 1.2), "g": 1.0},
+    "cart_pole": _cart_pole,
+}
 
 
 def _friction(rng: Generator, friction: str, i: int, axis: bool) -> Values:
