@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
 from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Forces
+from herglotz.models.term import with_force
 
 HIGHEST = 9  # power of a speed or a position
 _TEXT = re.compile(
@@ -95,22 +96,8 @@ class Drag(nn.Module):
     def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
         """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them."""
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v))
-        f = -value @ self.on
-        before, after = (c * h / 2)[..., None], (h / 2)[..., None]
-        minus, plus = own.minus + before * f, own.plus + after * f
-        if own.minus_2 is None:
-            return replace(own, minus=minus, plus=plus)
-        assert own.minus_1 is not None
-        assert own.plus_1 is not None
-        assert own.plus_2 is not None
-        along = torch.diag_embed(-(by_v @ self.on)) / h[..., None, None]  # ∂f/∂v · ∂v/∂q1
-        across = -(self.on.T @ (by_q[..., None] * self.at)) / 2  # ∂f/∂q̄ · ∂q̄/∂q1
-        one, other = before[..., None], after[..., None]
-        return replace(
-            own, minus=minus, plus=plus, minus_1=own.minus_1 + one * (across - along),
-            minus_2=own.minus_2 + one * (across + along), plus_1=own.plus_1 + other * (across - along),
-            plus_2=own.plus_2 + other * (across + along),
-        )  # fmt: skip
+        slope, by_position = -torch.diag_embed(by_v @ self.on), -(self.on.T @ (by_q[..., None] * self.at))
+        return with_force(own, -value @ self.on, slope, c, h, by_position)
 
 
 def _power(x: Tensor, k: int) -> Tensor:

@@ -196,14 +196,7 @@ class ContactLagrangian(nn.Module):
         return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
 
     def _evaluate(
-        self,
-        q0: Tensor,
-        q1: Tensor,
-        s0: Tensor,
-        h: Tensor | float,
-        order: int,
-        u: Tensor | None,
-        delta: Tensor | None,
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, u: Tensor | None, delta: Tensor | None
     ) -> Partials:
         h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
         t = self.terms(q0, q1, h, order, delta)
@@ -255,7 +248,7 @@ class ContactLagrangian(nn.Module):
         c = self.damping(q0, q1, h, order).exp()
         forces = self.friction(v, c, h, order, u)
         for term in self.forces_between:
-            forces = with_force(forces, term, v, c, h)
+            forces = with_force(forces, *term.force(v), c, h)
         return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
 
 

@@ -17,14 +17,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.single_step import SingleStep
-from herglotz.stepping.state import (
-    State,
-    Status,
-    Step,
-    check_h,
-    check_state,
-    throw_failure,
-)
+from herglotz.stepping.state import State, Status, Step, check_h, check_state, throw_failure
 
 
 @runtime_checkable

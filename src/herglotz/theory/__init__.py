@@ -11,7 +11,6 @@ from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gra
 from herglotz.theory.evolution import EvolutionStepper
 from herglotz.theory.explicit_time import TimeDependent, energies, time_defect
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
-from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
     GeneratingFunction,
     generating_function,
@@ -109,7 +108,6 @@ __all__ = [
     "PointSource",
     "Propagated",
     "Quadratic",
-    "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
     "Symmetries",
@@ -151,7 +149,6 @@ __all__ = [
     "invariance_defect",
     "inverse_step",
     "jacobi_bracket",
-    "joined_action",
     "left_equations",
     "left_generating_function",
     "left_hamilton_jacobi_residual",

@@ -25,14 +25,7 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.newton import Root, attached, find_root
 from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.state import (
-    State,
-    Step,
-    check_h,
-    check_state,
-    status_of_root,
-    throw_failure,
-)
+from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root, throw_failure
 from herglotz.theory.continuous import jacobian
 
 Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)

@@ -14,14 +14,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.state import (
-    State,
-    Step,
-    check_h,
-    check_state,
-    status_of_root,
-    throw_failure,
-)
+from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root, throw_failure
 from herglotz.theory.continuous import Hamiltonian, contact_vector_field, evolution_vector_field, square_jacobian
 from herglotz.theory.discrete_gradient import DiscreteGradient, midpoint_gradient
 from herglotz.theory.jacobi import join, sharp_bivector, split
