@@ -15,7 +15,7 @@ import platform
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -156,13 +156,34 @@ def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
     return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
 
 
-def spread(values: Iterable[float | None], digits: str = ".1e", between: str = " – ") -> str:
+def spread(values: Iterable[float | None]) -> str:
     """Median and range over the seeds, the median alone of one seed, or "failed"."""
     known = [x for x in values if x is not None]
     if not known:
         return "failed"
-    middle = f"{statistics.median(known):{digits}}"
-    return middle if len(known) == 1 else f"{middle} ({min(known):{digits}}{between}{max(known):{digits}})"
+    middle = f"{statistics.median(known):.1e}"
+    return middle if len(known) == 1 else f"{middle} ({min(known):.1e} – {max(known):.1e})"
+
+
+def by_seed(
+    path: Path,
+    jobs: Mapping[str, Callable[[int], dict[str, Any]]],  # name → what measures it with a seed
+    names: Iterable[str],
+    seeds: int,
+    text: Callable[[dict[str, Any]], str],  # the rows → the table
+) -> dict[str, Any]:
+    """Measure some rows with every seed; each is stored when it is done, beside those of earlier runs. All rows."""
+    rows = load(path, {"rows": {}})["rows"]
+    for name in names:
+        found = []
+        for seed in range(seeds):
+            began = time.process_time()
+            found.append({**jobs[name](seed), "cpu_seconds": round(time.process_time() - began, 1)})
+            print(name, seed, json.dumps({k: x for k, x in found[-1].items() if not isinstance(x, dict)}), flush=True)
+        rows[name] = {"commit": commit(), "seeds": found}
+        kept = {key: rows[key] for key in jobs if key in rows}
+        store(path, {**conditions(), "rows": kept}, text(kept))
+    return rows
 
 
 def picture(figure: Any, path: Path) -> None:

@@ -68,11 +68,11 @@ def family(p: dict) -> str:
     return next(name for name, starts in FAMILIES if p["kind"].startswith(starts))
 
 
-def front(points: list[dict], error: str = "median") -> list[dict]:
+def front(points: list[dict]) -> list[dict]:
     """Points that no other beats in both error and cost, cheapest first."""
     kept: list[dict] = []
-    for p in sorted((p for p in points if p.get(error) is not None), key=lambda p: p["us_per_time"]):
-        if not kept or p[error] < kept[-1][error]:
+    for p in sorted((p for p in points if p.get("median") is not None), key=lambda p: p["us_per_time"]):
+        if not kept or p["median"] < kept[-1]["median"]:
             kept.append(p)
     return kept
 

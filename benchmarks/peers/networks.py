@@ -146,10 +146,10 @@ def train(
     best.restore()
 
 
-def split(rows: int, generator: torch.Generator, part: float = 0.12) -> tuple[Tensor, Tensor]:
+def split(rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Rows to train on and rows to validate on, at random."""
     order = torch.randperm(rows, generator=generator)
-    held = max(1, round(part * rows))
+    held = max(1, round(0.12 * rows))
     return order[held:], order[:held]
 
 
