@@ -184,7 +184,7 @@ FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),
 # h, the target of each figure and what measures it, by the name of a row.
 JOBS: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]]
 JOBS = {row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS}
-JOBS |= {name: (0.05, dict.fromkeys(figures, target), run) for name, (run, figures, target) in FALLS.items()}
+JOBS |= {name: (0.05, {figure: target for figure in figures}, run) for name, (run, figures, target) in FALLS.items()}
 
 
 def table(stored: dict) -> str:
