@@ -181,10 +181,11 @@ FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),
          "quadratic drag": (braking, ("coefficient", "coefficient, h → 0", "rms"), 1e-5)}  # fmt: skip
 
 
-# h, the target of each figure and what measures it, by the name of a row.
-JOBS: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]]
-JOBS = {row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS}
-JOBS |= {name: (0.05, {figure: target for figure in figures}, run) for name, (run, figures, target) in FALLS.items()}
+# A row: its h, the target of each figure, and what measures it with a seed.
+JOBS: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]] = {
+    **{row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS},
+    **{name: (0.05, {figure: target for figure in figures}, run) for name, (run, figures, target) in FALLS.items()},
+}
 
 
 def table(stored: dict) -> str:

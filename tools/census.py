@@ -111,12 +111,20 @@ def called(node: ast.AST) -> set[str]:
 def newton_loops(tree: ast.Module, text: str) -> Iterator[str]:
     """Functions with a loop that ends early (`while`, or `break`) and solves a linear problem in every turn."""
     functions = {f.name: f for f in ast.walk(tree) if isinstance(f, FUNCTIONS)}
-    solvers = {name for name, f in functions.items() if any(map(SOLVE.search, called(f)))}
+    solvers = solving({name: called(f) for name, f in functions.items()})
     named = "newton" in text.lower()
     for name, function in functions.items():
         solved = any(c in solvers or SOLVE.search(c) for loop in early_loops(function) for c in called(loop))
         if solved or (named and any("while_loop" in c for c in called(function))):
             yield f"{function.lineno} {name}"
+
+
+def solving(calls: dict[str, set[str]]) -> set[str]:
+    """Functions that solve a linear problem, themselves or by what they call; `calls` has what each calls."""
+    found = {name for name, names in calls.items() if any(map(SOLVE.search, names))}
+    while further := {name for name, names in calls.items() if names & found} - found:
+        found |= further
+    return found
 
 
 def early_loops(function: ast.AST) -> list[ast.AST]:

@@ -25,6 +25,7 @@ KINDS = {
     "spring": 0.30, "pendulum": 0.18, "axis": 0.12, "chain": 0.12, "pendulums": 0.08, "double_pendulum": 0.08,
     "cart_pole": 0.12,
 }  # fmt: skip
+# Shares: each friction is expected at least twice in thirty systems.
 FRICTIONS = {"viscous": 0.35, "dry": 0.25, "quadratic": 0.2, "stribeck": 0.12, "none": 0.08}
 # What is drawn instead: whether a joint sticks is decided by its own force, which a coupled mass does not have; and an
 # axis without dry friction is solved by hand.
@@ -176,6 +177,7 @@ def _spring(rng: Generator, _: int) -> Values:
     return values
 
 
+# What draws the numbers of a kind, in natural units: mass, length and frequency are near 1.
 POTENTIALS: dict[str, Callable[[Generator, int], Values]] = {
     "spring": _spring,
     "pendulum": _pendulum,

@@ -169,7 +169,8 @@ def _evaluate(equation: Equation, x: Tensor, rules: Rules, J: Jacobian = None, f
     point = equation(x, second)
     if second:
         J = select(fresh, point.J, J) if rules.keep and fresh is not None else point.J
-    delta = -(rules.solver or solve)(J, point.F)
+    solver = rules.solver or solve
+    delta = -solver(J, point.F)
     return _Here(x, point, J, delta, largest(point.F), rules.length(delta))
 
 
@@ -182,8 +183,8 @@ def _next(fraction: Tensor | None, accept: Tensor, natural: bool, like: Tensor) 
 def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Tensor | float) -> Tensor:
     """In which samples a trial passes the test of descent, (...)."""
     if rules.natural:
-        simplified = rules.length((rules.solver or solve)(here.J, trial.point.F))
-        return simplified <= (1 - NATURAL * fraction) * here.residual
+        solver = rules.solver or solve
+        return rules.length(solver(here.J, trial.point.F)) <= (1 - NATURAL * fraction) * here.residual
     return trial.merit <= (1 - ARMIJO * fraction) * here.merit
 
 
