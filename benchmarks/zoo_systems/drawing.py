@@ -75,39 +75,23 @@ def _attempt(rng: Generator, kind: str, seed: int, index: int) -> ZooSystem | No
     amplitude = float(rng.uniform(0.3, 1.0))
     noise = 0.0 if rng.random() < 0.3 else _log_uniform(rng, 0.001, 0.03)
     length_unit, time_unit = _log_uniform(rng, 1e-3, 10), 1 / _log_uniform(rng, 0.5, 30)
-    recordings = []
+    drawn = []
     for starts, length in ((count, samples), (3, warmup + rest)):
         t = _times(rng, length, PERIOD / rate, jitter)
         u = _inputs(rng, starts, t, amplitude) if driven else np.zeros((starts, length))
         q0, v0 = _start(rng, mechanism, starts)
         with np.errstate(all="ignore"):
             truth = exact_motion(mechanism, q0, v0, t, u)[0]
-        recordings.append((t, truth, u, rng.standard_normal(truth.shape)))
-    motions = [truth for _, truth, _, _ in recordings]
-    if not all(_readable(mechanism, truth) for truth in motions):
-        return None
+        drawn.append((t, truth, u, rng.standard_normal(truth.shape)))
+    motions = [truth for _, truth, _, _ in drawn]
     size = motions[0].reshape(-1, mechanism.n).std(0)
-    if not (size > SMALLEST).all():
+    if not all(_readable(mechanism, truth) for truth in motions) or not (size > SMALLEST).all():
         return None
-    sigma = noise * size
-    train, test = (Recording(t, truth + sigma * z, truth, u) for t, truth, u, z in recordings)
+    train, test = (Recording(t, truth + noise * size * z, truth, u) for t, truth, u, z in drawn)
     return ZooSystem(
-        seed,
-        index,
-        mechanism,
-        mechanism,
-        friction,
-        driven,
-        rate,
-        noise,
-        sigma,
-        size,
-        train,
-        test,
-        warmup,
-        length_unit,
-        time_unit,
-    )
+        seed, index, mechanism, mechanism, friction, driven, rate, noise, noise * size, size, train, test, warmup,
+        length_unit, time_unit,
+    )  # fmt: skip
 
 
 def _readable(mechanism: Mechanism, truth: Array) -> bool:

@@ -126,8 +126,10 @@ class ContactLagrangian(nn.Module):
 
     def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Terms:
         """Evaluate every term once."""
-        n = q0.shape[-1]
-        phase = Phase(q0, q1, h, order, self.config, delta)
+        return self._terms(Phase(q0, q1, h, order, self.config, delta))
+
+    def _terms(self, phase: Phase) -> Terms:
+        q0, q1, h, order, n = phase.q0, phase.q1, phase.h, phase.order, phase.q0.shape[-1]
         g = self.damping
         if g is not None:
             g = g(phase) if isinstance(g, AffineDamping) else g(q0, q1, h, order)
@@ -137,7 +139,7 @@ class ContactLagrangian(nn.Module):
             return Terms(g, None, None, None, N, b)
         V = self.potential(torch.stack([q0, q1]), order)  # both ends in one network call
         m = self.kinetic
-        K = m(q0, q1, h, order, delta) if isinstance(m, Kinetic) else m(phase)
+        K = m(q0, q1, h, order, phase.delta) if isinstance(m, Kinetic) else m(phase)
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -154,14 +156,14 @@ class ContactLagrangian(nn.Module):
     ) -> Partials:
         """Value and derivatives in closed form; see `herglotz.mechanics.partials`."""
         q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
-        return self._evaluate(q0, q1, s0[..., 0], h, order, u, None)
+        return self._evaluate(self._phase(q0, q1, s0[..., 0], h, order), s0[..., 0], u)
 
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
     ) -> Partials:
         """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 when the step is small."""
         q0, delta, s0 = torch.broadcast_tensors(q0, delta, s0[..., None])
-        return self._evaluate(q0, q0 + delta, s0[..., 0], h, order, u, delta)
+        return self._evaluate(self._phase(q0, q0 + delta, s0[..., 0], h, order, delta), s0[..., 0], u)
 
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
@@ -169,8 +171,7 @@ class ContactLagrangian(nn.Module):
         """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but the forced one."""
         if self.friction is None:
             return None
-        h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
-        force = self._forces(q0, q1, h, 1, u, None)
+        force = self._forces(self._phase(q0, q1, s0, h, 1), u)
         assert force is not None
         return force.minus, force.plus
 
@@ -195,13 +196,16 @@ class ContactLagrangian(nn.Module):
             return self.partials(q0, q1, s0, h, 1).L
         return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
 
-    def _evaluate(
-        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, u: Tensor | None, delta: Tensor | None
-    ) -> Partials:
+    def _phase(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, delta: Tensor | None = None
+    ) -> Phase:
         h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
-        t = self.terms(q0, q1, h, order, delta)
+        return Phase(q0, q1, h, order, self.config, delta)
+
+    def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
+        t, h = self._terms(phase), phase.h
         if self.action is not None:
-            return action_partials(self._through_action(self.action, t, s0, h, order))
+            return action_partials(self._through_action(self.action, t, s0, h, phase.order))
         c = None if t.g is None else t.g.exp()
         if t.K is None or t.V0 is None or t.V1 is None:
             assert t.N is not None  # checked by ModelConfig
@@ -210,7 +214,7 @@ class ContactLagrangian(nn.Module):
             V = h / 2 * (t.V0 + t.V1)
             L = t.K - V if c is None or t.g is None else (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - V
             L = L if t.N is None else L + t.N
-        return affine_partials(L, t.g, c, s0, self._forces(q0, q1, h, order, u, delta))
+        return affine_partials(L, t.g, c, s0, self._forces(phase, u))
 
     def _through_action(self, action: ActionFlow, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
         """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
@@ -238,12 +242,11 @@ class ContactLagrangian(nn.Module):
         rate = phase.q0.new_zeros(()) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
-    def _forces(
-        self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None
-    ) -> Forces | None:
+    def _forces(self, phase: Phase, u: Tensor | None) -> Forces | None:
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
+        q0, q1, h, order, delta = phase.q0, phase.q1, phase.h, phase.order, phase.delta
         v = (q1 - q0 if delta is None else delta) / h[..., None]
         c = self.damping(q0, q1, h, order).exp()
         forces = self.friction(v, c, h, order, u)

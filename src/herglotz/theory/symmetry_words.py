@@ -44,8 +44,9 @@ def _plane(A: Tensor) -> list[int]:
     return turned[0] if len(turned) == 2 and bool((A * A.mT).sum() < 0) else []
 
 
-def formula(A: Tensor, b: Tensor, a: Tensor, k: Tensor, w: Tensor, B: Tensor, coordinates: Sequence[str]) -> str:
-    """J = p·(A q + b) − a s − χ(q) as text; entries below a millionth of the largest are left out."""
+def formula(generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates: Sequence[str]) -> str:
+    """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ; small entries are left out."""
+    (A, b, a), (k, w, B) = generator, boundary
     terms = []
     for i, name in enumerate(coordinates):
         terms.append((float(b[i]), f"p_{name}"))
