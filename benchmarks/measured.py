@@ -124,7 +124,7 @@ def main(argv: list[str] | None = None) -> None:
             print(f"{name}: skipped, no {absent[0]} in {arguments.data}")
         else:
             names.append(name)
-    jobs = {name: partial(measure, folder=arguments.data) for name, (_, measure) in ROWS.items()}
+    jobs = {name: (lambda seed, one=measure: one(seed, arguments.data)) for name, (_, measure) in ROWS.items()}
     rows = harness.by_seed(path, jobs, names, arguments.seeds, table)
     if "coverage_simulated" in rows:
         draw(rows, path.with_name("coverage.png"))

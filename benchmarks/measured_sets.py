@@ -64,14 +64,14 @@ def rollout_rms(model: ContactLagrangian, steps: int, seed: int, reach: float | 
     return float((out.q - q).square().mean().sqrt())
 
 
-def noise(seed: int, folder: Path, trajectories: int = 40) -> dict[str, float]:  # noqa: ARG001
+def noise(seed: int, _folder: Path, trajectories: int = 40) -> dict[str, float]:
     data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=40, h=0.2, noise=0.01, seed=seed)
     run = fit(data, FitConfig(train_fraction=1.0, seed=seed), progress=False)
     reach = float(data.q.abs().max()) if trajectories == 1 else None
     return {"rms_100_steps": rollout_rms(run.model, 100, seed, reach), "train_rms": run.metrics["train_rms"]}
 
 
-def outliers(seed: int, folder: Path) -> dict[str, float]:  # noqa: ARG001
+def outliers(seed: int, _folder: Path) -> dict[str, float]:
     clean = simulate(scene("damped_pendulum"), trajectories=6, steps=60, h=0.2, noise=0.01, seed=seed)
     make = torch.Generator().manual_seed(seed + 100)
     bad = torch.rand(clean.samples, generator=make) < 0.02
@@ -85,7 +85,7 @@ def outliers(seed: int, folder: Path) -> dict[str, float]:  # noqa: ARG001
     return {**found, "over_clean": found["robust"] / found["clean"]}
 
 
-def disturbed(seed: int, folder: Path) -> dict[str, float]:  # noqa: ARG001
+def disturbed(seed: int, _folder: Path) -> dict[str, float]:
     count, steps, h, parts = 10, 100, 0.2, 20
     start = simulate(scene("damped_pendulum"), trajectories=count, steps=2, h=h, seed=seed, keep_state=True)
     assert start.p is not None
@@ -209,7 +209,7 @@ def members(run: Run) -> list[Run]:
     return [run, *(fit(run.data, config, progress=False) for config in others)]
 
 
-def coverage_simulated(seed: int, folder: Path) -> dict[str, Any]:  # noqa: ARG001
+def coverage_simulated(seed: int, _folder: Path) -> dict[str, Any]:
     pendulum = scene("damped_pendulum")
     data = simulate(pendulum, trajectories=TRAINED, steps=STEPS, h=0.2, noise=0.01, seed=seed)
     run = fit(data, FitConfig(train_fraction=1.0, seed=seed), progress=False)
