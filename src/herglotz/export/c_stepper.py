@@ -21,14 +21,7 @@ from herglotz.stepping.rollout import Track
 class CLibrary:
     """The compiled functions of a generated header, sample by sample on one thread, as functions of tensors.
 
-    Parameters
-    ----------
-    header
-        What `export_c` wrote.
-    path
-        Where it came from, for messages.
-    whole
-        Gives the header with derivatives, where this one has none.
+    `path` is named in messages; `whole` gives the header with derivatives, where this one has none.
 
     Raises
     ------

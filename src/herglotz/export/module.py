@@ -39,15 +39,7 @@ def solved(
 
 
 class RolloutModule(nn.Module):
-    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside.
-
-    Parameters
-    ----------
-    graphs
-        The functions of a step.
-    iterations
-        Bound on the Newton iterations of a step.
-    """
+    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`."""
 
     def __init__(self, graphs: StepGraphs, iterations: int):
         super().__init__()
@@ -96,17 +88,6 @@ class StepModule(nn.Module):
     The solve is outside autograd; its derivative is that of the implicit-function theorem, dΔ = −J⁻¹ dF, with J at the
     solution. A step in closed form is differentiated as it stands. With `linearised`, d(q, p, s)′ / d(q, p, s, h, u),
     (B, 2n+1, 2n+2+m), is one more output instead.
-
-    Parameters
-    ----------
-    equations
-        Of the discrete Lagrangian.
-    graphs
-        The functions of a step.
-    iterations
-        Bound on the Newton iterations.
-    linearised
-        Give the derivative as an output.
     """
 
     def __init__(self, equations: Equations, graphs: StepGraphs, iterations: int, *, linearised: bool = False):

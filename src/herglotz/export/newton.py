@@ -44,13 +44,7 @@ def first_carry(guess: Tensor) -> Values:
 
 
 class NewtonIteration(nn.Module):
-    """One iteration with backtracking, one evaluation of the step equation.
-
-    Parameters
-    ----------
-    model
-        The discrete Lagrangian; not copied.
-    """
+    """One iteration with backtracking, one evaluation of the step equation."""
 
     def __init__(self, model: ContactLagrangian):
         super().__init__()

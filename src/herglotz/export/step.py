@@ -153,14 +153,9 @@ def _followed(trail: Tensor, v: Tensor) -> Tensor:
 
 
 class StepGraphs(nn.Module):
-    """The functions of a step, traced.
+    """The functions of a step, traced, of a model that is not to be trained any more.
 
-    Parameters
-    ----------
-    model
-        The discrete Lagrangian; not copied, and not to be trained any more.
-    box, h_range
-        Where it was fitted, for the output `outside` (`herglotz.export.box`).
+    `box` and `h_range` say where it was fitted, for the output `outside` (`herglotz.export.box`).
     """
 
     def __init__(

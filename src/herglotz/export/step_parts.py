@@ -75,12 +75,7 @@ class GivenPotential(nn.Module):
 class StepParts(nn.Module):
     """Everything that a step is made of, for a format that cuts it into pieces itself (`herglotz.export.lower.c`).
 
-    Parameters
-    ----------
-    model
-        Not changed.
-    explicit
-        Whether the step needs no iteration: then the guess is the solution, and J is not known.
+    Where the step is `explicit`, the guess is the solution, and J is not known.
     """
 
     def __init__(self, model: ContactLagrangian, explicit: bool):

@@ -35,16 +35,7 @@ INSTEAD: dict[Any, Any] = {
 class Graph(nn.Module):
     """A traced function f(*inputs) of `code`(*inputs, *constants); loops take the constants as operands.
 
-    Every node has meta "example": what it gave when it was traced, tensors as `Example`.
-
-    Parameters
-    ----------
-    code
-        The graph; its last inputs are the constants.
-    constants
-        Their values.
-    batch
-        The batch it was traced with.
+    Every node has meta "example": what it gave when it was traced, with `batch` samples, tensors as `Example`.
     """
 
     def __init__(self, code: fx.GraphModule, constants: Sequence[Tensor], batch: int):
@@ -77,12 +68,8 @@ def example_batch(sizes: set[int]) -> int:
 def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
     """The module as a graph without classes, repetitions and constant parts, for any batch size.
 
-    Parameters
-    ----------
-    module
-        Takes and returns tensors whose batch is axis 0; may differentiate by `torch.func`; not changed.
-    arguments
-        Examples, with a batch from `example_batch`.
+    The module takes and returns tensors whose batch is axis 0, and may differentiate by `torch.func`; `arguments` are
+    examples, with a batch from `example_batch`.
     """
     recorder = Recorder(arguments)
     with torch.no_grad():
@@ -129,11 +116,6 @@ class Recorder(TorchDispatchMode):
 
     An operation on numbers that no input and no batch size decides is not written down; its result becomes a constant
     where an operation that is written down reads it. What changes nothing is left out.
-
-    Parameters
-    ----------
-    inputs
-        The tensors that become the inputs of the graph.
     """
 
     def __init__(self, inputs: Sequence[Tensor]):

@@ -203,17 +203,7 @@ def variable(x: Tensor, index: int, size: int, order: int) -> Jet:
 
 
 def affine(value: Tensor, slope: Tensor, order: int) -> Jet:
-    """A vector-valued jet with constant gradient.
-
-    Parameters
-    ----------
-    value
-        (..., m).
-    slope
-        (d, m) or (d, ..., m): ∂_i of each component.
-    order
-        1 or 2.
-    """
+    """A vector-valued jet (..., m) with constant gradient: slope (d, m) or (d, ..., m) is ∂_i of each component."""
     d = slope.shape[0]
     slope = slope.reshape(d, *(1,) * (value.ndim - slope.ndim + 1), *slope.shape[1:])
     rows = [value[None], slope.expand(d, *value.shape)]

@@ -22,17 +22,7 @@ from herglotz.models.terms import Kinetic
 
 
 class Slope:
-    """The force e and the mass M at one (q̄, v), for V and K made of features and a constant mass.
-
-    Parameters
-    ----------
-    potential, kinetic
-        V and K.
-    rate
-        γ, a scalar.
-    phase
-        q̄ and v.
-    """
+    """The force e and the mass M at one (q̄, v), for V and K made of features and a constant mass; γ is a scalar."""
 
     def __init__(self, potential: FeaturePotential, kinetic: Kinetic | FeatureKinetic, rate: Tensor, phase: Phase):
         self.potential, self.rate, self.phase = potential, rate, phase

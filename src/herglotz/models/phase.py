@@ -2,45 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Protocol
-
 from torch import Tensor
 
+from herglotz.models.config import ModelConfig
 from herglotz.models.jet import Jet, concatenate
 from herglotz.models.network import midpoint_velocity_jets, position_features
-
-
-class Sizes(Protocol):
-    """What is known of the coordinates: a `ModelConfig`, or a term that keeps its own copy."""
-
-    @property
-    def angles(self) -> tuple[bool, ...]: ...  # noqa: D102
-    @property
-    def scale(self) -> tuple[float, ...]: ...  # noqa: D102
-    @property
-    def speed(self) -> tuple[float, ...]: ...  # noqa: D102
 
 
 class Phase:
     """q̄ = (q0 + q1)/2, v = Δ/h and their features as jets over (q0, q1), each made at its first use.
 
     A model whose terms read none of them pays nothing.
-
-    Parameters
-    ----------
-    q0, q1
-        (..., n) positions.
-    h
-        (...) step.
-    order
-        1 or 2.
-    sizes
-        Angles, scale and speed of the coordinates.
-    delta
-        (..., n) Δ = q1 − q0 where it is known better than by subtraction.
     """
 
-    def __init__(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, sizes: Sizes, delta: Tensor | None = None):
+    def __init__(
+        self,
+        q0: Tensor,  # (..., n)
+        q1: Tensor,  # (..., n)
+        h: Tensor,  # (...)
+        order: int,  # 1 or 2
+        sizes: ModelConfig,  # angles, scale and speed of the coordinates
+        delta: Tensor | None = None,  # (..., n) q1 − q0 where it is known better than by subtraction
+    ):
         self.q0, self.q1, self.h, self.order, self.sizes = q0, q1, h, order, sizes
         self.delta = delta
         self._jets: tuple[Jet, Jet] | None = None

@@ -74,12 +74,7 @@ class Sweep:
     def __call__(self, y: Tensor, dy: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor | None]:
         """Value (...), gradient (..., m) at the features y (..., m), and the gradient's tangents (k, ..., m).
 
-        Parameters
-        ----------
-        y
-            (..., m).
-        dy
-            (k, ..., m) tangents of y; without them the third result is None.
+        Without the tangents dy of y, (k, ..., m), the third result is None.
         """
         layers: list[tuple[Tensor, Tensor | None]] = []
         for weight, bias in zip(self.hidden, self.biases, strict=True):

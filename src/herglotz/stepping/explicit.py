@@ -55,14 +55,7 @@ class _Constants(NamedTuple):
 class Leapfrog:
     """The explicit step of one model at its present parameters; differentiable by plain autograd.
 
-    Parameters
-    ----------
-    model
-        One whose capabilities are `explicit`.
-    invert
-        Inverse of a batch of matrices, for where `torch.linalg` cannot go.
-    field
-        V and V′, in the place of `FieldOf`.
+    `invert` inverts a batch of matrices where `torch.linalg` cannot go; `field` gives V and V′ in place of `FieldOf`.
     """
 
     def __init__(

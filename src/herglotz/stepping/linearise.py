@@ -39,17 +39,7 @@ class Linearised(NamedTuple):
 
 
 def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None, step: Step) -> Linearised:
-    """The derivatives of a solved step of L_d.
-
-    Parameters
-    ----------
-    L_d
-        Any discrete Lagrangian.
-    state, h, u
-        What the step started from; h is a scalar or (...), u is (m,) or (..., m).
-    step
-        The solved step.
-    """
+    """The derivatives of a solved step of L_d from `state`; h is a scalar or (...), u is (m,) or (..., m)."""
     q, p, s = (x.detach() for x in state)
     h = h.detach().expand(s.shape)
     u = None if u is None else u.detach().expand(*s.shape, u.shape[-1])
@@ -136,15 +126,7 @@ def backward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor
 def eliminate(A: Tensor, b: Tensor) -> Tensor:
     """A⁻¹ b by elimination with row exchanges, written out: ONNX has no solve, AOTInductor calls it slowly.
 
-    Parameters
-    ----------
-    A, b
-        (..., n, n) and (..., n, k); n is small.
-
-    Returns
-    -------
-    Tensor
-        (..., n, k); inf or nan where A is singular.
+    A is (..., n, n), with a small n, and b (..., n, k); inf or nan where A is singular.
     """
     n = b.shape[-2]
     if n == 1:

@@ -87,33 +87,16 @@ class Plan:
 
 @dataclass(frozen=True)
 class Drive:
-    """What is rolled out, and how.
+    """What is rolled out, and how."""
 
-    Parameters
-    ----------
-    single_step
-        Makes the function that takes one step; called once for each segment, whose steps may share work.
-    h
-        (..., K) all steps.
-    plan
-        Segments and decimation.
-    inputs
-        (..., K, m), or None.
-    watch
-        The events to look for, or None.
-    extrapolate
-        Whether the steps want a guess.
-    check
-        Looks at every step and raises, or None.
-    """
-
+    # Makes the function that takes one step; called once for each segment, whose steps may share work.
     single_step: Callable[[], OneStep]
-    h: Tensor
+    h: Tensor  # (..., K) all steps
     plan: Plan
-    inputs: Tensor | None = None
+    inputs: Tensor | None = None  # (..., K, m)
     watch: Watch | None = None
-    extrapolate: bool = True
-    check: Check | None = None
+    extrapolate: bool = True  # whether the steps want a guess
+    check: Check | None = None  # looks at every step and raises
 
     @cached_property
     def guess(self) -> Extrapolation:

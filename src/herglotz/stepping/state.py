@@ -186,18 +186,12 @@ def step_sizes(h: Tensor, steps: int | None) -> Tensor:
     return h
 
 
-def status_of_root(root: Root, finite: Tensor, singular: Tensor | None = None) -> Tensor:
-    """The status of each sample from where its iteration ended, uint8.
-
-    Parameters
-    ----------
-    root
-        The solved unknowns.
-    finite
-        (...) whether the step has finite numbers.
-    singular
-        (...) whether the step is not defined at the solution, beside where J is singular.
-    """
+def status_of_root(
+    root: Root,
+    finite: Tensor,  # (...) whether the step has finite numbers
+    singular: Tensor | None = None,  # (...) whether it is not defined at the solution, beside where J is singular
+) -> Tensor:
+    """The status of each sample from where its iteration ended, uint8."""
     singular = ~torch.isfinite(root.error) if singular is None else singular | ~torch.isfinite(root.error)
     status = torch.where(root.converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
     status = torch.where(singular, int(Status.SINGULAR), status)

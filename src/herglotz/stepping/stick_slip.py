@@ -41,10 +41,7 @@ class Rest(NamedTuple):
 def at_rest(equation: PartialsEquation) -> Rest:
     """The start of the iteration, exact for n = 1 and by Gauss–Seidel for more, with the constants of z.
 
-    Parameters
-    ----------
-    equation
-        In the unknown q1 or, in increments, Δ = q1 − q0; its friction is set-valued.
+    The friction of the equation, which is in q1 or, in increments, in Δ = q1 − q0, is set-valued.
     """
     zero = torch.zeros_like(equation.q0)
     P = equation(zero if equation.increments else equation.q0, True).rest
@@ -63,14 +60,9 @@ def at_rest(equation: PartialsEquation) -> Rest:
 
 
 class StickSlip:
-    """A step equation in the unknown z, for an equation whose forces hold; see the head of this module.
+    """A step equation in the unknown z, for an equation in q1 or Δ whose forces hold; see the head of this module.
 
-    Parameters
-    ----------
-    equation
-        In the unknown q1 or, in increments, Δ = q1 − q0.
-    stiffness, bound
-        K and w/K, as `at_rest` gives them.
+    K = `stiffness` and w/K = `bound` are those of `at_rest`.
     """
 
     def __init__(self, equation: PartialsEquation, stiffness: Tensor, bound: Tensor):

@@ -28,15 +28,7 @@ Outputs = Mapping[str, Any]  # the place written to → its number, or the list 
 
 
 class StepInC:
-    """The C functions of one model's step.
-
-    Parameters
-    ----------
-    equations
-        Of the model, in float64: numbers are rounded when they are written.
-    explicit
-        Whether the step needs no iteration.
-    """
+    """The C functions of one model's step, in float64: numbers are rounded when they are written."""
 
     def __init__(self, equations: Equations, explicit: bool):
         self.explicit = explicit

@@ -28,14 +28,7 @@ ROWS = ("tanh", "sigmoid", "softplus")  # functions with a kernel for a whole ro
 def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -> list[np.ndarray]:
     """The outputs of a graph as arrays of atoms, for one sample: the batch axis has size 1.
 
-    Parameters
-    ----------
-    program
-        Takes the statements.
-    graph
-        The traced function.
-    inputs
-        The numbers of each argument, in its order.
+    `program` takes the statements; `inputs` are the numbers of each argument, in its order.
     """
     nodes = list(graph.code.graph.nodes)
     places = [node for node in nodes if node.op == "placeholder"]

@@ -38,14 +38,8 @@ class Constants:
 class Writer:
     """Nodes of one graph; a value is known by its name, a size by a tensor of one number.
 
-    Parameters
-    ----------
-    constants
-        Where the file keeps them.
-    real
-        dtype of plain numbers where no tensor says otherwise.
-    numbers
-        Of the names, shared by all writers of a file.
+    `real` is the dtype of plain numbers where no tensor says otherwise; all writers of a file share the `numbers` of
+    its names.
     """
 
     def __init__(self, constants: Constants, real: torch.dtype, numbers: Iterator[int] | None = None):
