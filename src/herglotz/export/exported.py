@@ -24,29 +24,19 @@ FILES = {"pt2": "a .pt2", "aoti": "an AOTInductor", "onnx": "an ONNX", "c": "a C
 
 
 class ExportedStepper(OneStepMethod):
-    """The flow Φ̃ of an exported model; results are those of `Stepper`.
+    """The flow Φ̃ of an exported model; results are those of `Stepper`. `load_exported` makes it of a file.
 
-    Parameters
-    ----------
-    programs
-        What the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) → K steps, and
-        where the format has them `model`, one differentiable step, `linearise` and `init`.
-    metadata
-        The file's own description: model, dof, dtype, h, units, angles, box, versions, weights_sha256.
-    path
-        Where it came from, for messages.
-    kind
-        "pt2", "aoti", "onnx" or "c".
-    loop
-        K steps, of a format that has no program `rollout`. It needs no inputs where none act.
+    The programs are what the file can run, each a function of contiguous tensors: `rollout` (q, p, s, h (K, B)[, u]) →
+    K steps, and where the format has them `model`, one differentiable step, `linearise` and `init`. A format without
+    the program `rollout` gives the loop of K steps instead, which needs no inputs where none act.
     """
 
     def __init__(
         self,
         programs: Mapping[str, Program],
-        metadata: dict[str, Any],
-        path: str = "exported model",
-        kind: str = "pt2",
+        metadata: dict[str, Any],  # the file's own: model, dof, dtype, h, units, angles, box, versions, weights_sha256
+        path: str = "exported model",  # where it came from, for messages
+        kind: str = "pt2",  # or "aoti", "onnx", "c"
         loop: Loop | None = None,
     ):
         self.programs = dict(programs)
@@ -88,18 +78,7 @@ class ExportedStepper(OneStepMethod):
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
-        """One step.
-
-        Parameters
-        ----------
-        state
-            (q, p, s) with shapes (..., n), (..., n), (...), in the dtype of the file.
-        h
-            Time step > 0, scalar or (...).
-        guess
-            Taken for the sake of `Stepper`'s signature; the file has its own guess.
-        u
-            (..., m) inputs, for a model that takes some; None: no input acts.
+        """One step, as `Stepper.step`, in the dtype of the file, which has its own guess; u None: no input acts.
 
         Returns
         -------
@@ -124,10 +103,7 @@ class ExportedStepper(OneStepMethod):
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
         """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
 
-        Parameters
-        ----------
-        state, h, u
-            As in `step`; autograd does not go through the result.
+        Autograd does not go through the result.
 
         Returns
         -------

@@ -15,15 +15,7 @@ RIDGES = ("cos", "sin", "power")  # functions of a linear form w·q; "radius" is
 
 
 class Combination(nn.Module):
-    """Σ_g θ_g φ_g, with θ learned from 0, plus the known features with their own numbers.
-
-    Parameters
-    ----------
-    features, known
-        As parsed; the numbers of a known one are in units in which the first coordinate's mass is 1.
-    dof
-        Number of coordinates n.
-    """
+    """Σ_g θ_g φ_g, with θ learned from 0, plus the known features with their own numbers, where the first mass is 1."""
 
     def __init__(self, features: Sequence[Feature], known: Sequence[Feature], dof: int):
         super().__init__()

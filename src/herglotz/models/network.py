@@ -16,36 +16,19 @@ class Network(nn.Module):
     """Perceptron R^m → R (or R^k) with a zero-initialised last layer, so that a new model equals its baseline.
 
     (`zero=False` draws the last layer too, for a model that has no baseline.)
-
-    Parameters
-    ----------
-    inputs
-        Number of features m.
-    width, depth
-        Hidden units a layer, hidden layers.
-    gain
-        Size of the initial weights relative to 1/√inputs: below 1 the network starts smooth.
-    generator
-        Source of the initial weights.
-    zero
-        Start the last layer at zero.
-    outputs
-        Length k of the result; None for a scalar.
-    activation
-        One of `ACTIVATIONS`: smooth, so that the Hessian is no zero (trap 6).
     """
 
     def __init__(
         self,
-        inputs: int,
-        width: int,
-        depth: int,
-        gain: float,
+        inputs: int,  # m
+        width: int,  # hidden units a layer
+        depth: int,  # hidden layers
+        gain: float,  # size of the initial weights relative to 1/√inputs: below 1 the network starts smooth
         generator: torch.Generator,
         *,
         zero: bool = True,
-        outputs: int | None = None,
-        activation: str = "tanh",
+        outputs: int | None = None,  # k; None: a scalar
+        activation: str = "tanh",  # of `ACTIVATIONS`: smooth, so that the Hessian is no zero (trap 6)
     ):
         super().__init__()
         self.activation, self.scalar = activation, outputs is None

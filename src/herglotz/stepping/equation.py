@@ -75,12 +75,7 @@ class _Constants(NamedTuple):
 class ModelEquation:
     """Makes the step equations of one model at its present parameters; keeps what they share.
 
-    Parameters
-    ----------
-    model
-        One whose step equation is known `by_terms`.
-    fold
-        Fold h into the networks' last layers: fewer operations where h is one number for all samples.
+    `fold` puts h into the networks' last layers: fewer operations where h is one number for all samples.
     """
 
     def __init__(self, model: ContactLagrangian, fold: bool = True):

@@ -28,17 +28,7 @@ EXACT = 1e-8  # σ of the residuals relative to the motion's size
 
 
 class FlowProblem:
-    """½ Σ |r|²/σ² + prior over the parameters, for pairs of states a time H apart.
-
-    Parameters
-    ----------
-    model
-        The model to re-train; its parameters are read, not changed.
-    before, after
-        T pairs of states, (T, n), (T, n), (T,) each.
-    h
-        The time H between the states of a pair.
-    """
+    """½ Σ |r|²/σ² + prior over the parameters of a model, for T pairs of states a time H = h apart."""
 
     def __init__(self, model: ContactLagrangian, before: State, after: State, h: float, chunk: int = 1024):
         self.parameters, self.before, self.after, self.chunk = ParameterVector(model), before, after, chunk

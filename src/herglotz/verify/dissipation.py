@@ -24,14 +24,7 @@ TOLD = 0.05  # the data tell the dissipation where an altered one changes the er
 def dissipation(run: Run, error: Callable[[Run], float], own: float) -> tuple[Check | None, str]:
     """Compare the error of the run's windows with those of its null models; None and a note where nothing is told.
 
-    Parameters
-    ----------
-    run
-        The run.
-    error
-        The RMS of free runs over windows, of any run on these data.
-    own
-        That of this run.
+    `error` is the RMS of free runs over windows, of any run on these data, and `own` that of this run.
     """
     if not math.isfinite(own) or not any(bool((x != 0).any()) for x in _rates(run.model)):
         return None, ""

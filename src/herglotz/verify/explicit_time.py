@@ -19,18 +19,9 @@ from herglotz.verify.subject import Subject
 
 
 def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bound: float) -> list[Check]:
-    """The checks of motions whose k-th step begins at t_k = t0 + kh.
+    """The checks of motions of K = `steps` steps, the k-th of which begins at t_k = t0 + kh.
 
-    Parameters
-    ----------
-    known
-        The subject whose L_d is `family`.
-    family
-        L_d with the time t0 at which the motions begin.
-    steps
-        K, the steps of a motion.
-    strict, bound
-        Of the contact property, and of the other identities.
+    `strict` bounds the contact property, `bound` the other identities.
     """
     times = torch.as_tensor(family.t0, dtype=known.states.s.dtype) + known.h * torch.arange(steps).to(known.states.s)
     members = [replace(known, L_d=family.at(t.reshape(1))) for t in times]

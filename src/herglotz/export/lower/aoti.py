@@ -30,16 +30,7 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     nothing and takes contiguous tensors of the model's dtype only: call it through `load_aoti`, which does check. It
     runs on the kind of processor it was compiled on, without derivatives.
 
-    Parameters
-    ----------
-    model, path, h, box, units, metadata, newton_iterations
-        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside,
-        plus 2 where h is outside an `h_range` in the metadata.
-
-    Returns
-    -------
-    Path
-        The file written.
+    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`.
 
     Raises
     ------

@@ -32,16 +32,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     A failed step has a status other than 0, and NaN from there on. The entry `herglotz_init` of the model's metadata is
     a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1.
 
-    Parameters
-    ----------
-    model, path, h, box, units, metadata, newton_iterations
-        As in `export_pt2`. With a box there is one more output, `outside`: 1 where a step starts or ends outside,
-        plus 2 where h is outside an `h_range` in the metadata.
-
-    Returns
-    -------
-    Path
-        The file written.
+    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`.
 
     Raises
     ------

@@ -80,18 +80,10 @@ class Program:
     def elementwise(
         self, form: str, fold: Callable[..., Atom | None], *operands: Any, kernel: str | None = None
     ) -> np.ndarray:
-        """A formula entry by entry.
+        """A formula as in `scalar`, entry by entry of arrays of atoms that broadcast.
 
-        Parameters
-        ----------
-        form
-            As in `scalar`.
-        fold
-            The result where no operation is needed, else None.
-        operands
-            Arrays of atoms that broadcast.
-        kernel
-            A function of (count, x, y) that does a whole row.
+        `fold` gives the result where no operation is needed, else None; `kernel` names a function of (count, x, y) that
+        does a whole row.
         """
         arrays = np.broadcast_arrays(*(np.asarray(x, object) for x in operands))
         out = np.empty(arrays[0].size, object)
