@@ -12,7 +12,7 @@ from torch import Tensor
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata
-from herglotz.export.c_wrapper import build
+from herglotz.export.c_wrapper import build, library_of
 from herglotz.export.exported import ExportedStepper
 from herglotz.stepping import Status
 from herglotz.stepping.rollout import Track
@@ -34,7 +34,7 @@ class CLibrary:
         self.dof: int = self.metadata["dof"]
         self.inputs: int = self.metadata["inputs"]
         self.dtype: torch.dtype = getattr(torch, self.metadata["dtype"])
-        self.library = build(header, self.metadata["name"])
+        self.library = build(header, library_of(self.metadata["name"]))
         self.whole = whole
         self.differentiates = self.library if whole is None else None
 

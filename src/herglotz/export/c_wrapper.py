@@ -42,8 +42,8 @@ def compiler() -> list[str]:
     raise InputError(f"{missing}; install one, for example with: apt install gcc")
 
 
-def build(header: str, name: str) -> ctypes.CDLL:
-    """Compile the header with its loops, or take the library from the cache, and load it.
+def build(header: str, loops: str) -> ctypes.CDLL:
+    """Compile C that includes the header as "stepper.h", or take the library from the cache, and load it.
 
     Raises
     ------
@@ -51,7 +51,6 @@ def build(header: str, name: str) -> ctypes.CDLL:
         If there is no compiler, or it does not compile the header.
     """
     words = compiler()
-    loops = re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
     key = "\0".join([header, loops, *words, *FLAGS, sys.platform, _processor()])
     digest = hashlib.sha256(key.encode()).hexdigest()[:32]
     library = private_folder("c") / f"{digest}.so"
@@ -61,6 +60,11 @@ def build(header: str, name: str) -> ctypes.CDLL:
         return ctypes.CDLL(str(library))
     except OSError as error:
         raise InputError(f"{library}: cannot be loaded ({error}); check the compiler {words[0]}") from None
+
+
+def library_of(name: str) -> str:
+    """The loops around a header whose prefix is `name`."""
+    return re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
 
 
 def _is_whole(library: Path) -> bool:

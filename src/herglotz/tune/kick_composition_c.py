@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import ctypes
 import math
-import subprocess
-import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +20,7 @@ from numpy.polynomial import polynomial as power
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
-from herglotz.export.c_wrapper import FLAGS, compiler
+from herglotz.export.c_wrapper import build
 from herglotz.stepping import Rollout, State, Status
 from herglotz.tune.kick_composition import KickStepper
 
@@ -63,7 +61,7 @@ static inline int herglotz_kicks_rollout(herglotz_kicks_state *x, long steps, he
 #endif
 """
 
-LOOPS = """#include "kicks.h"
+LOOPS = """#include "stepper.h"
 typedef herglotz_real real;
 /* Outputs are (batch, steps + 1). Each motion waits for the one before, as in a loop of control. */
 int herglotz_kicks_rollouts(long batch, long steps, double wait, const real *q0, const real *p0, const real *s0,
@@ -117,24 +115,7 @@ class CompiledKicks:
 
     def __init__(self, stepper: KickStepper, dtype: str = "float64"):
         self.h, self.rate, self.dtype = stepper.h, stepper.rate, getattr(torch, dtype)
-        with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-            here = Path(folder)
-            (here / "kicks.h").write_text(kicks_c(stepper, dtype))
-            (here / "kicks.c").write_text(LOOPS)
-            command = [
-                *compiler(),
-                *FLAGS,
-                "-shared",
-                "-fPIC",
-                str(here / "kicks.c"),
-                "-o",
-                str(here / "kicks.so"),
-                "-lm",
-            ]
-            done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
-            if done.returncode:
-                raise InputError(f"{command[0]}: does not compile the kicks ({done.stderr[:200]})")
-            self.library = ctypes.CDLL(str(here / "kicks.so"))
+        self.library = build(kicks_c(stepper, dtype), LOOPS)
 
     def rollout(
         self, q: torch.Tensor, p: torch.Tensor, s: torch.Tensor | None = None, *, h: torch.Tensor | float, steps: int
