@@ -5,8 +5,8 @@ then carries the defects forward, e_{k+1} = A_k e_k + Φ̃(X_k) − X_{k+1}. It 
 sweeps from the trajectory of a slightly different parameter vector, and costs a few batched evaluations where
 stepping costs K small ones (Albersmeyer & Diehl 2010, the lifted Newton method).
 
-Φ̃ is implicit: its own equation F(q_k, q_{k+1}) = 0 is linearised about the guess of q_{k+1} in the same sweep, so that a
-sweep costs one evaluation of L_d. Where these sweeps do not converge, sweeps that solve every step follow.
+Φ̃ is implicit: its own equation F(q_k, q_{k+1}) = 0 is linearised about the guess of q_{k+1} in the same sweep, so that
+a sweep costs one evaluation of L_d. Where these sweeps do not converge, sweeps that solve every step follow.
 """
 
 from __future__ import annotations
