@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import unicodedata
 from dataclasses import dataclass, field
+from html import escape
 from textwrap import fill
 from typing import Any
 
@@ -64,9 +65,9 @@ class Check:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Report:
-    """All checks of one target."""
+    """All checks of one target; printed, it is its table."""
 
     target: str
     checks: tuple[Check, ...]
@@ -84,6 +85,16 @@ class Report:
             if check.name == name:
                 return check
         raise KeyError(f"no check {name!r}; there are {', '.join(c.name for c in self.checks)}")
+
+    def __repr__(self) -> str:
+        bad = [check.name for check in self.checks if not check.passed]
+        return f"Report({self.target}: {'verified' if self.passed else 'NOT verified, ' + ', '.join(bad)})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.table())}</pre>"
 
     def table(self) -> str:
         """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below."""
