@@ -6,12 +6,14 @@ import argparse
 import json
 import math
 import tempfile
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from herglotz.errors import InputError
 
+COLUMNS = 80  # of a terminal as it opens
 KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kicks were chosen
 
 
@@ -39,6 +41,21 @@ def count(text: str) -> int:
     if not text.isdecimal():
         raise argparse.ArgumentTypeError(f"must be a whole number >= 0, got {text!r}")
     return int(text)
+
+
+def seed(text: str) -> int:
+    """Parse a seed, as PyTorch's generators take it (argparse type)."""
+    value = count(text)
+    if value >= 2**63:
+        raise argparse.ArgumentTypeError(f"must be below 2^63, got {text}")
+    return value
+
+
+def existing(text: str) -> Path:
+    """Parse the path of a file or folder that is there (argparse type): it is missed before any other flag is."""
+    if not Path(text).exists():
+        raise argparse.ArgumentTypeError(f"{text}: there is no such file; check the name and the folder")
+    return Path(text)
 
 
 def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) -> None:
@@ -90,11 +107,16 @@ def print_json(values: dict[str, Any]) -> None:
     print(json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False))
 
 
+def say(text: str) -> None:
+    """Print a sentence in lines that fit a terminal as it opens; names of files are not broken."""
+    print(textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False))
+
+
 def print_table(rows: Sequence[tuple[str, str]]) -> None:
-    """Print names and values in two aligned columns."""
+    """Print names and values in two aligned columns, wrapped."""
     width = max(len(name) for name, _ in rows)
     for name, value in rows:
-        print(f"  {name:<{width}}  {value}")
+        print(textwrap.fill(value, COLUMNS, initial_indent=f"  {name:<{width}}  ", subsequent_indent=" " * (width + 4)))
 
 
 def _plain(value: Any) -> Any:

@@ -14,8 +14,8 @@ FORMAT = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file whose format i
 DESCRIPTION = """\
 Write the model of a run as one file; every format checks its own steps and reports a residual and a status.
 
-  pt2   graphs of PyTorch operations: one differentiable step, K steps, and a start from two positions. Any batch
-        size, any step; torch.export.load(FILE).module() needs no herglotz
+  pt2   graphs of PyTorch operations: one differentiable step, K steps, and a start from two positions. Any batch size,\
+ any step; torch.export.load(FILE).module() needs no herglotz
   onnx  K steps (q, p, s, h) for onnxruntime and numpy, without PyTorch; a start from two positions in its metadata
   aoti  K steps and a start compiled to machine code (needs g++ or clang++, one or two minutes): fast batches
   c     one C99 header that steps with <math.h> alone: the fastest single steps

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import print_json
+from herglotz.cli.common import print_json, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
 
@@ -86,7 +86,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     print("Result:")
     print(result.summary())
     if drawn:
-        print(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
+        say(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 

@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from herglotz.cli.common import check_output_folder
+from herglotz.cli.common import check_output_folder, existing
 from herglotz.cli.settings import add_data_settings
 from herglotz.errors import InputError
 
@@ -16,7 +16,7 @@ Progress = Literal[False, "lines", "iterations"] | None  # what `herglotz.traini
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """Add DATA, --out and --resume, --config, and how the data are read: --angles, --train-fraction."""
-    parser.add_argument("data", metavar="DATA", type=Path, help="file with time and positions")
+    parser.add_argument("data", metavar="DATA", type=existing, help="file with time and positions")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
     add_data_settings(parser)

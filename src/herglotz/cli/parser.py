@@ -13,24 +13,44 @@ from herglotz.cli import export, fit, plot, predict, report, rollout, select, si
 DESCRIPTION = """\
 Learn a discrete contact Lagrangian from measured positions, step it, and prove that it is a contact integrator.
 
-  herglotz simulate damped_pendulum --out pendulum.csv     data with a known answer (or bring your own csv)
-  herglotz fit pendulum.csv --out runs/pendulum            train; metrics and figures land in the folder
-  herglotz verify runs/pendulum                            check every identity, exit code 1 if one fails
-  herglotz report runs/pendulum                            one HTML page: the equation, errors, whether to believe it
-  herglotz export runs/pendulum --out pendulum.pt2         one file that steps with PyTorch alone
+Data with a known answer (or bring your own csv):
+  herglotz simulate damped_pendulum --out pendulum.csv
+Train; metrics and figures land in the folder:
+  herglotz fit pendulum.csv --out runs/pendulum
+One HTML page: the equation, errors, whether to believe it:
+  herglotz report runs/pendulum
+Check every identity, exit code 1 if one fails:
+  herglotz verify runs/pendulum
+One file that steps with PyTorch alone:
+  herglotz export runs/pendulum --out pendulum.pt2
 """
 NEGATIVE_NUMBER = re.compile(r"^-(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")  # argparse takes -1e-3 for an option
 
 
 class Help(argparse.RawDescriptionHelpFormatter):
-    """Help as wide as the terminal: paragraphs are wrapped, lists and examples (indented lines) stay."""
+    """Help as wide as the terminal: paragraphs are wrapped, lines of lists and examples (indented ones) each alone."""
 
     def _fill_text(self, text: str, width: int, indent: str) -> str:
         paragraphs = [
-            part if "\n " in f"\n{part}" else textwrap.fill(" ".join(part.split()), width)
+            "\n".join(_item(line, width) for line in part.splitlines())
+            if "\n " in f"\n{part}"
+            else textwrap.fill(" ".join(part.split()), width)
             for part in text.strip("\n").split("\n\n")
         ]
         return "\n\n".join(textwrap.indent(part, indent) for part in paragraphs)
+
+
+def _item(line: str, width: int) -> str:
+    """A line of a list, its later lines under its second column; a command is broken as a shell allows."""
+    if len(line) <= width:
+        return line
+    if line.lstrip().startswith("herglotz "):
+        words = re.sub(r"(--\S+) (?=[^-])", "\\1\x00", line)  # a flag and its value stay together
+        return " \\\n".join(textwrap.wrap(words, width - 2, subsequent_indent=" " * 6, break_on_hyphens=False)).replace(
+            "\x00", " "
+        )
+    column = re.match(r" *(\S+ {2,})?", line)
+    return textwrap.fill(line, width, subsequent_indent=" " * (column.end() if column else 0))
 
 
 class Parser(argparse.ArgumentParser):

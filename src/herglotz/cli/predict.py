@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, positive, print_json, print_table
+from herglotz.cli.common import check_output_file, count, existing, positive, print_json, print_table, say
 from herglotz.cli.flags import add_column_flags, add_force_flag, columns_of
 from herglotz.errors import InputError
 
@@ -39,7 +39,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("predict", help="score a run on another recording", description=DESCRIPTION)
     parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
-    parser.add_argument("data", metavar="DATA", type=Path, help="recording of the same coordinates, in the same units")
+    parser.add_argument(
+        "data", metavar="DATA", type=existing, help="recording of the same coordinates, in the same units"
+    )
     parser.add_argument(
         "--warmup", type=count, default=WARMUP, metavar="K",
         help="samples that the state is estimated from, at least 3 (default %(default)s)",
@@ -85,15 +87,18 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def _report(found: Prediction, arguments: argparse.Namespace) -> None:
+    from herglotz.data.units import size
+
     numbers = found.metrics()
     what = "window" if arguments.windows else "trajectory" if len(found.data) == 1 else "trajectories"
-    print(
+    say(
         f"{arguments.source} on {arguments.data}: {len(found.data)} {what}{'s' if arguments.windows else ''}, state "
         f"from {found.warmup} samples of each, {numbers['predicted_samples']} samples predicted"
     )
     each = numbers["rms_per_coordinate"] or dict.fromkeys(found.data.names)
+    degrees = found.data.degrees
     rows = [
-        (f"RMS {name}", "not reached" if each[name] is None else f"{each[name]:.4g} {unit}".removesuffix(" 1"))
+        (f"RMS {name}", "not reached" if (error := each[name]) is None else size(error, unit, name in degrees, 4))
         for name, unit in zip(found.data.names, found.data.units, strict=True)
     ]
     rows.append(("failed steps", f"{100 * found.failed_steps:.3g} %"))
@@ -108,13 +113,14 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
 def _write(found: Prediction, out: Path) -> list[Path]:
     """The predicted motion as far as it goes, and the figure."""
     from herglotz.data import save
+    from herglotz.data.units import in_degrees
     from herglotz.plots import save_figure
     from herglotz.plots.motion import plot_prediction
 
     motion: Any = found.motion()
     written = [] if motion is None else [out]
     if motion is not None:
-        save(out, motion)
+        save(out, in_degrees(motion, found.data.degrees) if out.suffix.lower() == ".csv" else motion)
     picture = out.with_suffix(".png")
     save_figure(plot_prediction(found), picture)
     return [*written, picture]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder
+from herglotz.cli.common import check_output_folder, existing
 from herglotz.cli.flags import add_column_flags, columns_of
 
 DESCRIPTION = """\
@@ -23,7 +23,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
     parser = commands.add_parser("report", help="write an HTML report of a run", description=DESCRIPTION)
     parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
-    parser.add_argument("--against", type=Path, metavar="DATA", help="another recording to score the model on")
+    parser.add_argument("--against", type=existing, metavar="DATA", help="another recording to score the model on")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for both files (default: RUN)")
     add_column_flags(parser)
     parser.set_defaults(run=run)

@@ -9,15 +9,16 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.cli.common import check_output_file, count, existing, finite, positive, print_json, say
 from herglotz.cli.flags import add_force_flag, add_trust_flag
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
     import torch
 
+    from herglotz.data import Trajectories
     from herglotz.export import ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
 
@@ -51,6 +52,9 @@ class Source:
     h_range: tuple[float, float] | None  # steps of the fit
     hold: str = ""  # what the inputs of the fit do between samples
     frequencies: tuple[float, ...] = ()  # of waves that are its inputs
+    inputs: int = 0
+    states: str = "(q, p, s)"  # what the box bounds
+    degrees: tuple[str, ...] = ()  # coordinates that were recorded in degrees
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -75,7 +79,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         help="constant input of a driven model, one number an input (default: no input acts)",
     )  # fmt: skip
     parser.add_argument(
-        "--inputs", type=Path, metavar="FILE",
+        "--inputs", type=existing, metavar="FILE",
         help="recorded motion whose inputs u drive the model, each at its own time: K samples from the start's time on "
         "(with --q0: from the first), at their own steps unless --h",
     )  # fmt: skip
@@ -96,56 +100,81 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.q0 is None) != (arguments.p0 is None):
         raise InputError("--q0 and --p0 go together; give both, or neither to start from the last fitted state")
 
-    import torch
-
-    from herglotz.data import Trajectories, save
+    from herglotz.data import save
+    from herglotz.data.units import in_degrees
 
     source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
     u, times = _driven(arguments, source, t0)
     h = times.diff().to(start.q.dtype) if arguments.inputs else (arguments.h or source.h)
     began = time.perf_counter()
-    with torch.no_grad():
-        found = source.stepper.rollout(
-            *start, h=h, steps=arguments.steps, inputs=None if u is None else u.to(start.q.dtype)
-        )
+    found = _stepped(source, start, h, arguments.steps, u)
     seconds = time.perf_counter() - began
-    h = float(times.diff().mean())
-    _check(found, h)
+    _check(found, float(times.diff().mean()))
+    motion = _motion(source, found, times, str(arguments.source))
+    out: Path = arguments.out
+    save(out, in_degrees(motion, source.degrees) if out.suffix.lower() == ".csv" else motion)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
     left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
-    motion = Trajectories.of(
-        times, found.q.double(), names=source.names,
-        units=source.units, angles=source.angles, s=found.s.double(), p=found.p.double(), time_unit=source.time_unit,
-        source=str(arguments.source),
+    if arguments.json:
+        print_json(_numbers(found, times, seconds, left) | {"file": str(out)})
+    else:
+        _report(source, found, times, f"{out}: {arguments.steps} steps", 1e6 * seconds / arguments.steps)
+    _warn(source, times, left)
+    return 0
+
+
+def _stepped(source: Source, start: State, h: torch.Tensor | float, steps: int, u: torch.Tensor | None) -> Rollout:
+    import torch
+
+    with torch.no_grad():
+        return source.stepper.rollout(*start, h=h, steps=steps, inputs=None if u is None else u.to(start.q.dtype))
+
+
+def _motion(source: Source, found: Rollout, times: torch.Tensor, name: str) -> Trajectories:
+    from herglotz.data import Trajectories
+
+    return Trajectories.of(
+        times, found.q.double(), names=source.names, units=source.units, angles=source.angles, s=found.s.double(),
+        p=found.p.double(), time_unit=source.time_unit, source=name,
     )  # fmt: skip
-    save(arguments.out, motion)
+
+
+def _numbers(found: Rollout, times: torch.Tensor, seconds: float, left: int | None) -> dict[str, Any]:
     last = found.final
-    summary = {
-        "file": str(arguments.out),
-        "steps": arguments.steps,
+    return {
+        "steps": len(times) - 1,
         "t0": float(times[0]),
-        "h": h,
+        "h": float(times.diff().mean()),
         "seconds": seconds,
         "largest_residual": float(found.residual.max()),
         "outside_from_step": left,
         "final": {"q": last.q.tolist(), "p": last.p.tolist(), "s": float(last.s), "sigma": float(found.sigma[-1])},
     }
-    if arguments.json:
-        print_json(summary)
-    else:
-        end = ", ".join(f"{name} = {float(x):.6g}" for name, x in zip(source.names, last.q, strict=True))
-        per_step = 1e6 * seconds / arguments.steps
-        print(f"{arguments.out}: {arguments.steps} steps of {h:g} {source.time_unit}, {per_step:.0f} µs each; {end}")
+
+
+def _report(source: Source, found: Rollout, times: torch.Tensor, what: str, per_step: float) -> None:
+    from herglotz.data.units import size
+
+    each = zip(source.names, source.units, found.final.q.tolist(), strict=True)
+    end = ", ".join(f"{name} = {size(x, unit, name in source.degrees, 6)}" for name, unit, x in each)
+    h = float(times.diff().mean())
+    say(f"{what} of {h:g} {source.time_unit}, {per_step:.0f} µs each; at t = {float(times[-1]):g}: {end}")
+
+
+def _warn(source: Source, times: torch.Tensor, left: int | None) -> None:
+    """Say on stderr where the motion or its steps are beyond the data of the fit."""
     if left is not None:
-        _note(f"from step {left} on, the motion leaves the range of states (q, p, s) that the model was fitted to")
+        _note(
+            f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted to"
+        )
     low, high = source.h_range or (0.0, math.inf)
     steps = times.diff()
     if float(steps.min()) < low * (1 - 1e-6) or float(steps.max()) > high * (1 + 1e-6):
         _note(
-            f"steps of {h:g} {source.time_unit} are outside of {low:g} to {high:g}, those that the model was fitted to"
+            f"steps of {float(steps.mean()):g} {source.time_unit} are outside of {low:g} to {high:g}, those that the "
+            "model was fitted to"
         )
-    return 0
 
 
 def _note(text: str) -> None:
@@ -162,7 +191,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     """
     import torch
 
-    from herglotz.export.box import Box
+    from herglotz.export.box import Box, s_matters
     from herglotz.stepping import State
 
     if path.is_dir() or path.suffix.lower() not in SUFFIXES:
@@ -170,11 +199,12 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
 
         run_, data = (found := load_run(path)), found.data
         start, t0 = run_.last_fitted(trajectory)
-        box = Box(run_.box, data.angles, start.q.dtype)
-        labels = (data.names, data.units, data.angles, data.time_unit)
+        model, labels = run_.model, (data.names, data.units, data.angles, data.time_unit)
+        box = Box(run_.box, data.angles, start.q.dtype, by_s=model.s_enters_motion)
         return Source(
-            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.data.hold, run_.config.frequencies
-        )
+            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, data.hold, run_.config.frequencies,
+            model.inputs, _bounded(model.s_enters_motion), data.degrees,
+        )  # fmt: skip
 
     from herglotz.export import load_exported
 
@@ -185,10 +215,18 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     names = tuple(m.get("names") or (["q"] if n == 1 else [f"q{i}" for i in range(n)]))
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
-    box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype)
+    by_s = s_matters(m)
+    box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype, by_s=by_s)
     span, stepper.metadata["h_range"] = m.get("h_range"), None  # a note beside the motion, as for a run: no refusal
     t0 = (stored or {}).get("t", 0.0)
-    return Source(stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span)
+    return Source(
+        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span,
+        inputs=stepper.inputs, states=_bounded(by_s), degrees=tuple(m.get("degrees", ())),
+    )  # fmt: skip
+
+
+def _bounded(by_s: bool) -> str:
+    return "(q, p, s)" if by_s else "(q, p)"
 
 
 def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
@@ -222,6 +260,8 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     steps, path = arguments.steps, arguments.inputs
     if path is None:
         times = even_times(t0, arguments.h or source.h, steps)
+        if arguments.u is not None and len(arguments.u) != source.inputs:
+            raise InputError(f"--u needs {source.inputs or 'no'} number(s), one an input, got {len(arguments.u)}")
         if arguments.u is None:
             middle = 0.5 * (times[1:] + times[:-1])
             return waves(middle, source.frequencies) if source.frequencies else None, times

@@ -8,7 +8,7 @@ from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import count, finite, positive
+from herglotz.cli.common import count, existing, finite, positive, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def _read(path: Path, kind: type[FitConfig]) -> FitConfig:
 def add_data_settings(parser: argparse._ActionsContainer) -> None:
     """Add --config and --train-fraction."""
     parser.add_argument(
-        "--config", type=Path, metavar="FILE",
+        "--config", type=existing, metavar="FILE",
         help="settings of another run: its folder or its config.json; flags that are given stand over them",
     )  # fmt: skip
     _setting(
@@ -65,7 +65,7 @@ def add_data_settings(parser: argparse._ActionsContainer) -> None:
 
 def add_machine_flags(parser: argparse._ActionsContainer) -> None:
     """Add --seed, --device, --dtype and --json."""
-    _setting(parser, "--seed", type=count, help="seed of the initial weights (default 0)")
+    _setting(parser, "--seed", type=seed, help="seed of the initial weights (default 0)")
     _setting(parser, "--device", metavar="D", help="cpu or cuda (default cpu)")
     _setting(parser, "--dtype", choices=DTYPES, help="precision (default float64)")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_file, count, finite, positive, print_json
+from herglotz.cli.common import check_output_file, count, finite, positive, print_json, seed
 from herglotz.cli.flags import add_force_flag
 from herglotz.errors import InputError
 
@@ -63,7 +63,7 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--gaps", type=count, default=0, metavar="G",
         help="runs of 1 to 3 samples deleted from each motion (default %(default)s)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=count, default=0, help="seed of starts, noise and gaps (default %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of starts, noise and gaps (default %(default)s)")
     parser.add_argument(
         "--param", action="append", default=[], metavar="NAME=VALUE",
         help="parameter of the scene, for example gamma=0.3; may come more than once",

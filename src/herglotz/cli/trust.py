@@ -8,9 +8,10 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, finite, print_json, print_table
+from herglotz.cli.common import COLUMNS, check_output_folder, finite, print_json, print_table
 
 if TYPE_CHECKING:
+    from herglotz.training import Bands, Laplace, Run
     from herglotz.training.quantities import Quantity
 
 DESCRIPTION = """\
@@ -23,7 +24,6 @@ examples:
   herglotz trust runs/pendulum --level 0.95 --json
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
-COLUMNS = 80  # of a terminal as it opens
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 
@@ -43,7 +43,7 @@ def add(commands: argparse._SubParsersAction) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Measure, draw, report."""
-    from herglotz.training import ensemble_bands, laplace, load_run, traded
+    from herglotz.training import ensemble_bands, laplace, load_run
     from herglotz.training.quantities import quantities
 
     result = load_run(arguments.source)
@@ -51,20 +51,36 @@ def run(arguments: argparse.Namespace) -> int:
     check_output_folder(folder)
 
     from herglotz.plots import plot_bands, save_figure
-    from herglotz.plots.motion import trained_mask
 
     posterior = laplace(result)
     bands = ensemble_bands([result, *map(load_run, arguments.others)]) if arguments.others else posterior.bands()
-    inside = bands.inside(result.data.unwrapped().q, arguments.level)
-    held = ~trained_mask(result)
     physical = quantities(posterior, result)
-    numbers: dict[str, Any] = {
-        "level": arguments.level,
+    numbers = _numbers(result, posterior, bands, arguments.level) | {"parameters": _by_name(physical)}
+    folder.mkdir(parents=True, exist_ok=True)
+    save_figure(plot_bands(result, bands, arguments.level), folder / "bands.png")
+    if arguments.json:
+        print_json(numbers)
+    else:
+        _report(numbers, physical, result, folder / "bands.png")
+    verdict = str(result.metrics.get("verdict", ""))
+    if verdict.startswith("does not fit"):
+        text = "the run does not fit its data: what is said here of its parameters means little; fit it better first"
+        print(f"herglotz: warning: {text}", file=sys.stderr)
+    return 0
+
+
+def _numbers(result: Run, posterior: Laplace, bands: Bands, level: float) -> dict[str, Any]:
+    from herglotz.plots.motion import trained_mask
+    from herglotz.training import traded
+
+    inside = bands.inside(result.data.unwrapped().q, level)
+    held = ~trained_mask(result)
+    return {
+        "level": level,
         "inside_training": float(inside[~held].double().mean()),
         "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
         "noise": dict(zip(result.data.names, bands.sigma.tolist(), strict=True)),
         "held_out_over_noise": posterior.inflation,
-        "parameters": _by_name(physical),
         "not_determined": [
             {"reduction": d.reduction, "parts": dict(d.parts)}
             for d in posterior.least_identified()
@@ -74,17 +90,6 @@ def run(arguments: argparse.Namespace) -> int:
         "effective_parameters": posterior.effective_parameters(),
         "all_parameters": len(posterior.theta),
     }
-    folder.mkdir(parents=True, exist_ok=True)
-    save_figure(plot_bands(result, bands, arguments.level), folder / "bands.png")
-    if arguments.json:
-        print_json(numbers)
-    else:
-        _report(numbers, physical, result.metrics.get("equation"), folder / "bands.png")
-    verdict = str(result.metrics.get("verdict", ""))
-    if verdict.startswith("does not fit"):
-        text = "the run does not fit its data: what is said here of its parameters means little; fit it better first"
-        print(f"herglotz: warning: {text}", file=sys.stderr)
-    return 0
 
 
 def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
@@ -95,13 +100,17 @@ def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
     return numbers
 
 
-def _report(numbers: dict[str, Any], physical: list[Quantity], equation: dict[str, Any] | None, figure: Path) -> None:
+def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figure: Path) -> None:
+    from herglotz.data.units import size
+
+    data, equation = result.data, result.metrics.get("equation")
+    noises = zip(numbers["noise"].items(), data.units, strict=True)
     percent = f"{100 * numbers['level']:g} % band"
     rows = [(f"{percent}, training", f"{100 * numbers['inside_training']:.1f} % of the samples inside")]
     if numbers["inside_held_out"] is not None:
         rows.append((f"{percent}, held out", f"{100 * numbers['inside_held_out']:.1f} % of the samples inside"))
     worse = f"{numbers['held_out_over_noise']:.2f}"
-    noise = ", ".join(f"{x:.3g}" for x in dict.fromkeys(numbers["noise"].values()))
+    noise = ", ".join(dict.fromkeys(size(x, unit, name in data.degrees) for (name, x), unit in noises))
     rows.append(("noise of a sample", f"{noise}; held-out blocks miss {worse} times as much"))
     worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
     rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json
+from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument("--no-c", action="store_true", help="PyTorch only")
     parser.add_argument("--starts", type=count, default=128, help="number of motions that choose (default %(default)s)")
     parser.add_argument("--iterations", type=count, default=80, help="most in a re-training (default %(default)s)")
-    parser.add_argument("--seed", type=count, default=0, help="seed of the starts (default %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the starts (default %(default)s)")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
     parser.set_defaults(run=run)
 

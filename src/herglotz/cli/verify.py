@@ -8,7 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_folder, count, positive, print_json
+from herglotz.cli.common import check_output_folder, count, positive, print_json, seed
 from herglotz.cli.flags import add_trust_flag
 from herglotz.errors import InputError
 
@@ -38,7 +38,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--steps", type=count, default=8, help="steps of the checks along motions (default %(default)s)"
     )
-    parser.add_argument("--seed", type=count, default=0, help="seed of the states (default %(default)s)")
+    parser.add_argument("--seed", type=seed, default=0, help="seed of the states (default %(default)s)")
     parser.add_argument(
         "--against",
         type=Path,

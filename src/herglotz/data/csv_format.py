@@ -70,6 +70,9 @@ def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
         raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
     columns = assign(_cells(header), f"{path}, row {at}", wanted)
     found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]))
+    if not is_number(_cells(rows[1][1])[columns.time]):
+        roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
+        found = replace(found, columns=tuple(roles))
     said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
     return replace(found, hold=said[0]) if said else found
 

@@ -18,7 +18,7 @@ from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-LABELS = ("names", "units", "angles", "time_unit", "source", "hold")
+LABELS = ("names", "units", "angles", "time_unit", "source", "hold", "columns")
 USED = (*ARRAYS, "lengths", "metadata")
 LARGEST = 2**31  # bytes that the arrays of an archive may take: 67 million samples of t and three coordinates
 # Exceptions that numpy and zipfile raise on a damaged archive.
@@ -32,8 +32,8 @@ def read_npz(path: PathLike) -> Trajectories:
     """Read trajectories from a .npz archive.
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and
-    `metadata` (a JSON object with names, units, angles, time_unit, source, hold) may follow. Integer arrays become
-    float64.
+    `metadata` (a JSON object with names, units, angles, time_unit, source, hold, columns) may follow. Integer arrays
+    become float64.
 
     Raises
     ------
@@ -135,11 +135,13 @@ def _labels(path: Path, metadata: np.ndarray | None) -> dict:
         labels = json.loads(str(metadata))
     except (ValueError, RecursionError):
         labels = None
-    kinds = {"names": str, "units": str, "angles": bool}
-    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else {"names": None}
-    if not all(
+    kinds = {"names": str, "units": str, "angles": bool, "columns": list}
+    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else {"names": ""}
+    sound = all(
         isinstance(x, list) and all(isinstance(y, kinds[k]) for y in x) if k in kinds else isinstance(x, str)
         for k, x in known.items()
-    ):
+    )
+    columns = known.get("columns", []) if sound else []
+    if not sound or any(len(row) != 3 or not all(isinstance(x, str) for x in row) for row in columns):
         raise InputError(f"{path}: 'metadata' must be a JSON object of {', '.join(LABELS)}; write it again or drop it")
-    return known
+    return {**known, "columns": tuple(map(tuple, columns))}

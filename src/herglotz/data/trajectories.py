@@ -13,12 +13,14 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
+from herglotz.data.column_table import column_table
 from herglotz.data.holds import HOLDS, held
 from herglotz.data.splits import liveliest_rows, time_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError
 
+DEGREES = ("deg", "°", "degree", "degrees")
 GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
 
@@ -136,6 +138,18 @@ class Trajectories:
     def trajectory(self) -> Tensor:
         """Trajectory of every sample, (N,) long."""
         return torch.repeat_interleave(torch.arange(len(self)), torch.tensor(self.lengths)).to(self.t.device)
+
+    @property
+    def degrees(self) -> tuple[str, ...]:
+        """Coordinates that the table had in degrees: they are rad here, and reported in degrees too."""
+        return tuple(name for name, _, unit in self.columns if name in self.names and unit in DEGREES)
+
+    @property
+    def input_labels(self) -> tuple[tuple[str, str], ...]:
+        """Name and unit of each column of u, as the table had them; u, or u1, u2, ..., where no table was read."""
+        m = 0 if self.u is None else self.u.shape[1]
+        found = tuple((name, unit) for name, role, unit in self.columns if role == "input")
+        return found if len(found) == m else tuple(("u" if m == 1 else f"u{j + 1}", "") for j in range(m))
 
     @cached_property
     def balance(self) -> Tensor:
@@ -306,18 +320,7 @@ class Trajectories:
 
     def table(self) -> str:
         """Return what every column of the table that was read was taken for, a line each, for people."""
-        now = dict(zip(self.names, zip(self.units, self.angles, strict=True), strict=True))
-        rows = [("column", "is taken for", "unit")]
-        for name, role, unit in self.columns:
-            if role == "coordinate" and name in now:
-                role = "angle" if now[name][1] else role
-                unit = unit if unit in ("", now[name][0]) else f"{unit}, converted to {now[name][0]}"
-            elif role == "time" and unit not in ("", self.time_unit):
-                unit = f"{unit}, converted to {self.time_unit}"
-            rows.append((name, role, unit or "-"))
-        widths = [max(len(row[k]) for row in rows) for k in range(2)]
-        lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
-        return "\n".join([f"{self.source or 'table'}:", *lines])
+        return column_table(self.columns, Labels(self.names, self.units, self.angles, self.time_unit), self.source)
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}

@@ -1,13 +1,13 @@
-"""Degrees become radians and other times seconds, so that angles unwrap and rates are per second."""
+"""Degrees become radians and other times seconds, so that angles unwrap and rates are per second; and back."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import replace
 
-from herglotz.data.trajectories import Trajectories
+from herglotz.data.trajectories import DEGREES, Trajectories
 
-DEGREES = ("deg", "°", "degree", "degrees")
 PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9, "min": 1 / 60}
 
 
@@ -26,3 +26,23 @@ def in_radians_and_seconds(data: Trajectories) -> Trajectories:
         # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
         data = replace(data, t=data.t / PER_SECOND[data.time_unit], time_unit="s")
     return data
+
+
+def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
+    """Return the set with these coordinates in deg, for a table to be read by people (`load` converts them back).
+
+    Momenta stay those of radians.
+    """
+    turned = [name in names and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
+    return replace(
+        data,
+        q=data.q * data.q.new_tensor([180 / math.pi if x else 1.0 for x in turned]),
+        units=tuple("deg" if x else unit for x, unit in zip(turned, data.units, strict=True)),
+        angles=tuple(angle and not x for x, angle in zip(turned, data.angles, strict=True)),
+    )
+
+
+def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str:
+    """A length or an angle in words: `0.0021 rad = 0.12 deg` where it was recorded in degrees."""
+    also = f" = {math.degrees(value):.3g} deg" if degrees and unit == "rad" else ""
+    return f"{value:.{digits}g} {unit}".removesuffix(" 1").rstrip() + also

@@ -6,6 +6,7 @@ forces is the amplitude and the phase (f cos φ, −f sin φ). The time stands i
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -28,14 +29,22 @@ def with_waves(data: Trajectories, frequencies: Sequence[float]) -> Trajectories
     Raises
     ------
     InputError
-        If a frequency is not positive, or the data hold other inputs.
+        If a frequency is not positive, beyond half the rate of the samples (π/h), or the data hold other inputs.
     """
     if not frequencies:
         return data
     where = data.source or "data"
     if not all(0 < x < float("inf") for x in frequencies):
         raise InputError(f"{where}: frequencies must be positive numbers, got {tuple(frequencies)}")
+    fastest = math.pi / data.typical_step
+    if max(frequencies) > fastest:
+        raise InputError(
+            f"{where}: samples {data.typical_step:.4g} apart show no angular frequency above {fastest:.4g}, got "
+            f"{max(frequencies):g}; give it in rad per unit of time"
+        )
     u = waves(data.t, frequencies)
     if data.u is not None and (data.u.shape != u.shape or not torch.allclose(data.u, u)):
         raise InputError(f"{where}: holds inputs u, and frequencies would be inputs, too; leave one of them out")
-    return replace(data, u=u, hold="smooth")
+    names = [f"{wave}({x:g} t)" for x in frequencies for wave in ("cos", "sin")]
+    columns = data.columns if data.u is not None else (*data.columns, *((name, "input", "") for name in names))
+    return replace(data, u=u, hold="smooth", columns=columns)

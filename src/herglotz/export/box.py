@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,10 +28,16 @@ class Box(nn.Module):
         angles: Sequence[bool],
         dtype: torch.dtype,
         h_range: Sequence[float] | None = None,
+        by_s: bool = True,  # whether s counts: it grows without bound, and matters only where the motion depends on it
     ):
         super().__init__()
-        low = torch.tensor([*box["q_low"], *box["p_low"], *box["s_low"]], dtype=torch.float64)
-        high = torch.tensor([*box["q_high"], *box["p_high"], *box["s_high"]], dtype=torch.float64)
+        self.by_s = by_s
+        low, high = (
+            torch.tensor(
+                [x for name in "qps" if by_s or name != "s" for x in box[f"{name}_{end}"]], dtype=torch.float64
+            )
+            for end in ("low", "high")
+        )
         turn = torch.zeros_like(low)
         turn[: len(angles)] = torch.tensor([2 * math.pi * bool(a) for a in angles], dtype=torch.float64)
         inverse = torch.where(turn > 0, 1 / turn, 0.0)
@@ -40,17 +47,16 @@ class Box(nn.Module):
 
     @classmethod
     def of(
-        cls,
-        box: Mapping[str, Sequence[float]] | None,
-        model: ContactLagrangian,
-        h_range: Sequence[float] | None = None,
+        cls, box: Mapping[str, Sequence[float]] | None, model: ContactLagrangian, h_range: Sequence[float] | None = None
     ) -> Box | None:
         """The box of a model, if there is one."""
-        return None if box is None else cls(box, model.config.angles, next(model.parameters()).dtype, h_range)
+        if box is None:
+            return None
+        return cls(box, model.config.angles, next(model.parameters()).dtype, h_range, model.s_enters_motion)
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """(...) True where a state lies outside, or is not a number."""
-        x = torch.cat([q, p, s[..., None]], -1)
+        x = torch.cat([q, p, s[..., None]] if self.by_s else [q, p], -1)
         x = x - self.turn * torch.round((x - (self.low + self.high) / 2) * self.inverse)
         return ~((x >= self.low) & (x <= self.high)).all(-1)
 
@@ -61,6 +67,11 @@ class Box(nn.Module):
         if not isinstance(span, Tensor):
             return flags
         return torch.where((h >= span[0]) & (h <= span[1]), flags, flags + 2)
+
+
+def s_matters(metadata: Mapping[str, Any]) -> bool:
+    """Whether the motion of a file's model depends on s, by its level."""
+    return metadata.get("level") in ("affine", "full")
 
 
 class Report(nn.Module):

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.export.box import Box
+from herglotz.export.box import Box, s_matters
 from herglotz.export.inputs import check_inputs, check_range, spread_h
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
@@ -63,7 +63,8 @@ class ExportedStepper(OneStepMethod):
         if loop is None and self.inputs:
             self._idle = torch.tensor(metadata.get("input_zero") or [0.0] * self.inputs, dtype=self.dtype)
         box = metadata["box"]
-        self._box = None if box is None else Box(box, metadata.get("angles", [False] * self.dof), self.dtype)
+        angles = metadata.get("angles", [False] * self.dof)
+        self._box = None if box is None else Box(box, angles, self.dtype, by_s=s_matters(metadata))
 
     @property
     def differentiable(self) -> bool:

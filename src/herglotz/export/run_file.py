@@ -49,6 +49,7 @@ def export_run(
     metadata = {
         "names": list(run.data.names),
         "time_unit": run.data.time_unit,
+        "degrees": list(run.data.degrees),
         "start": {"q": q.tolist(), "p": p.tolist(), "s": float(s), "t": t},
         "metrics": run.metrics,
         "card": model_card(run, (span[0], span[-1])),

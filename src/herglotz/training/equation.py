@@ -126,7 +126,10 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
     data = run.data
-    units = [f"{name} in {unit}" for name, unit in zip(data.names, data.units, strict=True) if unit != "1"]
+    labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
+    units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
+    if data.degrees:  # the derivatives of sines and powers are those of radians
+        units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
     return Equation(tuple(terms), tuple(_lefts(run)), ", ".join(units) or "plain numbers", network_of(run))
 
@@ -203,8 +206,8 @@ def _friction(
     if "friction.input_map" in named:
         for j in range(config.inputs):
             at = i * config.inputs + j
-            what = "u" if config.inputs == 1 else f"u{j + 1}"
-            yield left, f"({what} − {_zero(run, j)})", "", [("friction.input_map", at, 1.0)]
+            what, zero = run.data.input_labels[j][0], _zero(run, j)
+            yield left, f"({what} − {zero})" if float(zero) else what, "", [("friction.input_map", at, 1.0)]
 
 
 def _zero(run: Run, j: int) -> str:

@@ -13,7 +13,6 @@ from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
 from herglotz.data.lock import locked
-from herglotz.data.units import DEGREES
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
@@ -111,8 +110,6 @@ def _fit(
         task = Task(seen.kept, seen.base, seen.settings, stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
     run.metrics["equation"] = _equation(run, plan).as_dict()
-    if degrees := [name for name, _, unit in data.columns if name in data.names and unit in DEGREES]:
-        run.metrics["degrees"] = degrees  # the model has radians; errors are told in degrees too
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 

@@ -77,6 +77,8 @@ def free_motion(
     """Step a run from its last fitted state, or from (q0, p0, s0); see `Run.rollout`."""
     if (q0 is None) != (p0 is None):
         raise InputError("q0 and p0 go together; give both, or neither to start from the last fitted state")
+    if isinstance(steps, bool) or not isinstance(steps, (int, np.integer)) or steps < 1:
+        raise InputError(f"steps must be a whole number >= 1, got {steps!r}")
     state, time = run.last_fitted(trajectory) if q0 is None or p0 is None else _given(run, q0, p0, s0)
     time = time if t0 is None else t0
     dtype = state.q.dtype

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from html import escape
 from textwrap import fill
 from typing import Any, Protocol
 
 from herglotz.data import Trajectories
+from herglotz.data.units import size
 from herglotz.training.config import FitConfig
 
 MOST_FEATURES, COLUMNS = 5, 80
@@ -32,7 +32,7 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
     unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
-    degrees = bool(m.get("degrees")) and unit == "rad"  # as the file had them
+    degrees = bool(data.degrees)  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", data.summary()),
@@ -99,10 +99,9 @@ def model_card(run: Judged, h_range: tuple[float, float]) -> str:
 
 
 def _error(value: float | None, unit: str, degrees: bool, after: str = "") -> str:
-    also = f" = {math.degrees(value):.3g} deg" if degrees and value is not None else ""
-    return show(value, unit, also + after)
+    return "" if value is None else size(value, unit, degrees) + after
 
 
-def show(value: Any, unit: str, after: str = "") -> str:
+def show(value: Any, unit: str) -> str:
     """Three digits and a unit; "" where there is no value."""
-    return "" if value is None else f"{value:.3g} {unit}".rstrip() + after
+    return "" if value is None else f"{value:.3g} {unit}".rstrip()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import unicodedata
 from dataclasses import dataclass, field
+from html import escape
 from textwrap import fill
 from typing import Any
 
@@ -41,6 +42,14 @@ class Check:
         """Return a check of an object that does not exist for this target: it neither passes nor fails."""
         return cls(name, statement, math.nan, math.nan, True, note, applies=False)
 
+    @property
+    def verdict(self) -> tuple[str, str, str]:
+        """Return value, bound and result as a table shows them."""
+        if not self.applies:
+            return "–", "", "n/a"
+        sign = "≤" if self.relation == "<=" else self.relation
+        return f"{self.value:.3g}", f"{sign} {self.bound:.3g}", "ok" if self.passed else "FAIL"
+
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON; a value that is not finite becomes None."""
         value, bound = (x if math.isfinite(x) else None for x in (self.value, self.bound))
@@ -56,9 +65,9 @@ class Check:
         }
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Report:
-    """All checks of one target."""
+    """All checks of one target; printed, it is its table."""
 
     target: str
     checks: tuple[Check, ...]
@@ -77,16 +86,23 @@ class Report:
                 return check
         raise KeyError(f"no check {name!r}; there are {', '.join(c.name for c in self.checks)}")
 
+    def __repr__(self) -> str:
+        bad = [check.name for check in self.checks if not check.passed]
+        return f"Report({self.target}: {'verified' if self.passed else 'NOT verified, ' + ', '.join(bad)})"
+
+    def __str__(self) -> str:
+        return self.table()
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{escape(self.table())}</pre>"
+
     def table(self) -> str:
         """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below."""
         rows = [("claim", "measured", "bound", "")]
         notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
         for check in self.checks:
             mark = f" [{notes.index(check.note) + 1}]" if check.note else ""
-            sign = "≤" if check.relation == "<=" else check.relation
-            verdict = "ok" if check.passed else "FAIL"
-            row = (check.statement + mark, f"{check.value:.3g}", f"{sign} {check.bound:.3g}", verdict)
-            rows.append(row if check.applies else (check.statement + mark, "–", "", "n/a"))
+            rows.append((check.statement + mark, *check.verdict))
         widths = [max(_width(row[i]) for row in rows) for i in range(3)]
         lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
         lines += [

@@ -39,17 +39,20 @@ def test_version(capsys):  # fails if the version is not the package's
     assert capsys.readouterr().out == f"herglotz {herglotz.__version__}\n"
 
 
-COMMANDS = ("simulate", "fit", "select", "rollout", "export", "verify", "trust", "report", "tune", "plot")
+COMMANDS = ("simulate", "fit", "select", "predict", "rollout", "export", "verify", "trust", "report", "tune", "plot")
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_help_teaches_every_option(capsys, command):  # fails if an option has no help, or there is no example
+def test_help_teaches_every_option(capsys, command, monkeypatch):
+    # fails if an option has no help, there is no example, or a line is longer than a terminal as it opens
+    monkeypatch.setenv("COLUMNS", "80")
     assert main([command, "--help"]) == 0
     text = capsys.readouterr().out
     assert f"example:\n  herglotz {command}" in text or f"examples:\n  herglotz {command}" in text
     subparser = herglotz.cli.build_parser()._subparsers._group_actions[0].choices[command]  # pyright: ignore
     for action in subparser._actions:
         assert action.help, action.dest
+    assert max(map(len, text.splitlines())) <= 80
 
 
 def test_help_does_not_import_torch():  # fails if a heavy import moves to the top of a module (help takes seconds)
@@ -89,7 +92,9 @@ def test_settings_of_another_run(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(other.to_dict()))
 
     def settings(*flags):
-        return herglotz.cli.settings.settings_of(build_parser().parse_args(["fit", "a", "--out", "b", *flags]))
+        return herglotz.cli.settings.settings_of(
+            build_parser().parse_args(["fit", str(tmp_path), "--out", "b", *flags])
+        )
 
     assert settings() == FitConfig()
     assert settings("--config", str(tmp_path)) == other
@@ -178,6 +183,7 @@ def test_rollout_goes_on_where_training_ended(tiny_run, tmp_path, capsys):
     steps = run.data.samples - 1 - first
     code, found = run_json(capsys, "rollout", tiny_run, "--steps", steps, "--out", tmp_path / "a.csv")
     assert (code, found["steps"]) == (0, steps)
+    assert found["outside_from_step"] is None  # fails if s, which moves nothing here, is held to the training part's
     motion = load(tmp_path / "a.csv")
     torch.testing.assert_close(motion.t, run.data.t[first:], rtol=0, atol=1e-12)
     torch.testing.assert_close(motion.q, run.prediction[first:], rtol=0, atol=1e-10)

@@ -52,6 +52,9 @@ def test_bad_data(tmp_path, capsys, name, command):  # fails if a bad file reach
         ("--train-fraction", "1.5", "train fraction"),
         ("--train-fraction", "nan", "finite"),
         ("--seed", "-1", "whole number"),
+        ("--seed", str(2**63), "below 2^63"),
+        ("--config", "nowhere", "no such file"),
+        ("--frequency", "-1", "must be > 0"),
         ("--device", "tpu9", "unknown device"),
         ("--angles", "phi", "phi"),
         ("--nonsense", "1", "unrecognized"),
@@ -100,6 +103,8 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["verify", "missing.pt2"], "no such file"),
         (["verify", "damped_oscillator", "--samples", "0"], "--samples must be >= 1 and --steps >= 2"),
         (["fit", "missing.csv", "--out", "OUT"], "no such file"),
+        (["fit", "missing.csv"], "no such file"),
+        (["select", "missing.csv"], "no such file"),
         (["plot", "missing.csv", "--out", "OUT"], "no such file"),
         (["plot", "OUT", "--out", "OUT2"], "OUT"),
         (["rollout", "missing", "--steps", "5", "--out", "OUT.csv"], "no model.pt"),
@@ -124,6 +129,7 @@ def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, message):  # fail
         (["--steps", "5", "--q0", "inf", "--p0", "0"], "finite"),
         (["--steps", "5", "--trajectory", "7"], "there is no trajectory 7"),
         (["--steps", "-5"], "whole number"),
+        (["--steps", "5", "--u", "1"], "--u needs no number(s)"),
     ],
 )
 def test_bad_rollouts(tmp_path, capsys, tiny_run, options, message):  # fails if a bad start is stepped

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from herglotz.cli import main
-from herglotz.data import Trajectories, load
+from herglotz.data import Trajectories, load, save
 from herglotz.data.table import from_frame
+from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
 
 
@@ -53,10 +54,26 @@ def test_degrees_and_milliseconds(tmp_path):
     torch.testing.assert_close(data.q[:, 0], torch.tensor([170.0, 185.0, 200.0]).double() * math.pi / 180)
 
 
+def test_degrees_are_reported_and_written_back(tmp_path):
+    # fails if a file in degrees is written in radians, the archive forgets what the columns were, or a table written
+    # in degrees is read as another motion
+    data = read(tmp_path, "t,theta[deg],x,F[N]\n" + rows([0, 1, 2], [10, 20, 40], [1, 2, 3], [0, 1, 0]))
+    assert data.degrees == ("theta",)
+    save(tmp_path / "a.npz", data)
+    again = load(tmp_path / "a.npz")
+    assert again.columns == data.columns
+    assert (again.degrees, again.input_labels) == (("theta",), (("F", "N"),))
+    save(tmp_path / "b.csv", in_degrees(data, data.degrees))
+    assert "theta[deg]" in (tmp_path / "b.csv").read_text()
+    torch.testing.assert_close(load(tmp_path / "b.csv").q, data.q, rtol=1e-15, atol=0)
+    assert [size(0.1, "rad", True), size(0.1, "rad"), size(2.0, "1")] == ["0.1 rad = 5.73 deg", "0.1 rad", "2"]
+
+
 def test_dates(tmp_path):  # fails if a date is refused, or its fractions of a second are lost
     text = "timestamp,x\n2026-03-01 23:59:59.50,1\n2026-03-01T23:59:59.75,2\n2026-03-02 00:00:01,3\n"
     data = read(tmp_path, text)
     assert (data.t.tolist(), data.time_unit) == ([0, 0.25, 1.5], "s")
+    assert "date, converted to s" in data.table()
     with pytest.raises(InputError, match=r"row 3: .* differ in having a time zone"):
         read(tmp_path, "time,x\n2026-03-01T10:00:00Z,1\n2026-03-01T10:00:01,2\n2026-03-01T10:00:02,2\n")
 
@@ -90,6 +107,8 @@ def test_every_load_prints_what_it_took_the_columns_for(tmp_path, capsys):
         ["theta_dot", "left", "aside", "-"],
         ["tau", "input", "Nm"],
     ]
+    read(tmp_path, "t,theta\n0,1\n1,2\n2,3\n")
+    assert "theta   coordinate    - (an angle in rad? --angles theta)" in capsys.readouterr().err
     read(tmp_path, "t,x\n0,1\n1,2\n2,3\n", show=False)
     assert capsys.readouterr().err == ""
 

@@ -22,6 +22,9 @@ def test_waves():
     assert twice.hold == "smooth"
     assert twice.u is not None
     assert twice.u.shape == (3, 2)
+    assert twice.input_labels == (("cos(2 t)", ""), ("sin(2 t)", ""))
+    with pytest.raises(InputError, match=r"samples 0.5 apart show no angular frequency above 6.283, got 7"):
+        with_waves(data, (1.0, 7.0))
     with pytest.raises(InputError, match="holds inputs u, and frequencies would be inputs, too"):
         with_waves(Trajectories.of(t, t, u=t), (2.0,))
     with pytest.raises(InputError, match=r"must be positive numbers, got \(-1.0,\)"):

@@ -112,7 +112,7 @@ def test_what_leaves_the_box_is_flagged(stepper):
         assert stepper.rollout(q, p, s, h=0.1, steps=2).outside is None
         return
     inside = State(0.3 * q / q.abs().max(), 0.3 * p / p.abs().max(), 0 * s)
-    out = stepper.rollout(*inside, h=0.1, steps=3)
+    out = stepper.rollout(*inside._replace(s=inside.s + 100), h=0.1, steps=3)  # s moves nothing at this level
     assert not bool(out.outside.any())
     far = inside._replace(p=inside.p.clone().index_fill_(0, torch.tensor(1), 1.5))
     out = stepper.rollout(*far, h=0.1, steps=4, every=2)

@@ -397,10 +397,13 @@ def test_views_and_batches_of_any_shape():
 
 
 @needs_compiler
-def test_the_box_of_a_compiled_stepper():
-    # fails if angles are not taken modulo a turn, or p and s are not looked at
-    compiled = compile_c(damped(1, "linear"), box=BOX)
+@pytest.mark.parametrize(("level", "by_s"), [("linear", False), ("affine", True)])
+def test_the_box_of_a_compiled_stepper(level, by_s):
+    # fails if angles are not taken modulo a turn, p is not looked at, or s is where no motion depends on it (every free
+    # run was told to be outside of its data)
+    compiled = compile_c(damped(1, level), box=BOX)
     q = torch.tensor([0.0, 2.0, 2 * math.pi, 0.0, 0.0], dtype=torch.float64)[:, None]
     p = torch.tensor([0.0, 0.0, 0.0, 1.5, 0.0], dtype=torch.float64)[:, None]
     s = torch.tensor([0.0, 0.0, 0.0, 0.0, -6.0], dtype=torch.float64)
-    assert compiled.outside_box(State(q, p, s)).tolist() == [False, True, False, True, True]
+    assert compiled.outside_box(State(q, p, s)).tolist() == [False, True, False, True, by_s]
+    assert (compiled.step(State(q, 0 * p, s), 0.1).outside > 0).tolist() == [False, True, False, False, by_s]

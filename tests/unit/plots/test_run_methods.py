@@ -47,7 +47,7 @@ def test_words_are_short():  # fails if a run, data or a prediction fill the scr
     assert max(map(len, (repr(run), repr(run.data)))) < 200
     assert "<th style='text-align:left'>training RMS</th>" in run._repr_html_()
     assert "Verdict: fits to the noise" in run.summary()
-    degrees = replace(run, metrics={**run.metrics, "train_rms": 0.01, "degrees": ["theta"]})
+    degrees = replace(run, data=replace(run.data, columns=(("theta", "coordinate", "deg"),)))
     assert "0.01 rad = 0.573 deg" in degrees.summary()  # fails if data in degrees are told in rad alone
     assert "deg" not in run.summary()
     assert max(map(len, run.summary().splitlines())) <= 80
@@ -70,6 +70,8 @@ def test_pictures_files_and_checks(tmp_path, monkeypatch):  # fails if a method 
     state, t = run.last_fitted()
     assert calls == [(run.model, tmp_path / "a.h", {**{k: getattr(state, k).tolist() for k in "qps"}, "t": t})]
     assert run.verify(samples=4) == (run, {"samples": 4})
+    with pytest.raises(InputError, match=r"steps must be a whole number >= 1, got 2.5"):
+        run.rollout(2.5)  # pyright: ignore
     run.save(tmp_path / "run")
     assert hz.load_run(tmp_path / "run").data.digest() == run.data.digest()
 

@@ -1,17 +1,19 @@
 """The terms that recordings of one coordinate need, found with nothing told, and the equation that is printed."""
 
 import json
+from types import SimpleNamespace
 
 import pytest
 import torch
 
-from herglotz.data import simulate
+from herglotz.data import Trajectories, simulate
 from herglotz.data.smoothing import local_polynomials, smooth_triples
 from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
 from herglotz.training import fit
-from herglotz.training.equation import Equation, Term
+from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
 
@@ -43,6 +45,21 @@ def test_the_equation_is_printed_with_deviations(duffing):
     assert max(map(len, text.splitlines())) <= 78
     stored = json.loads(json.dumps(duffing.metrics["equation"]))
     assert str(Equation.from_dict(stored)) == text
+
+
+def test_the_equation_has_the_names_of_the_file():
+    # fails if a force is called u where its column has a name, its unit is lost, or degrees are not told
+    one = (1.0,)
+    config = ModelConfig((True,), "forced", one, one, one, (0.0,), potential_width=0, inputs=1)
+    t = torch.arange(5, dtype=torch.float64)
+    columns = (("t", "time", "s"), ("theta", "coordinate", "deg"), ("F", "input", "N"))
+    data = Trajectories.of(t, t, u=t, names=("theta",), angles=(True,), columns=columns)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        model.get_parameter("friction.input_map").fill_(2.0)
+    text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+    assert " + 2 F " in text
+    assert "theta in rad, F in N, theta recorded in deg" in " ".join(text.split())
 
 
 def test_an_equation_is_never_empty():

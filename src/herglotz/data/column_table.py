@@ -1,0 +1,32 @@
+"""What every column of a table was taken for, in words."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+from herglotz.data.checks import Labels
+
+ANGULAR = re.compile(r"(theta|phi|psi|angle|alpha|beta)(_?\d+|_.*)?", re.I)  # names that are given to angles
+
+
+def column_table(
+    columns: Sequence[tuple[str, str, str]],  # name, role and unit of each column, as it was read
+    labels: Labels,  # of what was made of them
+    source: str,
+) -> str:
+    """Return a line a column: its role, and its unit with the conversion that was made."""
+    now = dict(zip(labels.names, zip(labels.units, labels.angles, strict=True), strict=True))
+    rows = [("column", "is taken for", "unit")]
+    for name, role, unit in columns:
+        if role == "coordinate" and name in now:
+            role = "angle" if now[name][1] else role
+            unit = unit if unit in ("", now[name][0]) else f"{unit}, converted to {now[name][0]}"
+            if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
+                unit = f"- (an angle in rad? --angles {name})"
+        elif role == "time" and unit not in ("", labels.time_unit):
+            unit = f"{unit}, converted to {labels.time_unit}"
+        rows.append((name, role, unit or "-"))
+    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
+    return "\n".join([f"{source or 'table'}:", *lines])
