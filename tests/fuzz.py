@@ -82,7 +82,10 @@ def watched(count: Count) -> Iterator[None]:
         count.executed += 1
         raise InputError("reached")
 
-    with mock.patch.object(c_stepper, "build", reached), mock.patch.object(_package, "load_pt2", reached):
+    with (
+        mock.patch.object(c_stepper, "build", reached),
+        mock.patch.object(_package, "_load_exported_programs", reached),
+    ):
         yield
 
 

@@ -23,9 +23,15 @@ def random_model(n, level, seed, correction=8):
     return model, State(x[:, :n], x[:, n : 2 * n], x[:, -1])
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
-@pytest.mark.parametrize("level", ["linear", "affine"])
-def test_random_models_are_contact_integrators(n, level):
+SLOW = pytest.mark.slow  # every n and both levels are tested always; the slow suite has all pairs
+
+
+@pytest.mark.parametrize(
+    ("level", "n"),
+    [("affine", 1), ("linear", 2), ("affine", 3),
+     *(pytest.param(*x, marks=SLOW) for x in (("linear", 1), ("affine", 2), ("linear", 3)))],
+)  # fmt: skip
+def test_random_models_are_contact_integrators(level, n):
     # fails if any closed-form derivative, FL⁻, FL⁺, c or the step's own derivative is wrong
     report = verify(random_model(n, level, seed=n), h=0.1, steps=4)
     assert report.passed, report.table()

@@ -8,6 +8,7 @@ import re
 import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,8 @@ from herglotz.export.metadata import AOTI, KEY, METADATA, from_json, weights_dig
 from herglotz.export.programs import quiet
 from herglotz.export.trusted import check_trusted
 from herglotz.models import ContactLagrangian
+
+MODELS, EXTRA = "models/", f"extra/{METADATA}"  # in the archive that torch writes
 
 
 def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
@@ -53,7 +56,7 @@ def load_exported(path: PathLike, *, trust_code: bool = False) -> ExportedSteppe
 
 
 def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
-    """Read a file that `export_pt2` or `export_aoti` wrote.
+    """Read a file that `export_pt2` or `export_aoti` wrote; a program of a `.pt2` file is read at its first call.
 
     Parameters
     ----------
@@ -72,13 +75,11 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     with _reading(path, ".pt2"), quiet():  # torch logs a traceback of its own for a damaged file; one line is enough
         if _is_compiled(content):
             return _load_aoti(path)
-        from torch.export.pt2_archive._package import load_pt2 as unpack
-
-        found = unpack(io.BytesIO(content))
-        text = found.extra_files.get(METADATA)
-        metadata = from_json(text.decode() if isinstance(text, bytes) else text, path)
-        modules = {name: program.module(check_guards=False) for name, program in found.exported_programs.items()}
-    return ExportedStepper(modules, metadata, str(path), "pt2")
+        with _archive(content) as archive:
+            names = archive.get_file_names()
+            metadata = from_json(archive.read_string(EXTRA) if EXTRA in names else None, path)
+    programs = {Path(x).stem: _program_when_called(content, x, path) for x in names if x.startswith(MODELS)}
+    return ExportedStepper(programs, metadata, str(path), "pt2")
 
 
 def load_onnx(path: PathLike) -> ExportedStepper:
@@ -184,6 +185,26 @@ def _is_of(text: str, path: PathLike, model: ContactLagrangian) -> bool:
 def _is_compiled(content: bytes) -> bool:
     with zipfile.ZipFile(io.BytesIO(content)) as archive:
         return any("/data/aotinductor/" in f"/{name}" for name in archive.namelist())
+
+
+def _archive(content: bytes) -> Any:
+    from torch.export.pt2_archive._package import PT2ArchiveReader
+
+    return PT2ArchiveReader(io.BytesIO(content))
+
+
+def _program_when_called(content: bytes, name: str, path: PathLike) -> Program:
+    """One program of a `.pt2` file, read at its first call: that takes a second or more, and few uses need all."""
+
+    @cache
+    def program() -> Program:
+        from torch.export.pt2_archive._package import _load_exported_programs
+
+        with _reading(path, ".pt2"), quiet(), _archive(content) as archive:
+            (found,) = _load_exported_programs(archive, [name], None).values()
+            return found.module(check_guards=False)
+
+    return lambda *arguments: program()(*arguments)
 
 
 def _load_aoti(path: PathLike) -> ExportedStepper:

@@ -159,13 +159,13 @@ def test_wide_networks():
 
 
 @needs_compiler
-@pytest.mark.parametrize("language", ["c", "c++"])
 @pytest.mark.parametrize("dtype", ["float64", "float32"])
-def test_no_compiler_warnings(tmp_path, language, dtype):
+def test_no_compiler_warnings(tmp_path, dtype):
     # fails if the header is not clean C99 or C++: unused names, shadowing, implicit conversions of types
-    tool = [CC, "-std=c99"] if language == "c" else [CXX, "-x", "c++"]
-    if tool[0] is None:
-        pytest.skip("no C++ compiler in the PATH")
+    # What depends on the flow of values is the same in both languages, and takes the optimiser.
+    tools = [[CC, "-std=c99", "-O1", "-c", "-o", "/dev/null"]]
+    if CXX is not None:
+        tools.append([CXX, "-x", "c++", "-fsyntax-only"])
     source = tmp_path / "use.c"
     source.write_text('#include "stepper.h"\nint main(void) { return 0; }\n')
     models = {kind: damped(2, kind) for kind in (["both", "alone"] if dtype == "float64" else ["linear", "correction"])}
@@ -180,11 +180,10 @@ def test_no_compiler_warnings(tmp_path, language, dtype):
         )
     for kind, model in models.items():
         export_c(model, tmp_path / "stepper.h", h=0.1, units=["real*/", '"m?"'], dtype=dtype)
-        # What depends on the flow of values is the same in both languages, and takes the optimiser.
-        action = ["-O1", "-c", "-o", "/dev/null"] if language == "c" else ["-fsyntax-only"]
-        command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", *action, str(source)]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 0, (kind, done.stderr[:2000])
+        for tool in tools:
+            command = [*tool, "-Wall", "-Wextra", "-Wpedantic", "-Werror", str(source)]
+            done = subprocess.run(command, capture_output=True, text=True, check=False)
+            assert done.returncode == 0, (kind, tool, done.stderr[:2000])
 
 
 @needs_compiler
@@ -406,4 +405,6 @@ def test_the_box_of_a_compiled_stepper(level, by_s):
     p = torch.tensor([0.0, 0.0, 0.0, 1.5, 0.0], dtype=torch.float64)[:, None]
     s = torch.tensor([0.0, 0.0, 0.0, 0.0, -6.0], dtype=torch.float64)
     assert compiled.outside_box(State(q, p, s)).tolist() == [False, True, False, True, by_s]
-    assert (compiled.step(State(q, 0 * p, s), 0.1).outside > 0).tolist() == [False, True, False, False, by_s]
+    outside = compiled.step(State(q, 0 * p, s), 0.1).outside
+    assert outside is not None
+    assert (outside > 0).tolist() == [False, True, False, False, by_s]

@@ -17,8 +17,9 @@ from herglotz.stepping import State
 WRITE = {"pt2": export_pt2, "onnx": export_onnx, "aoti": export_aoti}
 SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
 EVERY = [*LEVELS, *TERMS]
-# Always tested; the others are slow tests. test_pt2.py has Newton's iteration in a .pt2 file, at the affine level.
-ALWAYS = {"pt2": ("forced",), "onnx": ("conservative", "affine", "forced", "order 4", "sticking"), "aoti": ()}
+# Always tested; the others are slow tests. test_pt2.py and test_onnx.py have Newton's iteration at the affine level:
+# rollouts of every batch size, starts and derivatives.
+ALWAYS = {"pt2": ("forced",), "onnx": ("conservative", "forced", "order 4", "sticking"), "aoti": ()}
 MATRIX = [
     pytest.param(form, name, marks=[] if name in ALWAYS[form] else pytest.mark.slow)
     for form in WRITE

@@ -97,6 +97,19 @@ print(*q[0].tolist(), *p[0].tolist(), float(s))
     torch.testing.assert_close(alone, torch.cat([x.reshape(-1) for x in final]), rtol=1e-12, atol=1e-12)
 
 
+def test_a_program_is_read_at_its_first_call(written, monkeypatch):
+    # fails if opening a file reads all its programs, a second or more each, or a call reads its program again
+    package, read = torch.export.pt2_archive._package, []
+    reader = package._load_exported_programs
+    monkeypatch.setattr(package, "_load_exported_programs", lambda *x: (read.append(x[1]), reader(*x))[1])
+    exported = load_pt2(written[1])
+    assert read == []
+    q, _, s = states_of(2, 3)
+    once, again = (exported.init(q, q + 0.01, s, 0.1) for _ in range(2))
+    assert read == [["models/init.json"]]
+    assert torch.equal(once.p, again.p)
+
+
 def test_metadata_describes_the_file(written):
     # fails if an entry is missing or wrong, or if the hash does not depend on the weights
     model, _, exported = written

@@ -65,8 +65,20 @@ def png_size(path: Path) -> tuple[int, int]:
     return width, height
 
 
-@pytest.mark.parametrize("name", [*FIGURES, *IDENTITIES])
-@pytest.mark.parametrize("kind", KINDS)
+# These figures draw positions and records of the fit alone: the level and the dtype of the model reach the others,
+# and each of these two kinds is drawn in four figures. The slow suite has all.
+PLAIN = ("trajectory", "training", "plan")
+SLOW = pytest.mark.slow
+
+
+@pytest.mark.parametrize(
+    ("kind", "name"),
+    [
+        pytest.param(kind, name, marks=SLOW if name in PLAIN and kind in ("affine", "single precision") else ())
+        for kind in KINDS
+        for name in (*FIGURES, *IDENTITIES)
+    ],
+)
 def test_every_figure_of_every_kind_of_run(tmp_path, kind, name):
     # fails if a figure warns, is empty, or cannot take several trajectories or coordinates, or no test part
     figure = {**FIGURES, **IDENTITIES}[name](run_of(kind))

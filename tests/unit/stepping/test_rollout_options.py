@@ -108,7 +108,7 @@ def test_a_failure_between_kept_states_is_reported():
         Stepper(cliff, throw=True).rollout(q, torch.ones_like(q), h=0.1, steps=6)
 
 
-@pytest.mark.parametrize("settings", [{}, {"correction_width": 4}, {"level": "affine"}])
+@pytest.mark.parametrize("settings", [{}, {"correction_width": 4, "level": "affine"}])
 def test_checkpointing_gives_the_same_gradient_with_less_memory(settings):
     # fails if a segment is recomputed from another start, or keeps the graph of its inner steps
     made, steps = model(**settings), 48

@@ -48,8 +48,8 @@ def drift(stepper, state, steps, h=0.1):
 @pytest.mark.parametrize(
     ("H", "n", "steps"),
     [
-        (PENDULUM, 1, 200),
-        (coupled, 2, 100),
+        (PENDULUM, 1, 100),
+        (coupled, 2, 50),
         *(pytest.param(H, n, 1000, marks=pytest.mark.slow) for H, n in ((PENDULUM, 1), (coupled, 2))),
     ],
 )

@@ -90,7 +90,7 @@ def test_outliers_in_runs_are_noticed_before_the_first_fit():
         assert outliers_pull(recorded(seed, share=0.15, run=6)[0])
         assert not outliers_pull(recorded(seed)[0])
     for name, steps, h in (("parachute", 60, 0.2), ("kepler", 60, 0.05), ("double_pendulum", 60, 0.05),
-                           ("quadratic_drag", 1000, 0.2), ("damped_pendulum", 1000, 0.2)):  # fmt: skip
+                           ("quadratic_drag", 400, 0.2), ("damped_pendulum", 400, 0.2)):  # fmt: skip
         assert not outliers_pull(simulate(scene(name), trajectories=4, steps=steps, h=h).unwrapped())
     t = 2.0 * torch.arange(500, dtype=torch.float64)  # three samples a period, and at rest for most of the time
     assert not outliers_pull(Trajectories.of(t, torch.exp(-0.1 * t) * torch.cos(t)))
