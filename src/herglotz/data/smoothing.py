@@ -14,8 +14,8 @@ from torch import Tensor
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.windows import Triples
 
-DEGREES = (4, 6)
-WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)
+DEGREES = (4, 6)  # even: at the middle of a window an odd power says nothing about position and acceleration
+WIDTHS = (7, 9, 11, 15, 21, 29, 41, 57, 81, 113, 161)  # odd, each about √2 times the one before
 EXCESS = 1.2  # squared residuals beyond so many times the least are motion that the polynomials miss
 NEAR = 0.02  # of a window's half width: steps so short that the rule's own error does not count
 MOST = 2000  # windows that the choice looks at

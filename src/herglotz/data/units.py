@@ -8,6 +8,7 @@ from dataclasses import replace
 
 from herglotz.data.trajectories import DEGREES, Trajectories
 
+# How many of each unit of time make a second.
 PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9, "min": 1 / 60}
 
 

@@ -22,7 +22,7 @@ from herglotz.stepping import State
 from herglotz.training.config import FitConfig
 from herglotz.training.run import Run
 
-FORMAT = 1
+FORMAT = 1  # of the folder; a change that older versions cannot read raises it
 FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
 MANIFEST = "manifest.json"
 REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"

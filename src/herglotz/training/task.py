@@ -17,6 +17,10 @@ NOISY = 3e-4  # a one-step error above this share of the motion's size is noise:
 LEAST_GRIP = 0.01  # of set-valued friction at the start of a fit, over the typical speed: small beside what is found
 EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the motion's size; smaller errors are rounding
 
+# Settings of a fit that its model has under the same name.
+AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "coulomb", "input_map", "known", "alike",
+          "diagonal", "coupled", "drag", "order", "terms", "translations")  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Task:
@@ -55,49 +59,38 @@ def build_model(base: Baseline, config: FitConfig, network: str) -> ContactLagra
     Where the baseline's motions have "covered" the whole range, the correction is one layer of `WIDER` times as many
     units. "none": named terms alone.
     """
-    alone, n = network == "plain", len(base.angles)
-    width = config.correction_width if network not in ("potential", "none") and config.order == 2 else 0
+    alone, wide, forced = network == "plain", network == "covered", config.level == "forced"
     features = ("1", *config.features) if drag_starts_the_fit(config) else () if alone else config.features
+    own = replace(config, mass_width=0, known=(), alike=False, diagonal=False, terms=()) if alone else config
+    corrects = network not in ("potential", "none") and config.order == 2
+    stiffness, tilt = ((0.0,) * len(base.angles),) * 2 if config.alike else (base.stiffness, base.tilt)
     model = ContactLagrangian(
         ModelConfig(
-            angles=base.angles,
-            level=config.level,
-            scale=base.scale,
-            speed=base.speed,
-            stiffness=(0.0,) * n if config.alike else base.stiffness,
-            tilt=(0.0,) * n if config.alike else base.tilt,
-            rate=base.rate,
+            angles=base.angles, scale=base.scale, speed=base.speed, stiffness=stiffness, tilt=tilt, rate=base.rate,
             potential_width=config.potential_width if network == "potential" and config.order == 2 else 0,
             damping_width=config.damping_width if network != "none" else 0,
-            correction_width=width * (WIDER if network == "covered" else 1),
-            correction_depth=1 if network == "covered" else 2,
+            correction_width=config.correction_width * (WIDER if wide else 1) if corrects else 0,
+            correction_depth=1 if wide else 2,
             baseline=not alone,
-            seed=config.seed,
-            activation=config.activation,
-            mass_width=0 if alone else config.mass_width,
-            action_width=config.action_width,
-            coulomb=config.coulomb,
-            inputs=base.inputs if config.level == "forced" else 0,
-            input_map=config.input_map,
-            input_zero=config.level == "forced" and base.inputs > 0,
+            inputs=base.inputs if forced else 0,
+            input_zero=forced and base.inputs > 0,
             features=features,
-            known=() if alone else config.known,
-            alike=config.alike and not alone,
-            diagonal=config.diagonal and not alone,
-            coupled=config.coupled,
-            drag=config.drag,
-            order=config.order,
-            terms=() if alone else config.terms,
-            translations=config.translations,
+            **{name: getattr(own, name) for name in AS_SET},
         )
-    )
+    )  # fmt: skip
+    _start(model, base, config)
+    return model.to(dtype=config.torch_dtype, device=config.device)
+
+
+def _start(model: ContactLagrangian, base: Baseline, config: FitConfig) -> None:
+    """Write the baseline's starting values into a model."""
     if model.inputs and not config.input_map:
         assert model.friction is not None
-        model.friction.input_map.data.copy_(torch.tensor(base.input_map, dtype=torch.float64).reshape(n, -1))
+        start = torch.tensor(base.input_map, dtype=torch.float64)
+        model.friction.input_map.data.copy_(start.reshape(len(base.angles), -1))
     for name, values in base.start.items():
         numbers = model.get_parameter(name).data.view(-1)
         numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)  # order 4 has the baseline's features first
-    return model.to(dtype=config.torch_dtype, device=config.device)
 
 
 def with_sticking(model: ContactLagrangian) -> ContactLagrangian:
