@@ -2,6 +2,7 @@
 
 import ast
 import sys
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -22,12 +23,18 @@ EXTRAS = {
 FILES = sorted(SOURCE.rglob("*.py"))
 
 
+@cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
+@cache
 def imports(path):
-    yield from imported(ast.walk(ast.parse(path.read_text(encoding="utf-8"))), path)
+    return list(imported(ast.walk(parsed(path)), path))
 
 
 def top_level(path):
-    return set(imported(ast.parse(path.read_text(encoding="utf-8")).body, path))
+    return set(imported(parsed(path).body, path))
 
 
 def imported(nodes, path):
