@@ -15,7 +15,7 @@ import platform
 import statistics
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -106,16 +106,20 @@ def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
 
 def _json(value: Any, depth: int) -> str:
     """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper; many alike as a table."""
-    inside = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
-    alike = len(inside) > 0 and all(isinstance(x, dict) for x in inside)
+    inside = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
+    alike = bool(inside) and all(isinstance(x, dict) for x in inside)
     if alike and len(inside) >= PACKED:
-        columns = list(dict.fromkeys(k for x in inside for k in x))
-        rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
-        packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
-        return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
-    if (isinstance(value, dict) and depth < 2 and value) or (isinstance(value, list) and alike):
-        return _lines(value, depth + 1)
-    return json.dumps(_rounded(value), ensure_ascii=False)
+        return _packed(value, inside)
+    opened = depth < 2 and value if isinstance(value, dict) else alike
+    return _lines(value, depth + 1) if opened else json.dumps(_rounded(value), ensure_ascii=False)
+
+
+def _packed(value: Any, inside: list[dict]) -> str:
+    """Dictionaries alike as a table: their keys once, and a row each."""
+    columns = list(dict.fromkeys(k for x in inside for k in x))
+    rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
+    packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
+    return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
 
 
 def _lines(value: Any, depth: int) -> str:
@@ -152,13 +156,34 @@ def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:
     return lines + [f"| {' | '.join(map(str, row))} |" for row in rows]
 
 
-def spread(values: Iterable[float | None], digits: str = ".1e", between: str = " – ") -> str:
+def spread(values: Iterable[float | None]) -> str:
     """Median and range over the seeds, the median alone of one seed, or "failed"."""
     known = [x for x in values if x is not None]
     if not known:
         return "failed"
-    middle = f"{statistics.median(known):{digits}}"
-    return middle if len(known) == 1 else f"{middle} ({min(known):{digits}}{between}{max(known):{digits}})"
+    middle = f"{statistics.median(known):.1e}"
+    return middle if len(known) == 1 else f"{middle} ({min(known):.1e} – {max(known):.1e})"
+
+
+def by_seed(
+    path: Path,
+    jobs: Mapping[str, Callable[[int], dict[str, Any]]],  # name → what measures it with a seed
+    names: Iterable[str],
+    seeds: int,
+    text: Callable[[dict[str, Any]], str],  # the rows → the table
+) -> dict[str, Any]:
+    """Measure some rows with every seed; each is stored when it is done, beside those of earlier runs. All rows."""
+    rows = load(path, {"rows": {}})["rows"]
+    for name in names:
+        found = []
+        for seed in range(seeds):
+            began = time.process_time()
+            found.append({**jobs[name](seed), "cpu_seconds": round(time.process_time() - began, 1)})
+            print(name, seed, json.dumps({k: x for k, x in found[-1].items() if not isinstance(x, dict)}), flush=True)
+        rows[name] = {"commit": commit(), "seeds": found}
+        kept = {key: rows[key] for key in jobs if key in rows}
+        store(path, {**conditions(), "rows": kept}, text(kept))
+    return rows
 
 
 def picture(figure: Any, path: Path) -> None:

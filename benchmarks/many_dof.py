@@ -181,17 +181,25 @@ FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),
          "quadratic drag": (braking, ("coefficient", "coefficient, h → 0", "rms"), 1e-5)}  # fmt: skip
 
 
-def table(results: dict) -> str:
+# A row: its h, the target of each figure, and what measures it with a seed.
+JOBS: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]] = {
+    **{row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS},
+    **{name: (0.05, {figure: target for figure in figures}, run) for name, (run, figures, target) in FALLS.items()},
+}
+
+
+def table(stored: dict) -> str:
     """One line a figure: median, range over the seeds, target."""
     head = ("case", "h", "figure", "median", "min … max", "seeds", "parameters", "fit, CPU s")
     rows = []
-    for name, row in results.items():
+    for name, row in stored.items():
+        h, figures, _ = JOBS[name]
         cpu, parameters = statistics.median(x["cpu_s"] for x in row["seeds"]), row["seeds"][0]["parameters"]
-        for figure, target in row["figures"].items():
+        for figure, target in figures.items():
             values = [x[figure] for x in row["seeds"]]
             middle, span = statistics.median(values), f"{min(values):.1e} … {max(values):.1e}"
             met = "yes" if middle <= target else "**no**"
-            rows.append([name, row["h"], figure, f"{middle:.1e}", span, len(values), parameters, f"{cpu:.0f}",
+            rows.append([name, h, figure, f"{middle:.1e}", span, len(values), parameters, f"{cpu:.0f}",
                          f"{target:g}", met, row["commit"]])  # fmt: skip
     return "\n".join(harness.table((*head, "target", "met", "commit"), rows))
 
@@ -201,20 +209,9 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=5, help="how many seeds (default 5)")
     parser.add_argument("--only", nargs="*", default=[""], help="rows whose names contain one of these words")
     arguments = parser.parse_args(argv)
-    path = harness.json_file(arguments, "many_dof")
-    stored = harness.load(path, {"rows": {}})["rows"]
-    jobs: dict[str, tuple[float, dict[str, float], Callable[[int], dict]]]
-    jobs = {row.name: (row.h, {"rms": row.target}, partial(motion, row)) for row in ROWS}
-    for name, (run, figures, target) in FALLS.items():
-        jobs[name] = (0.05, {figure: target for figure in figures}, run)
-    for name, (h, figures, run) in jobs.items():
-        if not any(word in name for word in arguments.only):
-            continue
-        found = [run(seed) for seed in range(arguments.seeds)]
-        stored[name] = {"h": h, "figures": figures, "seeds": found, "commit": harness.commit()}
-        rows = {key: stored[key] for key in jobs if key in stored}
-        harness.store(path, {**harness.conditions(), "rows": rows}, table(rows))
-        print(name, {f: [f"{x[f]:.1e}" for x in found] for f in figures}, flush=True)
+    names = [name for name in JOBS if any(word in name for word in arguments.only)]
+    jobs = {name: run for name, (_, _, run) in JOBS.items()}
+    harness.by_seed(harness.json_file(arguments, "many_dof"), jobs, names, arguments.seeds, table)
 
 
 if __name__ == "__main__":

@@ -10,10 +10,8 @@ it took.
 
 from __future__ import annotations
 
-import json
 import statistics
 import sys
-import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -40,7 +38,7 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
     ("coverage_real", "ensemble_measured"): COVERED,
 }
 # A set: its files, and what measures it.
-ROWS: dict[str, tuple[tuple[str, ...], Callable[[int, Path], dict[str, Any]]]] = {
+ROWS: dict[str, tuple[tuple[str, ...], Callable[..., dict[str, Any]]]] = {
     "noise": ((), sets.noise),
     "one_trajectory": ((), partial(sets.noise, trajectories=1)),
     "outliers": ((), sets.outliers),
@@ -59,10 +57,10 @@ CURVES = {
 }
 
 
-def table(result: dict[str, Any]) -> str:
+def table(stored: dict[str, Any]) -> str:
     """Median and spread of every figure."""
     rows = []
-    for name, row in result["rows"].items():
+    for name, row in stored.items():
         for key, value in row["seeds"][0].items():
             values = (
                 [] if isinstance(value, dict | list) else [x for seed in row["seeds"] if (x := seed[key]) is not None]
@@ -120,24 +118,16 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--only", help=f"with commas, some of {', '.join(ROWS)}")
     parser.add_argument("--data", type=Path, default=harness.DATA, help="folder of measured sets")
     arguments = parser.parse_args(argv)
-    path = harness.json_file(arguments, "measured")
-    rows = harness.load(path, {"rows": {}})["rows"]
+    path, names = harness.json_file(arguments, "measured"), []
     for name in harness.chosen(parser, arguments.only, ROWS, "set"):
-        files, measure = ROWS[name]
-        if not all((arguments.data / file).exists() for file in files):
-            print(f"{name}: skipped, no {files[0]} in {arguments.data}")
-            continue
-        seeds = []
-        for seed in range(arguments.seeds):
-            began = time.process_time()
-            seeds.append({**measure(seed, arguments.data), "cpu_seconds": round(time.process_time() - began, 1)})
-            shown = {key: value for key, value in seeds[-1].items() if not isinstance(value, dict)}
-            print(name, seed, json.dumps(shown), flush=True)
-        rows[name] = {"commit": harness.commit(), "seeds": seeds}
-        result = {**harness.conditions(), "rows": {key: rows[key] for key in ROWS if key in rows}}
-        harness.store(path, result, table(result))
-        if "coverage_simulated" in rows:
-            draw(rows, path.with_name("coverage.png"))
+        if absent := [file for file in ROWS[name][0] if not (arguments.data / file).exists()]:
+            print(f"{name}: skipped, no {absent[0]} in {arguments.data}")
+        else:
+            names.append(name)
+    jobs = {name: (lambda seed, one=measure: one(seed, arguments.data)) for name, (_, measure) in ROWS.items()}
+    rows = harness.by_seed(path, jobs, names, arguments.seeds, table)
+    if "coverage_simulated" in rows:
+        draw(rows, path.with_name("coverage.png"))
 
 
 if __name__ == "__main__":

@@ -134,8 +134,8 @@ def momenta(model: ContactLagrangian, q: Tensor, v: Tensor, s: Tensor) -> Tensor
     return model.partials(q - 1e-4 * v, q, s, h).D2
 
 
-def window_rows(data: Trajectories, steps: int, count: int = 120) -> Tensor:
-    return torch.linspace(10, data.samples - steps - 11, count).round().long()
+def window_rows(data: Trajectories, steps: int) -> Tensor:
+    return torch.linspace(10, data.samples - steps - 11, 120).round().long()
 
 
 def driven_pendulum(seed: int, folder: Path) -> dict[str, float]:

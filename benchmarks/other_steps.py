@@ -45,6 +45,7 @@ def henon_heiles(gamma: float = 0.05) -> Scene:
     )  # fmt: skip
 
 
+# Scene, h, trajectories and steps of each: 31 samples a period of small motions, over two and three periods.
 SYSTEMS = {"pendulum": (lambda: scene("damped_pendulum"), 0.2, 8, 60), "henon_heiles": (henon_heiles, 0.2, 8, 90)}
 
 

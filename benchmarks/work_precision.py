@@ -68,11 +68,11 @@ def family(p: dict) -> str:
     return next(name for name, starts in FAMILIES if p["kind"].startswith(starts))
 
 
-def front(points: list[dict], error: str = "median") -> list[dict]:
+def front(points: list[dict]) -> list[dict]:
     """Points that no other beats in both error and cost, cheapest first."""
     kept: list[dict] = []
-    for p in sorted((p for p in points if p.get(error) is not None), key=lambda p: p["us_per_time"]):
-        if not kept or p[error] < kept[-1][error]:
+    for p in sorted((p for p in points if p.get("median") is not None), key=lambda p: p["us_per_time"]):
+        if not kept or p["median"] < kept[-1]["median"]:
             kept.append(p)
     return kept
 
@@ -228,17 +228,21 @@ def chosen(points: list[dict], error: str, wanted: float, seeds: int) -> dict[st
     rows = []
     for seed in range(seeds):
         mine = [p for p in points if p.get("seed", seed) == seed]
-        good = [p for p in mine if p["kind"].startswith("learned")]
-        good = [p for p in good if p[f"choice_{error}"] is not None and p[f"choice_{error}"] <= wanted]
+        good = _within([p for p in mine if p["kind"].startswith("learned")], f"choice_{error}", wanted)
         best = min(good, key=lambda p: p["us_per_time"], default=None)
         if best is None or best[error] is None:
             continue
         row = {"seed": seed, "setting": best["setting"], "error": best[error], "us_per_time": best["us_per_time"]}
         for rival, belongs in RIVALS:
-            costs_ = [p["us_per_time"] for p in mine if belongs(p) and p[error] is not None and p[error] <= best[error]]
+            costs_ = [p["us_per_time"] for p in _within(mine, error, best[error]) if belongs(p)]
             row[rival] = min(costs_) / best["us_per_time"] if costs_ else None
         rows.append(row)
     return {"wanted": wanted, "seeds": rows}
+
+
+def _within(points: list[dict], error: str, most: float) -> list[dict]:
+    """Points whose error is known and at most so large."""
+    return [p for p in points if p.get(error) is not None and p[error] <= most]
 
 
 def study_table(name: str, result: dict[str, Any]) -> list[str]:

@@ -276,20 +276,8 @@ def analytic(setup: Setup, quick: bool) -> list[dict]:
     system = setup.scene
     start = starts_of(system, RULE_MOTIONS, 1)
     truth = exact_motion(setup, start)
-    rules = {name: system.L_d_rules[name] for name in ORDERS if name in system.L_d_rules}
-    driven = setup.held is not None
-    if driven:  # rules that take no input for each step are left out
-        rules = {name: L_d for name, L_d in rules.items() if hasattr(L_d, "at")}
-    if system.exact:
-        rules["exact"] = system.L_d
-    methods: list[tuple[str, str, Any, Any]] = [(r, f"{r}", L_d, Stepper) for r, L_d in rules.items()]
-    if "strang" in rules and not driven:
-        base = rules["strang"]
-        for make, order in COMPOSED:
-            name = f"{make.__name__}{order}"
-            methods.append((name, f"{name}(strang)", base, partial(make, order=order)))
     found = []
-    for kind, label, L_d, make in methods:
+    for kind, label, L_d, make in _methods(setup):
         for parts in setup.rules[-2:] if quick else setup.rules:
             one, seconds = _measured(setup, L_d, make, parts, start, truth)
             order = ORDERS.get(kind, int(kind[-1]) if kind[-1].isdigit() else None)
@@ -297,6 +285,21 @@ def analytic(setup: Setup, quick: bool) -> list[dict]:
             if seconds > PATIENCE:
                 break
     return found
+
+
+def _methods(setup: Setup) -> list[tuple[str, str, Any, Any]]:
+    """Kind, label, L_d and stepper of every rule and composition."""
+    system, driven = setup.scene, setup.held is not None
+    rules = {name: system.L_d_rules[name] for name in ORDERS if name in system.L_d_rules}
+    if driven:  # rules that take no input for each step are left out
+        rules = {name: L_d for name, L_d in rules.items() if hasattr(L_d, "at")}
+    if system.exact:
+        rules["exact"] = system.L_d
+    methods: list[tuple[str, str, Any, Any]] = [(r, r, L_d, Stepper) for r, L_d in rules.items()]
+    for make, order in COMPOSED if "strang" in rules and not driven else ():
+        name = f"{make.__name__}{order}"
+        methods.append((name, f"{name}(strang)", rules["strang"], partial(make, order=order)))
+    return methods
 
 
 def _measured(setup: Setup, L_d: Any, make: Any, parts: int, start: State, truth: Tensor) -> tuple[dict, float]:

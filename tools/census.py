@@ -111,14 +111,26 @@ def called(node: ast.AST) -> set[str]:
 def newton_loops(tree: ast.Module, text: str) -> Iterator[str]:
     """Functions with a loop that ends early (`while`, or `break`) and solves a linear problem in every turn."""
     functions = {f.name: f for f in ast.walk(tree) if isinstance(f, FUNCTIONS)}
-    solvers = {name for name, f in functions.items() if any(map(SOLVE.search, called(f)))}
+    solvers = solving({name: called(f) for name, f in functions.items()})
+    named = "newton" in text.lower()
     for name, function in functions.items():
-        loops = [n for n in ast.walk(function) if isinstance(n, LOOPS)]
-        early = [n for n in loops if isinstance(n, ast.While) or any(isinstance(m, ast.Break) for m in ast.walk(n))]
-        solved = any(c in solvers or SOLVE.search(c) for loop in early for c in called(loop))
-        traced = "newton" in text.lower() and any("while_loop" in c for c in called(function))
-        if solved or traced:
+        solved = any(c in solvers or SOLVE.search(c) for loop in early_loops(function) for c in called(loop))
+        if solved or (named and any("while_loop" in c for c in called(function))):
             yield f"{function.lineno} {name}"
+
+
+def solving(calls: dict[str, set[str]]) -> set[str]:
+    """Functions that solve a linear problem, themselves or by what they call; `calls` has what each calls."""
+    found = {name for name, names in calls.items() if any(map(SOLVE.search, names))}
+    while further := {name for name, names in calls.items() if names & found} - found:
+        found |= further
+    return found
+
+
+def early_loops(function: ast.AST) -> list[ast.AST]:
+    """Loops that may end before their range does."""
+    loops = [n for n in ast.walk(function) if isinstance(n, LOOPS)]
+    return [n for n in loops if isinstance(n, ast.While) or any(isinstance(m, ast.Break) for m in ast.walk(n))]
 
 
 def drives(function: Any) -> bool:
@@ -136,12 +148,17 @@ def imports(files: Files) -> dict[str, set[str]]:
     trees = {p: ast.parse(files[p]) for p in paths}
     found: dict[str, set[str]] = {}
     for path, tree in trees.items():
-        used = [] if path.endswith("__init__.py") else list(ast.walk(tree))  # a package only passes names on
-        named = ((n.module or "", a.name) for n in used if isinstance(n, ast.ImportFrom) for a in n.names)
-        origins = {_origin(module, trees, *x) for x in named}
-        origins |= {module.get(a.name) for n in used if isinstance(n, ast.Import) for a in n.names}
-        found[path] = {f for f in origins if f and f != path}
+        names = [] if path.endswith("__init__.py") else references(tree)  # a package only passes names on
+        origins = {_origin(module, trees, *x) if x[1] else module.get(x[0]) for x in names}
+        found[path] = {f for f in origins if f} - {path}
     return found
+
+
+def references(tree: ast.Module) -> list[tuple[str, str]]:
+    """(module, name) of every `from module import name`, (module, "") of every `import module`."""
+    nodes = list(ast.walk(tree))
+    named = [(n.module or "", a.name) for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names]
+    return named + [(a.name, "") for n in nodes if isinstance(n, ast.Import) for a in n.names]
 
 
 def _origin(module: dict[str, str], trees: dict[str, ast.Module], package: str, name: str) -> str | None:
@@ -203,37 +220,54 @@ def bare_constants(tree: ast.Module, text: str) -> Iterator[str]:
             yield target.id
 
 
+def in_text(path: str, text: str) -> Iterator[tuple[str, str]]:
+    """Kind and place of what is found in the text of a file of src, C or C in Python."""
+    for kind, pattern in (("Newton loops", C_NEWTON), ("rollout drivers", C_ROLLOUT)):
+        yield from ((kind, f"{path} {m.group().strip()}") for m in pattern.finditer(text))
+
+
+def in_tree(path: str, text: str, tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Kind and place of what is found in the syntax of a file."""
+    ours = path.startswith("src/")
+    for f in (n for n in ast.walk(tree) if isinstance(n, FUNCTIONS)):
+        place = f"{path}:{f.lineno} {f.name}"
+        sizes = {"long functions": (length(f), LONG), "wide functions": (parameters(f), WIDE)}
+        yield from ((kind, f"{place} {size}") for kind, (size, most) in sizes.items() if size > most)
+        if ours and drives(f):
+            yield "rollout drivers", place
+    yield from (("bare constants", f"{path} {name}") for name in bare_constants(tree, text))
+    if ours and room(path) != "training":
+        yield from (("Newton loops", f"{path}:{loop}") for loop in newton_loops(tree, text))
+
+
 def census(files: Files) -> dict[str, Any]:
     """Every count, and what was found."""
     code = {p: t for p, t in files.items() if not p.startswith("tests/") and p.endswith((".py", ".c", ".h"))}
-    lines: Counter[str] = Counter()
+    trees = {p: ast.parse(t) for p, t in code.items() if p.endswith(".py")}
+    found = findings(code, trees) | {"circles": [" ↔ ".join(group) for group in circles(imports(code))]}
+    found["uncalled names"] = uncalled(files)
+    functions = ((p, f) for p, tree in trees.items() for f in ast.walk(tree) if isinstance(f, FUNCTIONS))
+    most = max(((complexity(f), f"{p}:{f.lineno} {f.name}") for p, f in functions), default=(0, ""))
+    counts = {"complexity": most[0], **{kind: len(x) for kind, x in found.items()}}
+    return {"lines": lines_of(code), "counts": counts, "most complex": most[1], "found": found}
+
+
+def findings(code: Files, trees: dict[str, ast.Module]) -> dict[str, list[str]]:
+    """Places by kind, of all that is found file by file."""
     kinds = ("long functions", "wide functions", "Newton loops", "rollout drivers", "bare constants")
     found: dict[str, list[str]] = {kind: [] for kind in kinds}
-    most = (0, "")
     for path, text in code.items():
-        lines[room(path)] += text.count("\n")
-        if path.startswith("src/"):
-            found["Newton loops"] += [f"{path} {m.group().strip()}" for m in C_NEWTON.finditer(text)]
-            found["rollout drivers"] += [f"{path} {m.group().strip()}" for m in C_ROLLOUT.finditer(text)]
-        if not path.endswith(".py"):
-            continue
-        tree = ast.parse(text)
-        for f in (n for n in ast.walk(tree) if isinstance(n, FUNCTIONS)):
-            place = f"{path}:{f.lineno} {f.name}"
-            most = max(most, (complexity(f), place))
-            found["long functions"] += [f"{place} {length(f)}"] * (length(f) > LONG)
-            found["wide functions"] += [f"{place} {parameters(f)}"] * (parameters(f) > WIDE)
-            found["rollout drivers"] += [place] * (path.startswith("src/") and drives(f))
-        found["bare constants"] += [f"{path} {name}" for name in bare_constants(tree, text)]
-        if path.startswith("src/") and room(path) != "training":
-            found["Newton loops"] += [f"{path}:{loop}" for loop in newton_loops(tree, text)]
-    found["circles"] = [" ↔ ".join(group) for group in circles(imports(code))]
-    found["uncalled names"] = uncalled(files)
-    budget = {name: sum(lines[r] for r in rooms) for name, (rooms, _) in BUDGETS.items()}
-    totals = {"src": sum(text.count("\n") for p, text in code.items() if p.startswith("src/"))}
-    totals["outside tests"] = sum(lines.values())
-    counts = {"complexity": most[0], **{kind: len(x) for kind, x in found.items()}}
-    return {"lines": budget | totals, "counts": counts, "most complex": most[1], "found": found}
+        pairs = list(in_text(path, text)) if path.startswith("src/") else []
+        for kind, place in [*pairs, *(in_tree(path, text, trees[path]) if path in trees else ())]:
+            found[kind].append(place)
+    return found
+
+
+def lines_of(code: Files) -> dict[str, int]:
+    """Lines by budget, of src, and of all."""
+    lines = Counter({path: text.count("\n") for path, text in code.items()})
+    budget = {name: sum(lines[p] for p in code if room(p) in rooms) for name, (rooms, _) in BUDGETS.items()}
+    return budget | {"src": sum(lines[p] for p in code if p.startswith("src/")), "outside tests": lines.total()}
 
 
 def table(now: dict[str, Any], before: dict[str, Any] | None) -> str:

@@ -138,14 +138,14 @@ def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of(samples, samples.motion())
     model = FreeLagrangian(scales, generator)
-    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
+    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False)
 
 
 def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
     """Fit M(q), V(q) and friction to accelerations."""
     generator = torch.Generator().manual_seed(seed)
     model = DeepLagrangian(scales_of(samples, samples.motion()), generator)
-    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False, velocity_rate=False)
+    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False)
 
 
 def integrator(field: Callable[[Tensor], Tensor], h: float, parts: int) -> Callable[[Tensor], Tensor]:

@@ -146,10 +146,10 @@ def train(
     best.restore()
 
 
-def split(rows: int, generator: torch.Generator, part: float = 0.12) -> tuple[Tensor, Tensor]:
+def split(rows: int, generator: torch.Generator) -> tuple[Tensor, Tensor]:
     """Rows to train on and rows to validate on, at random."""
     order = torch.randperm(rows, generator=generator)
-    held = max(1, round(part * rows))
+    held = max(1, round(0.12 * rows))
     return order[held:], order[:held]
 
 
@@ -176,7 +176,6 @@ def fit_rates(
     budget: float,
     *,
     momentum: bool,
-    velocity_rate: bool = True,
 ) -> Flow:
     """Least squares of (q̇, ẏ) against the data's rates, each divided by its spread.
 
@@ -189,9 +188,7 @@ def fit_rates(
     samples, generator, budget
         See `networks.train`.
     momentum
-        Whether y is the momentum; else the velocity.
-    velocity_rate
-        Whether q̇ is fitted as well; left out where q̇ = v by construction.
+        Whether y is the momentum; else the velocity, where q̇ = v by construction and only v̇ is fitted.
     """
     parameters, motion = list(parameters), samples.motion()
     y, y_rate = (motion.p, motion.f) if momentum else (motion.v, motion.a)
@@ -202,7 +199,7 @@ def fit_rates(
     def loss(at: Tensor) -> Tensor:
         q_rate, found = rates(motion.q[at], y[at])
         value = ((found - y_rate[at]) / y_spread).square().mean()
-        return value + ((q_rate - motion.v[at]) / scales.v).square().mean() if velocity_rate else value
+        return value + ((q_rate - motion.v[at]) / scales.v).square().mean() if momentum else value
 
     train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), parameters, generator, budget)
     n = samples.dof

@@ -92,14 +92,16 @@ def _ahead(rows: Rows) -> list[str]:
     times = next(x["after"] for c in ahead.values() for x in c if x.get("after"))
     found = []
     for peer, cells in ahead.items():
-        columns = []
-        for t in times:
-            pairs = [x["after"][t] for x in cells if x.get("after") and x["after"][t]]
-            middle = [statistics.median(p[k] for p in pairs) for k in (0, 1)] if pairs else []
-            columns.append(", ".join(f"{x:.3f}" for x in middle) or "failed")
-        found.append([PEERS[peer].title, *columns])
+        reached = [x["after"] for x in cells if x.get("after")]
+        found.append([PEERS[peer].title, *(_middle([after[t] for after in reached if after[t]]) for t in times)])
     words = "RMS of the elbow and the tip angle (rad), median of the seeds:"
     return ["", words, "", *lines_of(["peer", *(f"after {t}" for t in times)], found)]
+
+
+def _middle(pairs: list[list[float]]) -> str:
+    """Medians of both angles' errors."""
+    columns = zip(*pairs, strict=True)
+    return ", ".join(f"{statistics.median(column):.3f}" for column in columns) or "failed"
 
 
 def draw(result: dict[str, Any], path: Path) -> None:
@@ -135,16 +137,15 @@ def _panel(ax: Axes, result: dict[str, Any], data: str, place: dict[str, int]) -
     for (peer, given), cells in rows_of(result["cells"], data).items():
         exact, found = given == "exact", values(cells, "rms")
         color = MODEL if peer.startswith("ours") else UNSEEN if exact else INK
-        y = place[peer] + (-0.2 if exact else 0.12 if PEERS[peer].needs != "positions" else 0.0)
+        y = place[peer] + {"exact": -0.2, "differences": 0.12}.get(given, 0.12 * (PEERS[peer].needs == "either"))
         failed, total = (sum(int(c.get(k) or 0) for c in cells) for k in ("failures", "rollouts"))
         style: dict[str, Any] = {"ms": 4, "mec": color, "mfc": "white" if exact else color, "clip_on": False}
         if found:  # an empty line that is not clipped would lie at the figure's corner, and stretch the layout
             ax.plot(found, [y] * len(found), "x" if 2 * failed > total else "o", **style)
             ax.plot([statistics.median(found)] * 2, [y - 0.2, y + 0.2], color=color, lw=1.6)
         else:
-            ink = color if exact else MUTED
-            ax.text(0.99, y, "failed", transform=ax.get_yaxis_transform(), ha="right", va="center", color=ink,
-                    fontsize=7.5, in_layout=False)  # fmt: skip
+            ax.text(0.99, y, "failed", transform=ax.get_yaxis_transform(), ha="right", va="center", fontsize=7.5,
+                    color=color if exact else MUTED, in_layout=False)  # fmt: skip
     words = result["titles"].get(data, data).split(";")[0].replace(" = ", "\u00a0=\u00a0")
     ax.set_title(textwrap.fill(words, 38), fontsize=8)
     ax.set(xscale="log", xlabel="RMS (rad)", ylim=(-0.7, len(place) - 0.4))

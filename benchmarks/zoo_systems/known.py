@@ -12,7 +12,7 @@ from benchmarks.zoo_systems.mechanisms import Array, Mechanism
 from benchmarks.zoo_systems.prediction import MechanismModel, roll, start_states, trained
 from benchmarks.zoo_systems.systems import ZooSystem
 
-ITERATIONS = 8
+ITERATIONS = 8  # from the true numbers; a gain below 1e-4 of the cost ends the fit before
 OFFSET = 1e-5  # of finite differences, relative to 1 for numbers of the mechanism, to the noise for states
 
 

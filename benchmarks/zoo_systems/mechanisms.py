@@ -6,6 +6,7 @@ evaluates as many parameter sets as a finite-difference Jacobian needs. Units ar
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -138,3 +139,15 @@ class Mechanism:
         m, r, g = self["m"], self["r"], self["g"]
         cart = m * r * np.sin(q[..., 1]) * v[..., 1] ** 2 - self["k"] * q[..., 0]
         return np.stack([cart, -m * r * g * np.sin(q[..., 1])], -1)
+
+
+def rk4(slope: Callable[[Array, Array], Array], q: Array, v: Array, h: float) -> tuple[Array, Array]:
+    """One Runge–Kutta step of q̈ = slope(q, q̇)."""
+    a1 = slope(q, v)
+    v2 = v + 0.5 * h * a1
+    a2 = slope(q + 0.5 * h * v, v2)
+    v3 = v + 0.5 * h * a2
+    a3 = slope(q + 0.5 * h * v2, v3)
+    v4 = v + h * a3
+    a4 = slope(q + h * v3, v4)
+    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.zoo_systems.mechanisms import Array, Mechanism
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism, rk4
 
 FINE = 2 * np.pi / 500  # longest fine step, in natural units
 BISECTIONS = 50  # of the time of an event, in a fine step
@@ -103,11 +103,4 @@ def _rk4(of: Mechanism, q: Array, v: Array, u: Array, h: float, mode: Array) -> 
         f = of.smooth_force(q, v, u)
         return np.where(stuck, 0.0, of.acceleration(q, f - mode * of.dry_level(v) if dry else f))
 
-    a1 = slope(q, v)
-    v2 = v + 0.5 * h * a1
-    a2 = slope(q + 0.5 * h * v, v2)
-    v3 = v + 0.5 * h * a2
-    a3 = slope(q + 0.5 * h * v2, v3)
-    v4 = v + h * a3
-    a4 = slope(q + h * v3, v4)
-    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+    return rk4(slope, q, v, h)

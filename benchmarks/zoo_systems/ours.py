@@ -33,12 +33,12 @@ class OurFit:
     metrics: dict[str, Any]
 
 
-def fit_ours(of: ZooSystem, folder: Path, limit: float, flags: Sequence[str] = ()) -> OurFit:
-    """Write the training data, fit with default flags (and `flags`), predict both parts."""
+def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
+    """Write the training data, fit with default flags, predict both parts."""
     folder.mkdir(parents=True, exist_ok=True)
     save(folder / "train.csv", trajectories(of, of.train))
     save(folder / "unseen.csv", trajectories(of, of.test))
-    code, message, cpu = _run_fit(folder, limit, flags)
+    code, message, cpu = _run_fit(folder, limit)
     said = "" if code == 0 else "too slow" if code is None else f"exit code {code}: {message}"
     if not (folder / "run" / "metrics.json").is_file():
         return OurFit(None, said or "no run", cpu, {})
@@ -92,14 +92,14 @@ def _later(of: ZooSystem, run: Any) -> tuple[Array, Array]:
     return q.reshape(-1, n), of.train.q[:, first:].reshape(-1, n)
 
 
-def _run_fit(folder: Path, limit: float, flags: Sequence[str]) -> tuple[int | None, str, float]:
+def _run_fit(folder: Path, limit: float) -> tuple[int | None, str, float]:
     """Exit code (None: out of time), last line of stderr, processor time."""
     command = [sys.executable, "-m", "herglotz", "fit", str(folder / "train.csv"), "--out", str(folder / "run")]
     before = _children()
     bound = lambda: resource.setrlimit(resource.RLIMIT_CPU, (int(limit), int(limit) + 5))  # noqa: E731
     try:
         done = subprocess.run(
-            [*command, "--no-plots", "--json", *flags], capture_output=True, text=True, timeout=WALL * limit,
+            [*command, "--no-plots", "--json"], capture_output=True, text=True, timeout=WALL * limit,
             preexec_fn=bound, env={**os.environ, "OMP_NUM_THREADS": "1"}, check=False,
         )  # fmt: skip
         code, message = done.returncode, (done.stderr.strip().splitlines() or [""])[-1]

@@ -6,7 +6,7 @@ from typing import Protocol
 
 import numpy as np
 
-from benchmarks.zoo_systems.mechanisms import Array, Mechanism
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism, rk4
 from benchmarks.zoo_systems.systems import TRAIN, Recording, ZooSystem
 
 SMOOTH, DRY = 2 * np.pi / 60, 2 * np.pi / 250  # longest inner step, natural units; dry friction is split, of order 2
@@ -43,18 +43,6 @@ class MechanismModel:
 
     def _rubbed(self, q: Array, v: Array, h: float) -> Array:
         return np.sign(v) * np.maximum(np.abs(v) - h * self.of.dry_level(v) / self.of.mass(q), 0.0)
-
-
-def rk4(slope, q: Array, v: Array, h: float) -> tuple[Array, Array]:
-    """One Runge–Kutta step of q̈ = slope(q, q̇)."""
-    a1 = slope(q, v)
-    v2 = v + 0.5 * h * a1
-    a2 = slope(q + 0.5 * h * v, v2)
-    v3 = v + 0.5 * h * a2
-    a3 = slope(q + 0.5 * h * v2, v3)
-    v4 = v + h * a3
-    a4 = slope(q + h * v3, v4)
-    return q + h / 6 * (v + 2 * v2 + 2 * v3 + v4), v + h / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
 
 
 def roll(model: EquationModel, q: Array, v: Array, t: Array, u: Array) -> Array:

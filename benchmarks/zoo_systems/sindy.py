@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.zoo_systems.mechanisms import Array
-from benchmarks.zoo_systems.prediction import SMOOTH, rk4, roll, start_states, trained
+from benchmarks.zoo_systems.mechanisms import Array, rk4
+from benchmarks.zoo_systems.prediction import SMOOTH, roll, start_states, trained
 from benchmarks.zoo_systems.systems import ZooSystem
 
 HALF_WIDTHS = (0.02, 0.05, 0.1, 0.2)  # of the smoothing window, in natural periods; two samples at the least

@@ -12,14 +12,7 @@ from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State
 from herglotz.theory import contact_vector_field, generating_function, right_equations
 from herglotz.theory.continuous import derivatives
-from paper_errata.erratum import (
-    PARACHUTE,
-    Erratum,
-    Row,
-    parachute_start,
-    size,
-    tensor,
-)
+from paper_errata.erratum import PARACHUTE, Erratum, Row, parachute_start, size, tensor
 
 
 def e9() -> Erratum:

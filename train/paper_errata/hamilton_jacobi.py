@@ -25,15 +25,7 @@ from herglotz.theory import (
     riccati_step,
 )
 from herglotz.theory.continuous import derivatives, jacobian
-from paper_errata.erratum import (
-    OSCILLATOR,
-    Erratum,
-    Row,
-    oscillator_start,
-    printed_left,
-    size,
-    tensor,
-)
+from paper_errata.erratum import OSCILLATOR, Erratum, Row, oscillator_start, printed_left, size, tensor
 
 
 def solutions(k: int, h: float = 0.1):

@@ -47,10 +47,7 @@ class Box(nn.Module):
 
     @classmethod
     def of(
-        cls,
-        box: Mapping[str, Sequence[float]] | None,
-        model: ContactLagrangian,
-        h_range: Sequence[float] | None = None,
+        cls, box: Mapping[str, Sequence[float]] | None, model: ContactLagrangian, h_range: Sequence[float] | None = None
     ) -> Box | None:
         """The box of a model, if there is one."""
         if box is None:

@@ -176,14 +176,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
     types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
-    parts = [
-        _top(entries, step, derivatives),
-        types,
-        _constants(model, entries),
-        number_tests,
-        functions,
-        products,
-    ]
+    parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
     parts += [emitted.tables, _inputs(model, dtype), emitted.scalars, run]
     if emitted.lanes:
         parts += ["#ifdef hz_LANE_BYTES\n#define hz_BATCHED", emitted.lanes, batch, "#endif\n"]

@@ -11,7 +11,7 @@ import torch
 
 import herglotz
 from herglotz.data.files import PathLike
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.export.equation import input_count
 from herglotz.models import ContactLagrangian
 from herglotz.schema import check_entries
@@ -70,15 +70,14 @@ def describe(
     InputError
         If h, box, units or further entries are not usable.
     """
-    dtype = next(model.parameters()).dtype
-    if dtype not in (torch.float32, torch.float64):
-        raise InputError(f"export needs a float32 or float64 model, got {dtype}; convert it with .double()")
-    if not (float(h) > 0 and float(h) < float("inf")):
-        raise InputError(f"h must be a finite number > 0, got {h}")
-    if units and len(units) != model.config.dof:
-        raise InputError(f"units needs one entry a coordinate ({model.config.dof}), got {list(units)}")
-    if newton_iterations < 2:
-        raise InputError(f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models")
+    dtype, n = next(model.parameters()).dtype, model.config.dof
+    refuse({
+        f"export needs a float32 or float64 model, got {dtype}; convert it with .double()":
+            dtype not in (torch.float32, torch.float64),
+        f"h must be a finite number > 0, got {h}": not 0 < float(h) < float("inf"),
+        f"units needs one entry a coordinate ({n}), got {list(units)}": units and len(units) != n,
+        f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models": newton_iterations < 2,
+    })  # fmt: skip
     entries: dict[str, Any] = {
         "format": FORMAT,
         "herglotz_version": herglotz.__version__,
@@ -86,14 +85,14 @@ def describe(
         "model": model.config.to_dict(),
         "weights_sha256": weights_digest(model),
         "level": model.config.level,
-        "dof": model.config.dof,
+        "dof": n,
         "inputs": input_count(model),
         "input_zero": _input_zero(model),
         "dtype": str(dtype).removeprefix("torch."),
         "h": float(h),
         "units": list(units),
         "angles": list(model.config.angles),
-        "box": None if box is None else _box(box, model.config.dof),
+        "box": None if box is None else _box(box, n),
         "newton_iterations": newton_iterations,
         "newton_tolerance": TOLERANCE * torch.finfo(dtype).eps,
     }

@@ -111,62 +111,81 @@ class Found(NamedTuple):
     mixed: bool = False  # the samples' last trials are different ones, and `point` is that of none
 
 
+class _Here(NamedTuple):
+    """Where the samples are, and Newton's step from there."""
+
+    x: Tensor  # (..., m)
+    point: Point
+    J: Jacobian
+    delta: Tensor  # (..., m) −J⁻¹F
+    merit: Tensor  # (...) |F|
+    residual: Tensor  # (...) |J⁻¹F|
+
+
 def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes) -> Found:
     """Iterate from x (..., m), all samples at once."""
-    solver, length = rules.solver or solve, rules.length
-    point = equation(x, True)
-    J, delta = point.J, -solver(point.J, point.F)
-    merit, residual = largest(point.F), length(delta)
-    scale, floor = sizes(x, point, residual)
+    here = _evaluate(equation, x, rules)
+    scale, floor = sizes(x, here.point, here.residual)
     tiny, near = rules.tol * scale, NEAR * scale
     # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
-    done = (residual <= tiny) | ~torch.isfinite(residual)
+    done = (here.residual <= tiny) | ~torch.isfinite(here.residual)
     fraction: Tensor | None = None  # None: every sample takes full steps
     slow: Tensor | None = None  # samples whose old Jacobian has served its time
     mixed, iterations = False, 0
     while iterations < rules.max_iterations and not bool(done.all()):
-        if not rules.natural or bool((residual > floor).any()):  # the last digits are not counted
+        if not rules.natural or bool((here.residual > floor).any()):  # the last digits are not counted
             iterations += 1
-        move = delta if fraction is None else fraction[..., None] * delta
-        trial = x + torch.where(done[..., None], 0.0, move)
-        fresh = ~done & (residual > near)  # at a trial that may be far off, the Jacobian is wanted as well
+        move = here.delta if fraction is None else fraction[..., None] * here.delta
+        fresh = ~done & (here.residual > near)  # at a trial that may be far off, the Jacobian is wanted as well
         fresh = fresh if slow is None else fresh | slow
-        second = not rules.keep or bool(fresh.any())
-        point_trial, J_trial = equation(trial, second), J
-        if second:
-            J_trial = select(fresh, point_trial.J, J) if rules.keep else point_trial.J
-        delta_trial, merit_trial = -solver(J_trial, point_trial.F), largest(point_trial.F)
-        left = length(delta_trial)
-        settled = left <= tiny
-        whole = 1.0 if fraction is None else fraction
-        if rules.natural:
-            better = (length(solver(J, point_trial.F)) <= (1 - NATURAL * whole) * residual) | settled
-        else:
-            better = (merit_trial <= (1 - ARMIJO * whole) * merit) | settled
-        stalled = ~better & (residual <= floor)  # rounding, not a wrong direction
-        slow = None
+        trial = _evaluate(equation, here.x + torch.where(done[..., None], 0.0, move), rules, here.J, fresh)
+        settled = trial.residual <= tiny
+        better = _falls(rules, here, trial, 1.0 if fraction is None else fraction) | settled
+        stalled = ~better & (here.residual <= floor)  # rounding, not a wrong direction
         if rules.keep:
-            slow = ~fresh & ~done & ~settled & (left > CONTRACTION * residual) & torch.isfinite(left)
+            still = ~fresh & ~done & ~settled & torch.isfinite(trial.residual)
+            slow = still & (trial.residual > CONTRACTION * here.residual)
             better = better | (slow & ~stalled)
         accept = better & ~done
-        done_next = done | settled | stalled
+        mixed = not bool((better | done).all())
+        done = done | settled | stalled
         if rules.natural:  # this test may accept a trial where J is singular
-            done_next = done_next | (accept & ~torch.isfinite(left))
-        if bool((better | done).all()):  # a done sample's trial is its own x: nothing to select
-            x, J, delta, merit, residual = trial, J_trial, delta_trial, merit_trial, left
-            point, mixed = point_trial, False
-            if fraction is not None:
-                fraction = (2 * fraction).clamp(max=1.0) if rules.natural else torch.ones_like(merit)
-        else:
-            x, J, delta = (select(accept, new, old) for new, old in ((trial, x), (J_trial, J), (delta_trial, delta)))
-            merit, residual = torch.where(accept, merit_trial, merit), torch.where(accept, left, residual)
-            mixed = True  # the points of the samples are from different trials
-            before = torch.ones_like(merit) if fraction is None else fraction
-            after = (2 * before).clamp(max=1.0) if rules.natural else 1.0
-            fraction = torch.where(accept, after, before / 2)
-            done_next = done_next | (fraction < rules.shortest) if rules.shortest else done_next
-        done = done_next
+            done = done | (accept & ~torch.isfinite(trial.residual))
+        if not mixed:  # a done sample's trial is its own x: nothing to select
+            here = trial
+        else:  # the point is that of no sample
+            values = (select(accept, new, old) for new, old in zip(trial[2:], here[2:], strict=True))
+            here = _Here(select(accept, trial.x, here.x), here.point, *values)
+        if mixed or fraction is not None:
+            fraction = _next(fraction, accept, rules.natural, like=here.merit)
+            done = done | (fraction < rules.shortest)
+    x, point, J, delta, merit, residual = here
     return Found(x, point, merit, residual, done, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed)
+
+
+def _evaluate(equation: Equation, x: Tensor, rules: Rules, J: Jacobian = None, fresh: Tensor | None = None) -> _Here:
+    """The equation at x, with the Jacobian J in the samples that are not `fresh` where the rules keep it."""
+    second = fresh is None or not rules.keep or bool(fresh.any())
+    point = equation(x, second)
+    if second:
+        J = select(fresh, point.J, J) if rules.keep and fresh is not None else point.J
+    solver = rules.solver or solve
+    delta = -solver(J, point.F)
+    return _Here(x, point, J, delta, largest(point.F), rules.length(delta))
+
+
+def _next(fraction: Tensor | None, accept: Tensor, natural: bool, like: Tensor) -> Tensor:
+    """The fractions of the next move: halves after a refused trial; after an accepted one all, or twice as much."""
+    fraction = torch.ones_like(like) if fraction is None else fraction
+    return torch.where(accept, (2 * fraction).clamp(max=1.0) if natural else 1.0, fraction / 2)
+
+
+def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Tensor | float) -> Tensor:
+    """In which samples a trial passes the test of descent, (...)."""
+    if rules.natural:
+        solver = rules.solver or solve
+        return rules.length(solver(here.J, trial.point.F)) <= (1 - NATURAL * fraction) * here.residual
+    return trial.merit <= (1 - ARMIJO * fraction) * here.merit
 
 
 def select(mask: Tensor, a: Any, b: Any) -> Any:

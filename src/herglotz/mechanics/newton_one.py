@@ -17,9 +17,12 @@ from herglotz.mechanics.newton import ARMIJO, CONTRACTION, NEAR, Equation, Found
 Numbers = Callable[[Tensor, Point, float], tuple[float, float]]  # `Sizes` of one sample
 
 
-class _Move(NamedTuple):
-    """A Newton step."""
+class _Here(NamedTuple):
+    """Where the sample is, and Newton's step from there."""
 
+    x: Tensor  # (1, …, m)
+    point: Point
+    J: Tensor
     delta: Tensor | float  # −J⁻¹F
     left: float  # |J⁻¹F|
     merit: float  # |F|
@@ -27,57 +30,57 @@ class _Move(NamedTuple):
 
 def newton_one(equation: Equation, x: Tensor, rules: Rules, sizes: Numbers) -> Found:
     """Iterate from x by rules that measure |F| and have a matrix for a Jacobian."""
-    point, J = _evaluate(equation, x, None)
-    move = newton_step(J, point.F)
-    scale, floor = sizes(x, point, move.left)
+    here = _evaluate(equation, x, None)
+    scale, floor = sizes(x, here.point, here.left)
     tiny, near = rules.tol * scale, NEAR * scale
     # A direction that is not finite can never be followed: such a sample is over.
-    done, fraction, slow, iterations = move.left <= tiny or not isfinite(move.left), 1.0, False, 0
+    done, fraction, slow, iterations = not tiny < here.left < inf, 1.0, False, 0
     while iterations < rules.max_iterations and not done:
         iterations += 1
-        trial = x + (move.delta if fraction == 1.0 else fraction * move.delta)
-        fresh = slow or move.left > near  # at a trial that may be far off, the Jacobian is wanted as well
-        point_trial, J_trial = _evaluate(equation, trial, None if fresh or not rules.keep else J)
-        new = newton_step(J_trial, point_trial.F)
-        settled = new.left <= tiny
-        better = settled or new.merit <= (1 - ARMIJO * fraction) * move.merit
-        stalled = not better and move.left <= floor  # rounding, not a wrong direction
-        slow = False
-        if rules.keep:
-            slow = not (fresh or settled) and new.left > CONTRACTION * move.left and isfinite(new.left)
-            better = better or (slow and not stalled)
-        if better:
-            x, point, J, move, fraction = trial, point_trial, J_trial, new, 1.0
+        # At a trial that may be far off, the Jacobian is wanted as well.
+        fresh = slow or not rules.keep or here.left > near
+        move = here.delta if fraction == 1.0 else fraction * here.delta
+        trial = _evaluate(equation, here.x + move, None if fresh else here.J)
+        settled = trial.left <= tiny
+        better = settled or trial.merit <= (1 - ARMIJO * fraction) * here.merit
+        stalled = not better and here.left <= floor  # rounding, not a wrong direction
+        done = settled or stalled
+        slow = not (fresh or settled) and CONTRACTION * here.left < trial.left < inf
+        if better or (slow and not stalled):
+            here, fraction = trial, 1.0
         else:
             fraction /= 2
-        done = settled or stalled
-    merit, residual = (x.new_full(x.shape[:-1], value) for value in (move.merit, move.left))
-    flag = torch.full(x.shape[:-1], done, device=x.device)
-    return Found(x, point, merit, residual, flag, iterations, done and isfinite(move.merit + move.left))
+    return _found(here, done, iterations)
 
 
-def _evaluate(equation: Equation, x: Tensor, kept: Tensor | None) -> tuple[Point, Tensor]:
-    """The equation at x and its Jacobian, the kept one if there is one."""
+def _found(here: _Here, done: bool, iterations: int) -> Found:
+    shape, healthy = here.x.shape[:-1], done and isfinite(here.merit + here.left)
+    merit, residual = here.x.new_full(shape, here.merit), here.x.new_full(shape, here.left)
+    flag = torch.full(shape, done, device=here.x.device)
+    return Found(here.x, here.point, merit, residual, flag, iterations, healthy)
+
+
+def _evaluate(equation: Equation, x: Tensor, kept: Tensor | None) -> _Here:
+    """The equation at x and Newton's step by its Jacobian, or by the kept one if there is one."""
     point = equation(x, kept is None)
-    if kept is not None:
-        return point, kept
-    assert point.J is not None
-    return point, point.J
+    J = point.J if kept is None else kept
+    assert J is not None
+    return _Here(x, point, J, *newton_step(J, point.F))
 
 
-def newton_step(J: Tensor, F: Tensor) -> _Move:
-    """−J⁻¹F, not finite where J is singular."""
+def newton_step(J: Tensor, F: Tensor) -> tuple[Tensor | float, float, float]:
+    """−J⁻¹F, not finite where J is singular, |J⁻¹F| and |F|."""
     n = F.shape[-1]
     if n == 1:
         f, j = F.item(), J.item()
         delta = -f / j if j else (-inf if f else nan)
-        return _Move(delta, abs(delta), abs(f))
+        return delta, abs(delta), abs(f)
     f = F.flatten().tolist()
     if n == 2:
         delta = _eliminate(*J.flatten().tolist(), *f)
-        return _Move(torch.tensor(delta, dtype=F.dtype, device=F.device).reshape(F.shape), norm(delta), norm(f))
+        return torch.tensor(delta, dtype=F.dtype, device=F.device).reshape(F.shape), norm(delta), norm(f)
     delta = -torch.linalg.solve_ex(J, F[..., None])[0][..., 0]
-    return _Move(delta, norm(delta.flatten().tolist()), norm(f))
+    return delta, norm(delta.flatten().tolist()), norm(f)
 
 
 def _eliminate(a: float, b: float, c: float, d: float, x: float, y: float) -> list[float]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models.drag import parse_drag
 from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
@@ -80,50 +80,48 @@ class ModelConfig:
         check_translations(self)
 
     def _check_sizes(self) -> None:
-        if self.level not in LEVELS:
-            raise InputError(f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}")
-        if self.activation not in ACTIVATIONS:
-            raise InputError(f"unknown activation '{self.activation}'; choose one of {', '.join(ACTIVATIONS)}")
-        if not self.baseline and not self.correction_width:
-            raise InputError("a model without a baseline needs a correction network; set correction_width > 0")
-        if not self.baseline and self.mass_width:
-            raise InputError("a model without a baseline has no mass; set mass_width=0")
-        for name in ("scale", "speed", "stiffness", "tilt"):
-            if len(getattr(self, name)) != len(self.angles):
-                given = getattr(self, name)
-                raise InputError(f"{name} needs one number a coordinate ({len(self.angles)}), got {given}")
-        if self.level == "full" and self.action_width < 1:
-            raise InputError(f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'")
+        n = len(self.angles)
+        activations = ", ".join(ACTIVATIONS)
+        refuse({
+            f"unknown level '{self.level}'; choose one of {', '.join(LEVELS)}": self.level not in LEVELS,
+            f"unknown activation '{self.activation}'; choose one of {activations}": self.activation not in ACTIVATIONS,
+            "a model without a baseline needs a correction network; set correction_width > 0":
+                not self.baseline and not self.correction_width,
+            "a model without a baseline has no mass; set mass_width=0": not self.baseline and self.mass_width,
+            **{f"{name} needs one number a coordinate ({n}), got {getattr(self, name)}": len(getattr(self, name)) != n
+               for name in ("scale", "speed", "stiffness", "tilt")},
+            f"the full level needs action_width >= 1, got {self.action_width}; or take level='affine'":
+                self.level == "full" and self.action_width < 1,
+        })  # fmt: skip
 
     def _check_forces(self) -> None:
-        if self.level != "forced" and (self.coulomb or self.inputs or self.input_map):
-            raise InputError(f"coulomb and inputs are forces; set level='forced', not '{self.level}'")
-        if self.sticking and not self.coulomb:
-            raise InputError("sticking is of dry friction; set coulomb=True")
-        if self.level != "forced" and self.coupled:
-            raise InputError(f"coupled is friction between joints; set level='forced', not '{self.level}'")
-        if self.level != "forced" and self.drag:
-            raise InputError(f"drag is a friction force; set level='forced', not '{self.level}'")
-        for text in self.drag:
+        forced, wanted = self.level == "forced", self.dof * self.inputs
+        instead = f"set level='forced', not '{self.level}'"
+        for text in self.drag if forced else ():
             parse_drag(text, self.angles)
-        if self.input_zero and not self.inputs:
-            raise InputError("input_zero is the zero of inputs; set inputs to their number")
-        if self.inputs < 0:
-            raise InputError(f"inputs counts the motors and cannot be negative, got {self.inputs}")
-        if self.input_map and len(self.input_map) != self.dof * self.inputs:
-            wanted = self.dof * self.inputs
-            raise InputError(f"input_map needs n · inputs = {wanted} numbers, row by row; got {len(self.input_map)}")
+        refuse({
+            f"coulomb and inputs are forces; {instead}":
+                not forced and (self.coulomb or self.inputs or self.input_map),
+            "sticking is of dry friction; set coulomb=True": self.sticking and not self.coulomb,
+            f"coupled is friction between joints; {instead}": self.coupled and not forced,
+            f"drag is a friction force; {instead}": self.drag and not forced,
+            "input_zero is the zero of inputs; set inputs to their number": self.input_zero and not self.inputs,
+            f"inputs counts the motors and cannot be negative, got {self.inputs}": self.inputs < 0,
+            f"input_map needs n · inputs = {wanted} numbers, row by row; got {len(self.input_map)}":
+                self.input_map and len(self.input_map) != wanted,
+        })  # fmt: skip
 
     def _check_structure(self) -> None:
-        if self.order not in (2, 4):
-            raise InputError(f"order must be 2 or 4, got {self.order}")
         networks = self.potential_width or self.mass_width or self.correction_width or not self.baseline
-        if self.order == 4 and (networks or self.level in ("affine", "full")):
-            raise InputError("order 4 is for features, without networks, at the levels conservative, linear and forced")
-        if not self.baseline and (self.features or self.known or self.alike or self.diagonal):
-            raise InputError("a model without a baseline has no features; leave features, known, alike, diagonal out")
-        if self.diagonal and self.mass_width:
-            raise InputError("a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False")
+        refuse({
+            f"order must be 2 or 4, got {self.order}": self.order not in (2, 4),
+            "order 4 is for features, without networks, at the levels conservative, linear and forced":
+                self.order == 4 and (networks or self.level in ("affine", "full")),
+            "a model without a baseline has no features; leave features, known, alike, diagonal out":
+                not self.baseline and (self.features or self.known or self.alike or self.diagonal),
+            "a mass that depends on position is not diagonal; set mass_width=0 or diagonal=False":
+                self.diagonal and self.mass_width,
+        })  # fmt: skip
 
     def _check_features(self) -> None:
         products = {text: parse(text, self.angles) for text in expand((*self.features, *self.known), self.angles)}

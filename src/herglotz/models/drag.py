@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Forces
+from herglotz.models.term import with_force
 
 HIGHEST = 9  # power of a speed or a position
 _TEXT = re.compile(
@@ -47,18 +48,18 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     match, n = _TEXT.fullmatch(" ".join(text.split())), len(angles)
     if match is None:
         raise InputError(f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1' or 'load 1'")
-    on = int(match["v"] or match["load"]) - 1
-    at, a = int(match["q"] or on + 1) - 1, int(match["a"] or 1) if match["q"] else 0
-    c = 0 if match["load"] else int(match["c"] or 1)
-    if not (0 <= on < n and 0 <= at < n):
-        raise InputError(f"drag '{text}': the coordinates are numbered 1 … {n}")
-    if match["w"] and int(match["w"]) - 1 != on:
-        raise InputError(f"drag '{text}': |v| and v are the speed of one joint; write '|v{on + 1}| v{on + 1}'")
-    if a and angles[at]:
-        raise InputError(f"drag '{text}': a power of an angle is not periodic; leave q{at + 1} out")
-    if match["v"] and not (0 <= a <= HIGHEST and 1 <= c <= HIGHEST):
-        raise InputError(f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}")
-    return DragFeature(on, at, a, 1 if match["w"] else 0, c)
+    number = {name: int(digits) for name, digits in match.groupdict().items() if digits}
+    on = number["v" if "v" in number else "load"]
+    at, c = number.get("q", on), 0 if "load" in number else number.get("c", 1)
+    a = number.get("a", 1) if "q" in number else 0
+    powers = "v" not in number or (a <= HIGHEST and 1 <= c <= HIGHEST)
+    refuse({
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not (1 <= on <= n and 1 <= at <= n),
+        f"drag '{text}': |v| and v are the speed of one joint; write '|v{on}| v{on}'": number.get("w", on) != on,
+        f"drag '{text}': a power of an angle is not periodic; leave q{at} out": a and any(angles[at - 1 : at]),
+        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not powers,
+    })  # fmt: skip
+    return DragFeature(on - 1, at - 1, a, int("w" in number), c)
 
 
 class Drag(nn.Module):
@@ -95,22 +96,8 @@ class Drag(nn.Module):
     def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
         """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them."""
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v))
-        f = -value @ self.on
-        before, after = (c * h / 2)[..., None], (h / 2)[..., None]
-        minus, plus = own.minus + before * f, own.plus + after * f
-        if own.minus_2 is None:
-            return replace(own, minus=minus, plus=plus)
-        assert own.minus_1 is not None
-        assert own.plus_1 is not None
-        assert own.plus_2 is not None
-        along = torch.diag_embed(-(by_v @ self.on)) / h[..., None, None]  # ∂f/∂v · ∂v/∂q1
-        across = -(self.on.T @ (by_q[..., None] * self.at)) / 2  # ∂f/∂q̄ · ∂q̄/∂q1
-        one, other = before[..., None], after[..., None]
-        return replace(
-            own, minus=minus, plus=plus, minus_1=own.minus_1 + one * (across - along),
-            minus_2=own.minus_2 + one * (across + along), plus_1=own.plus_1 + other * (across - along),
-            plus_2=own.plus_2 + other * (across + along),
-        )  # fmt: skip
+        slope, by_position = -torch.diag_embed(by_v @ self.on), -(self.on.T @ (by_q[..., None] * self.at))
+        return with_force(own, -value @ self.on, slope, c, h, by_position)
 
 
 def _power(x: Tensor, k: int) -> Tensor:

@@ -98,19 +98,22 @@ class _Reader:
             if numbers > 1:
                 raise self._error(f"'{self.text[begin:].strip()}' has two numbers in one product; write their product")
             count += 1
-        body = self.text[begin : self._next()[2]].strip()
         if len(functions) > 1:
             raise self._error(
-                f"'{body}' has {len(functions)} functions of the position, and a product takes one; "
-                "q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
+                f"'{self.text[begin : self._next()[2]].strip()}' has {len(functions)} functions of the position, and a "
+                "product takes one; q1 q2 is 0.25 (q1 + q2)^2 - 0.25 (q1 - q2)^2"
             )
-        function, form, power = functions[0] if functions else ("power", (0.0,) * self.n, 0)
-        used = [True] * self.n if function == "radius" else form
-        if power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
+        return self._checked(Product(factor, *(functions or [("power", (0.0,) * self.n, 0)])[0], tuple(velocities)))
+
+    def _checked(self, product: Product) -> Product:
+        """The product, if the coordinates allow it."""
+        radial = product.function == "radius"
+        used = [True] * self.n if radial else product.form
+        if product.power and any(w and angle for w, angle in zip(used, self.angles, strict=True)):
             raise self._error("a power of an angle is not periodic; use cos or sin")
-        if function == "radius" and velocities:
+        if radial and product.velocities:
             raise self._error("powers of r join the potential; write the product without velocities")
-        return Product(factor, function, form, power, tuple(velocities))
+        return product
 
     def _function(self) -> tuple[str, tuple[float, ...], int]:
         """cos, sin, or a power of a form, a coordinate or r."""

@@ -7,7 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.feature_potential import Combination
+from herglotz.models.config import ModelConfig
+from herglotz.models.feature_potential import Combination, sorted_features
 from herglotz.models.features import Feature
 from herglotz.models.jet import Jet
 from herglotz.models.mass import PositionKinetic
@@ -85,6 +86,14 @@ class FeatureKinetic(nn.Module):
         x = x.linear(c.form)
         f0, f1 = c.ridge(x.value, k), c.ridge(x.value, k + 1)
         return x.map(f0, f1, c.ridge(x.value, k + 2) if x.order == 2 else None) * c.weights()
+
+
+def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:
+    """Return the K of a model: a mass, constant or of the position, and the named features with velocities."""
+    n = config.dof
+    mass = PositionKinetic(config, generator) if config.mass_width else Kinetic(n, config.alike, config.diagonal)
+    learned, known = (sorted_features(names, config.angles)[1] for names in (config.features, config.known))
+    return FeatureKinetic(mass, learned, known, n) if learned or known else mass
 
 
 def _sum(f: Jet, which: list[int]) -> Jet:

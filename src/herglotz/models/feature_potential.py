@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor, nn
 
+from herglotz.models.config import ModelConfig
 from herglotz.models.features import Feature, Product, expand, parse
 from herglotz.models.jet import Jet, pairs
 
@@ -138,6 +139,20 @@ def baseline_features(
         names += [f"cos(q{i})", f"sin(q{i})"] if angle else [f"q{i}^2", f"q{i}"]
         values += [-k if angle else k / 2, b]
     return names, values
+
+
+def named_potential(config: ModelConfig) -> FeaturePotential | None:
+    """Return the features of the position that a model names, at order 4 its baseline's as well; None without any."""
+    own, values = [], []
+    if config.order == 4 and not config.alike:
+        own, values = baseline_features(config.angles, config.stiffness, config.tilt)
+    learned = sorted_features((*own, *(x for x in config.features if x not in own)), config.angles)[0]
+    known = sorted_features(config.known, config.angles)[0]
+    if not learned and not known:
+        return None
+    potential = FeaturePotential(learned, known, config.dof)
+    potential.sum.coefficient.data[: len(values)] = torch.tensor(values, dtype=torch.float64)
+    return potential
 
 
 def sorted_features(names: Sequence[str], angles: Sequence[bool]) -> tuple[list[Feature], list[Feature]]:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from inspect import signature
-from itertools import combinations, product
+from itertools import combinations, combinations_with_replacement, product
 
 from herglotz.errors import InputError
 from herglotz.models.feature_grammar import Feature, Product, parse
@@ -94,15 +94,19 @@ def lengths(angles: Sequence[bool]) -> list[str]:
 
 def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
     """The waves of k·q with |k_i| ≤ highest and Σ|k_i| ≤ total, but those of V that the baseline has."""
-    which = [i + 1 for i, angle in enumerate(angles) if angle]
-    forms = []
-    for k in product(range(-highest, highest + 1), repeat=len(which)):
-        if 0 < sum(map(abs, k)) <= total and next(x for x in k if x) > 0:
-            forms.append(" + ".join(f"{x}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- "))
+    which = [i for i, angle in enumerate(angles, 1) if angle]
+    numbers = product(range(-highest, highest + 1), repeat=len(which))
+    forms = [_form(k, which) for k in numbers if 0 < sum(map(abs, k)) <= total and k > (0,) * len(k)]
+    own = [f"1q{i}" for i in which]  # the baseline's
+    pairs = [f"v{i} v{j}" for i, j in combinations_with_replacement(range(1, len(angles) + 1), 2)]
     waves = [f"{f}({form})" for form in forms for f in ("cos", "sin")]
-    own = {f"{f}(1q{i})" for i in which for f in ("cos", "sin")}  # the baseline's
-    pairs = [f"v{i + 1} v{j + 1}" for i in range(len(angles)) for j in range(i, len(angles))]
-    return [w for w in waves if w not in own] + [f"{w} {pair}" for pair in pairs for w in waves]
+    alone = [f"{f}({form})" for form in forms if form not in own for f in ("cos", "sin")]
+    return alone + [f"{wave} {pair}" for pair in pairs for wave in waves]
+
+
+def _form(k: Sequence[int], which: Sequence[int]) -> str:
+    """k·q as text, of the coordinates `which`."""
+    return " + ".join(f"{x}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- ")
 
 
 LIBRARIES: dict[str, Callable[..., list[str]]] = {

@@ -15,8 +15,7 @@ from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.coupling import CoupledFriction
 from herglotz.models.drag import Drag, parse_drag
-from herglotz.models.feature_kinetic import FeatureKinetic
-from herglotz.models.feature_potential import FeaturePotential, baseline_features, sorted_features
+from herglotz.models.feature_kinetic import kinetic_term
 from herglotz.models.friction import Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
@@ -24,7 +23,6 @@ from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
-from herglotz.models.translations import blind, unmoved
 
 
 @dataclass(frozen=True)
@@ -61,46 +59,18 @@ class ContactLagrangian(nn.Module):
 
     def __init__(self, config: ModelConfig):
         super().__init__()
-        self.config = config
-        make = torch.Generator().manual_seed(config.seed)
-        c = config
-        sizes, act = (c.angles, c.scale, c.speed), c.activation
-        own, values = baseline_features(c.angles, c.stiffness, c.tilt) if c.order == 4 and not c.alike else ([], [])
-        still, moving = sorted_features((*own, *(x for x in c.features if x not in own)), c.angles)
-        known_still, known_moving = sorted_features(c.known, c.angles)
-        fixed, zero = c.alike or c.order == 4 or bool(c.translations), (0.0,) * c.dof
-        stiffness, tilt = (zero, zero) if c.order == 4 else (unmoved(c, c.stiffness), unmoved(c, c.tilt))
-        self.kinetic: Kinetic | PositionKinetic | FeatureKinetic = Kinetic(c.dof, c.alike, c.diagonal)
-        self.potential = Potential(
-            *sizes, stiffness, tilt, c.potential_width, c.potential_depth, make, act,
-            FeaturePotential(still, known_still, c.dof) if still or known_still else None, fixed,
-        )  # fmt: skip
-        if values and self.potential.features is not None:
-            self.potential.features.sum.coefficient.data[: len(values)] = torch.tensor(values, dtype=torch.float64)
-        self.damping: LinearDamping | AffineDamping | None = None
-        if c.level in ("linear", "forced"):
-            self.damping = LinearDamping(c.rate)
-        elif c.level in ("affine", "full"):  # the full level's units read q̄ and v: no second network for them
-            width = c.damping_width if c.level == "affine" else 0
-            self.damping = AffineDamping(c.rate, *sizes, width, 1, make, act)
-        self.correction: Correction | None = None
-        if c.correction_width:
-            self.correction = Correction(*sizes, c.correction_width, c.correction_depth, make, not c.baseline, act)
-        if c.mass_width:
-            self.kinetic = PositionKinetic(c, make)
-        if moving or known_moving:
-            self.kinetic = FeatureKinetic(self.kinetic, moving, known_moving, c.dof)
+        self.config = c = config
+        make = torch.Generator().manual_seed(c.seed)
+        potential, damping = Potential(c, make), _damping(c, make)
+        correction = Correction(c, make) if c.correction_width else None
+        self.kinetic = kinetic_term(c, make)  # drawn after the others, but first of the parameters
+        self.potential, self.damping, self.correction = potential, damping, correction
         self.action = ActionFlow(c, make) if c.level == "full" else None
         self.friction = Friction(c) if c.level == "forced" else None
         self.coupling = CoupledFriction(c) if c.coupled and c.dof > 1 else None
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
         self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
         self.potential.more = tuple(self.named_terms)
-        if self.potential.network is not None:
-            self.potential.network.blind = blind(c, 0)
-        for term in (self.damping, self.correction):
-            if isinstance(term, AffineDamping | Correction) and term.network is not None:
-                term.network.blind = blind(c, c.dof)
 
     @property
     def named_terms(self) -> list[Term]:
@@ -156,8 +126,10 @@ class ContactLagrangian(nn.Module):
 
     def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Terms:
         """Evaluate every term once."""
-        n = q0.shape[-1]
-        phase = Phase(q0, q1, h, order, self.config, delta)
+        return self._terms(Phase(q0, q1, h, order, self.config, delta))
+
+    def _terms(self, phase: Phase) -> Terms:
+        q0, q1, h, order, n = phase.q0, phase.q1, phase.h, phase.order, phase.q0.shape[-1]
         g = self.damping
         if g is not None:
             g = g(phase) if isinstance(g, AffineDamping) else g(q0, q1, h, order)
@@ -167,7 +139,7 @@ class ContactLagrangian(nn.Module):
             return Terms(g, None, None, None, N, b)
         V = self.potential(torch.stack([q0, q1]), order)  # both ends in one network call
         m = self.kinetic
-        K = m(q0, q1, h, order, delta) if isinstance(m, Kinetic) else m(phase)
+        K = m(q0, q1, h, order, phase.delta) if isinstance(m, Kinetic) else m(phase)
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -184,14 +156,14 @@ class ContactLagrangian(nn.Module):
     ) -> Partials:
         """Value and derivatives in closed form; see `herglotz.mechanics.partials`."""
         q0, q1, s0 = torch.broadcast_tensors(q0, q1, s0[..., None])
-        return self._evaluate(q0, q1, s0[..., 0], h, order, u, None)
+        return self._evaluate(self._phase(q0, q1, s0[..., 0], h, order), s0[..., 0], u)
 
     def partials_increment(
         self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor | float, order: int = 1, u: Tensor | None = None
     ) -> Partials:
         """`partials` at (q0, q0 + Δ, s0), without the rounding of q1 − q0 when the step is small."""
         q0, delta, s0 = torch.broadcast_tensors(q0, delta, s0[..., None])
-        return self._evaluate(q0, q0 + delta, s0[..., 0], h, order, u, delta)
+        return self._evaluate(self._phase(q0, q0 + delta, s0[..., 0], h, order, delta), s0[..., 0], u)
 
     def forces(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, u: Tensor | None = None
@@ -199,8 +171,7 @@ class ContactLagrangian(nn.Module):
         """F⁻ and F⁺, each (..., n), in units of momentum; None at every level but the forced one."""
         if self.friction is None:
             return None
-        h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
-        force = self._forces(q0, q1, h, 1, u, None)
+        force = self._forces(self._phase(q0, q1, s0, h, 1), u)
         assert force is not None
         return force.minus, force.plus
 
@@ -225,20 +196,16 @@ class ContactLagrangian(nn.Module):
             return self.partials(q0, q1, s0, h, 1).L
         return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
 
-    def _evaluate(
-        self,
-        q0: Tensor,
-        q1: Tensor,
-        s0: Tensor,
-        h: Tensor | float,
-        order: int,
-        u: Tensor | None,
-        delta: Tensor | None,
-    ) -> Partials:
+    def _phase(
+        self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, delta: Tensor | None = None
+    ) -> Phase:
         h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device).expand(s0.shape)
-        t = self.terms(q0, q1, h, order, delta)
+        return Phase(q0, q1, h, order, self.config, delta)
+
+    def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
+        t, h = self._terms(phase), phase.h
         if self.action is not None:
-            return action_partials(self._through_action(self.action, t, s0, h, order))
+            return action_partials(self._through_action(self.action, t, s0, h, phase.order))
         c = None if t.g is None else t.g.exp()
         if t.K is None or t.V0 is None or t.V1 is None:
             assert t.N is not None  # checked by ModelConfig
@@ -247,7 +214,7 @@ class ContactLagrangian(nn.Module):
             V = h / 2 * (t.V0 + t.V1)
             L = t.K - V if c is None or t.g is None else (c - 1.0) * (s0 - h / 2 * t.V0) + (t.g / 2).exp() * t.K - V
             L = L if t.N is None else L + t.N
-        return affine_partials(L, t.g, c, s0, self._forces(q0, q1, h, order, u, delta))
+        return affine_partials(L, t.g, c, s0, self._forces(phase, u))
 
     def _through_action(self, action: ActionFlow, t: Terms, s0: Tensor, h: Tensor, order: int) -> Jet:
         """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
@@ -275,18 +242,25 @@ class ContactLagrangian(nn.Module):
         rate = phase.q0.new_zeros(()) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
-    def _forces(
-        self, q0: Tensor, q1: Tensor, h: Tensor, order: int, u: Tensor | None, delta: Tensor | None
-    ) -> Forces | None:
+    def _forces(self, phase: Phase, u: Tensor | None) -> Forces | None:
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
+        q0, q1, h, order, delta = phase.q0, phase.q1, phase.h, phase.order, phase.delta
         v = (q1 - q0 if delta is None else delta) / h[..., None]
         c = self.damping(q0, q1, h, order).exp()
         forces = self.friction(v, c, h, order, u)
         for term in self.forces_between:
-            forces = with_force(forces, term, v, c, h)
+            forces = with_force(forces, *term.force(v), c, h)
         return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
+
+
+def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:
+    """The exponent g of c = e^g that a level has; None where c = 1."""
+    if config.level == "conservative":
+        return None
+    linear = config.level in ("linear", "forced")
+    return LinearDamping(config.rate) if linear else AffineDamping(config, generator)
 
 
 @dataclass(frozen=True)

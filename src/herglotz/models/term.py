@@ -70,19 +70,22 @@ def check_terms(config: Any) -> None:
         raise InputError("terms need order 2 and a baseline; set order=2 and baseline=True, or leave terms out")
 
 
-def with_force(own: Forces, term: Term, v: Tensor, c: Tensor, h: Tensor) -> Forces:
-    """Return `own` plus a term's force at the velocity v (..., n), with derivatives if `own` has them."""
-    f, slope = term.force(v)
+def with_force(own: Forces, f: Tensor, slope: Tensor, c: Tensor, h: Tensor, by_q: Tensor | float = 0.0) -> Forces:
+    """Return `own` plus a force f (..., n) in halves, F⁻ = c (h/2) f and F⁺ = (h/2) f, with derivatives if it has any.
+
+    `slope` is ∂f/∂v at v = Δ/h, and `by_q` ∂f/∂q̄ at the midpoint, (..., n, n) each.
+    """
     minus, plus = own.minus + (c * h / 2)[..., None] * f, own.plus + (h / 2)[..., None] * f
     if own.minus_2 is None:
         return replace(own, minus=minus, plus=plus)
     assert own.minus_1 is not None
     assert own.plus_1 is not None
     assert own.plus_2 is not None
-    before, after = (c / 2)[..., None, None] * slope, slope / 2
+    along, across, c_ = slope / 2, by_q * (h / 4)[..., None, None], c[..., None, None]
     return replace(
-        own, minus=minus, plus=plus, minus_1=own.minus_1 - before, minus_2=own.minus_2 + before,
-        plus_1=own.plus_1 - after, plus_2=own.plus_2 + after,
+        own, minus=minus, plus=plus, minus_1=own.minus_1 + c_ * (across - along),
+        minus_2=own.minus_2 + c_ * (across + along), plus_1=own.plus_1 + (across - along),
+        plus_2=own.plus_2 + (across + along),
     )  # fmt: skip
 
 

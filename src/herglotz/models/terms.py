@@ -11,11 +11,13 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from herglotz.models.feature_potential import FeaturePotential
+from herglotz.models.config import ModelConfig
+from herglotz.models.feature_potential import named_potential
 from herglotz.models.jet import Jet, coordinates, pairs
 from herglotz.models.network import Network, feature_count, position_features
 from herglotz.models.phase import Phase
 from herglotz.models.term import Term
+from herglotz.models.translations import blind, unmoved
 
 
 class Kinetic(nn.Module):
@@ -72,37 +74,28 @@ class Potential(nn.Module):
 
     The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
     network is multiplied by the energy scale Σ speed², so that its weights are of order one. `features` joins V as it
-    is; `alike` fixes k and b, one set for all coordinates being a feature's business.
+    is; The model's `alike`, `order` 4 and `translations` fix k and b:
+    features say there what V is.
     """
 
-    def __init__(
-        self,
-        angles: tuple[bool, ...],
-        scale: tuple[float, ...],
-        speed: tuple[float, ...],
-        stiffness: tuple[float, ...],
-        tilt: tuple[float, ...],
-        width: int,
-        depth: int,
-        generator: torch.Generator,
-        activation: str = "tanh",
-        features: FeaturePotential | None = None,
-        alike: bool = False,
-    ):
+    def __init__(self, config: ModelConfig, generator: torch.Generator):
         super().__init__()
-        self.angles = angles
-        self.scale = scale
-        self.energy = sum(v * v for v in speed)
-        for name, numbers in (("stiffness", stiffness), ("tilt", tilt)):
-            value = torch.tensor(numbers, dtype=torch.float64)
-            setattr(self, name, nn.Parameter(value)) if not alike else self.register_buffer(name, value)
+        self.angles, self.scale = config.angles, config.scale
+        self.energy = sum(v * v for v in config.speed)
+        fixed = config.alike or config.order == 4 or bool(config.translations)
+        for name, numbers in (("stiffness", config.stiffness), ("tilt", config.tilt)):
+            start = (0.0,) * config.dof if config.order == 4 else unmoved(config, numbers)
+            value = torch.tensor(start, dtype=torch.float64)
+            setattr(self, name, nn.Parameter(value)) if not fixed else self.register_buffer(name, value)
         self.stiffness: Tensor
         self.tilt: Tensor
-        self.features = features
+        self.features = named_potential(config)
         self.more: tuple[Term, ...] = ()  # the model's terms by name, which it holds itself
         self.network: Network | None = None
-        if width:
-            self.network = Network(feature_count(angles), width, depth, 1.0, generator, activation=activation)
+        if config.potential_width:
+            count, width, depth = feature_count(config.angles), config.potential_width, config.potential_depth
+            self.network = Network(count, width, depth, 1.0, generator, activation=config.activation)
+            self.network.blind = blind(config, 0)
 
     def baseline(self, q: Jet) -> Jet:
         """The part of V that no network is needed for."""
@@ -152,25 +145,14 @@ class AffineDamping(nn.Module):
 
     constant = False
 
-    def __init__(
-        self,
-        rate: float,
-        angles: tuple[bool, ...],
-        scale: tuple[float, ...],
-        speed: tuple[float, ...],
-        width: int,
-        depth: int,
-        generator: torch.Generator,
-        activation: str = "tanh",
-    ):
+    def __init__(self, config: ModelConfig, generator: torch.Generator):
         super().__init__()
-        self.angles, self.scale, self.speed = angles, scale, speed
-        self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
-        self.drag = nn.Parameter(torch.zeros(len(angles), dtype=torch.float64))
+        self.sizes = config
+        self.rate = nn.Parameter(torch.tensor(config.rate, dtype=torch.float64))
+        self.drag = nn.Parameter(torch.zeros(config.dof, dtype=torch.float64))
         self.network: Network | None = None
-        if width:
-            inputs = feature_count(angles) + len(angles)
-            self.network = Network(inputs, width, depth, 0.3, generator, activation=activation)
+        if config.damping_width and config.level == "affine":  # the full level's units read q̄ and v themselves
+            self.network = _of_position_and_velocity(config, config.damping_width, 1, 0.3, generator)
 
     def forward(self, phase: Phase) -> Jet:
         """The exponent g as a jet over (q0, q1)."""
@@ -183,7 +165,7 @@ class AffineDamping(nn.Module):
         """The network's rate G(q, v), shape (...), or None without a network."""
         if self.network is None:
             return None
-        return self.network(Phase(q - v / 2, q + v / 2, q.new_ones(()), 1, self).features).value
+        return self.network(Phase(q - v / 2, q + v / 2, q.new_ones(()), 1, self.sizes).features).value
 
 
 class Correction(nn.Module):
@@ -192,27 +174,26 @@ class Correction(nn.Module):
     E = Σ speed² is a fixed energy scale. A network of several layers starts smooth (gain 0.1): where the data leave a
     hole, near a separatrix say, it then fills it in smoothly, which lowers the worst rollout errors by one to two
     orders. A single layer (gain 0.5) learns faster, and is for data without holes.
-    `alone` makes it the whole of A, a plain network without a baseline: the model that collapses (trap 2).
+    Without a baseline it is the whole of A, a plain network without a baseline: the model that collapses (trap 2).
     """
 
-    def __init__(
-        self,
-        angles: tuple[bool, ...],
-        scale: tuple[float, ...],
-        speed: tuple[float, ...],
-        width: int,
-        depth: int,
-        generator: torch.Generator,
-        alone: bool = False,
-        activation: str = "tanh",
-    ):
+    def __init__(self, config: ModelConfig, generator: torch.Generator):
         super().__init__()
-        self.angles, self.scale, self.speed = angles, scale, speed
-        self.energy = sum(v * v for v in speed)
-        inputs, gain = feature_count(angles) + len(angles), 0.5 if depth == 1 else 0.1
-        gain = 1.0 if alone else gain
-        self.network = Network(inputs, width, depth, gain, generator, zero=not alone, activation=activation)
+        self.energy = sum(v * v for v in config.speed)
+        width, depth, alone = config.correction_width, config.correction_depth, not config.baseline
+        gain = 1.0 if alone else 0.5 if depth == 1 else 0.1
+        self.network = _of_position_and_velocity(config, width, depth, gain, generator, zero=not alone)
 
     def forward(self, phase: Phase) -> Jet:
         """N as a jet over (q0, q1)."""
         return self.network(phase.features) * (phase.h * self.energy)
+
+
+def _of_position_and_velocity(
+    config: ModelConfig, width: int, depth: int, gain: float, generator: torch.Generator, zero: bool = True
+) -> Network:
+    """A scalar network of the features of q̄ and v, which does not see the model's translations."""
+    inputs = feature_count(config.angles) + config.dof
+    network = Network(inputs, width, depth, gain, generator, zero=zero, activation=config.activation)
+    network.blind = blind(config, config.dof)
+    return network

@@ -32,10 +32,7 @@ FIGURES = {
     "plan": plot_plan,
 }
 # Of S^k, which a model with forces does not have: identities that hold to rounding.
-IDENTITIES = {
-    "momentum_vs_dS": plot_momentum_vs_generating_function,
-    "hj_residual": plot_hamilton_jacobi_residual,
-}
+IDENTITIES = {"momentum_vs_dS": plot_momentum_vs_generating_function, "hj_residual": plot_hamilton_jacobi_residual}
 
 
 def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None, form: str = "png") -> list[Path]:

@@ -8,18 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import (
-    ACCENT,
-    INK,
-    MODEL,
-    MUTED,
-    UNSEEN,
-    captions,
-    label,
-    new_figure,
-    number,
-    styled,
-)
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, number, styled
 
 FLOOR = 1e-18  # where a difference of exactly 0 is drawn
 

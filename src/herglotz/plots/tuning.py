@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from itertools import product
 from typing import TYPE_CHECKING
 
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, one_unit, styled, with_unit
@@ -18,6 +20,7 @@ KINDS = (
     ("c", "float64", "s", MODEL, "C, float64"),
     ("c", "float32", "^", ACCENT, "C, float32"),
 )
+FORMS = (("own model", "none"), ("distilled", "full"), ("kicks", "left"))  # and how their marks are filled
 
 
 def _form(candidate: Candidate) -> str:
@@ -39,26 +42,30 @@ def plot_tuning(tuning: Tuning) -> Figure:
         ax = figure.subplots()
         front = tuning.front
         ax.step([c.us for c in front], [max(c.bound, FLOOR) for c in front], where="post", color=INK, lw=0.9)
-        for artefact, dtype, mark, color, name in KINDS:
-            mine = [c for c in good if (c.setting.artefact, c.setting.dtype) == (artefact, dtype)]
-            for form, fill in (("own model", "none"), ("distilled", "full"), ("kicks", "left")):
-                some = [c for c in mine if _form(c) == form]
-                if some:
-                    x, y = [c.us for c in some], [max(c.bound, FLOOR) for c in some]
-                    text = f"{name}, {form}"
-                    ax.plot(x, y, mark, color=color, fillstyle=fill, ms=6, ls="", label=text)
+        for (artefact, dtype, mark, color, name), (form, fill) in product(KINDS, FORMS):
+            kind = (artefact, dtype, form)
+            some = [c for c in good if (c.setting.artefact, c.setting.dtype, _form(c)) == kind]
+            x, y = [c.us for c in some], [max(c.bound, FLOOR) for c in some]
+            text = f"{name}, {form}" if some else None
+            ax.plot(x, y, mark, color=color, fillstyle=fill, ms=6, ls="", label=text)
         ax.plot([chosen.us], [max(chosen.bound, FLOOR)], "o", ms=14, mfc="none", mec=UNSEEN, mew=2)
         label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, -18))
-        if "max_error" in tuning.asked:
-            ax.axhline(tuning.asked["max_error"], color=UNSEEN, lw=0.9, ls="--")
-        else:
-            ax.axvline(tuning.asked["budget_us"], color=UNSEEN, lw=0.9, ls="--")
-        known = tuning.model_error["extrapolation_rms"] or tuning.model_error["train_rms"]
-        if known:
-            ax.axhline(known, color=MUTED, lw=0.9, ls=":")
-            label(ax, max(c.us for c in good), known, "RMS of the model against its data", MUTED, ha="right")
+        _draw_limits(ax, tuning)
         ax.set(xscale="log", yscale="log", xlabel=f"cost (µs per {'unit of time' if unit == '1' else unit})")
         ax.set_ylabel(with_unit(f"error that {share} keep", one_unit(tuning.run.data.units)))
         ax.grid(color="#EEEEEE", lw=0.8)
         ax.legend(fontsize=8, loc="best")
     return figure
+
+
+def _draw_limits(ax: Axes, tuning: Tuning) -> None:
+    """The error or the cost that was asked for, and the model's own error against its data."""
+    if "max_error" in tuning.asked:
+        ax.axhline(tuning.asked["max_error"], color=UNSEEN, lw=0.9, ls="--")
+    else:
+        ax.axvline(tuning.asked["budget_us"], color=UNSEEN, lw=0.9, ls="--")
+    known = tuning.model_error["extrapolation_rms"] or tuning.model_error["train_rms"]
+    if known:
+        ax.axhline(known, color=MUTED, lw=0.9, ls=":")
+        right = max(c.us for c in tuning.candidates if math.isfinite(c.bound))
+        label(ax, right, known, "RMS of the model against its data", MUTED, ha="right")

@@ -40,13 +40,11 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
     def second(q: Tensor) -> Tensor:
         return m * length * torch.cos(q[..., 1])
 
-    def potential(q: Tensor) -> Tensor:
-        return 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2  # 1 − cos θ without its cancellation
-
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
         vx, vt = v.unbind(-1)
         kinetic = 0.5 * first * vx**2 + second(q) * vx * vt + 0.5 * third * vt**2
-        return kinetic - potential(q) - gamma * s
+        potential = 2.0 * m * g * length * torch.sin(0.5 * q[..., 1]) ** 2  # 1 − cos θ without its cancellation
+        return kinetic - potential - gamma * s
 
     def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         (vx, vt), between = v.unbind(-1), second(q)

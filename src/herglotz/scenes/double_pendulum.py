@@ -29,12 +29,10 @@ def double_pendulum(g: float = 9.81, gamma: float = 0.1) -> Scene:
         drop = 2.0 * torch.sin(0.5 * q) ** 2  # 1 − cos q, without its cancellation
         return g * (2.0 * drop[..., 0] + drop[..., 1])
 
-    def kinetic(q: Tensor, v: Tensor) -> Tensor:
-        v1, v2 = v.unbind(-1)
-        return v1**2 + 0.5 * v2**2 + v1 * v2 * torch.cos(q[..., 0] - q[..., 1])
-
     def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return kinetic(q, v) - potential(q) - gamma * s
+        v1, v2 = v.unbind(-1)
+        kinetic = v1**2 + 0.5 * v2**2 + v1 * v2 * torch.cos(q[..., 0] - q[..., 1])
+        return kinetic - potential(q) - gamma * s
 
     def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
         (v1, v2), C = v.unbind(-1), torch.cos(q[..., 0] - q[..., 1])

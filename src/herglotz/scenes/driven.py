@@ -45,6 +45,28 @@ class DrivenRule:
         return self.rule(u[..., 0])
 
 
+def _rules(
+    system_at: Callable[[Tensor | float], Natural], amplitude: float, external: External | None
+) -> dict[str, DiscreteLagrangian]:
+    """The rules of the system at each input, with the force that no L has."""
+
+    def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
+        return rule if external is None else ForcedRule(rule, external)
+
+    def composed(u: Tensor | float) -> DiscreteLagrangian:
+        system = system_at(u)
+        return forced(strang(system.potential, system.m, system.gamma))
+
+    rules: dict[str, DiscreteLagrangian] = {}
+    for name, rule in RULES.items():
+        if name.startswith("lobatto"):  # evaluates L at several nodes at once: no broadcast of u
+            rules[name] = forced(rule(system_at(amplitude).lagrangian))
+        else:
+            rules[name] = DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
+    rules["strang"] = DrivenRule(composed, amplitude)
+    return rules
+
+
 def driven_scene(
     potential: Callable[[Tensor], Tensor],
     slope: Callable[[Tensor], Tensor],
@@ -88,16 +110,7 @@ def driven_scene(
     def drive(t: Tensor) -> Tensor:
         return amplitude * torch.cos(frequency * t)[..., None]
 
-    def forced(rule: DiscreteLagrangian) -> DiscreteLagrangian:
-        return rule if external is None else ForcedRule(rule, external)
-
-    rules: dict[str, DiscreteLagrangian] = {}
-    for name, rule in RULES.items():
-        if name.startswith("lobatto"):  # evaluates L at several nodes at once: no broadcast of u
-            rules[name] = forced(rule(system_at(amplitude).lagrangian))
-        else:
-            rules[name] = DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
-    rules["strang"] = DrivenRule(lambda u: forced(strang(potential_at(u), m, gamma)), amplitude)
+    rules = _rules(system_at, amplitude, external)
 
     def scene_at(u: Tensor | float) -> Scene:
         made = natural_scene(

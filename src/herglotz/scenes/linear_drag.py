@@ -49,6 +49,27 @@ class ExactLinearDrag:
         block, zero = torch.diag_embed(k.expand_as(D2)), torch.zeros_like(D2)
         return Partials(*first, block, -block, block, D13=zero, D23=zero, D33=torch.zeros_like(L))
 
+    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""
+        m, gamma = self.m, self.gamma
+        h = as_step(h, q)
+        span, E = h * expm1w(-gamma * h), torch.exp(-gamma * h)
+        return q + p / m * span[..., None], p * E[..., None], E * (s + (p * p).sum(-1) / (2 * m) * span)
+
+    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
+        """H⁺ = p1·q0 + |p1|² hφ(γh)/2m + (1−E)s0."""
+        m, gamma = self.m, self.gamma
+        h = as_step(h, q0)
+        kinetic = (p1 * p1).sum(-1) * h * expm1w(gamma * h) / (2 * m)
+        return (p1 * q0).sum(-1) + kinetic - torch.expm1(-gamma * h) * s0
+
+    def H_minus(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = −p0·q1 + |p0|² hφ(−γh)/2m + (1/E − 1)s1."""
+        m, gamma = self.m, self.gamma
+        h = as_step(h, q1)
+        kinetic = (p0 * p0).sum(-1) * h * expm1w(-gamma * h) / (2 * m)
+        return -(p0 * q1).sum(-1) + kinetic + torch.expm1(gamma * h) * s1
+
 
 def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
     """A body in a viscous medium, q̈ = −γq̇.
@@ -71,24 +92,6 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
     L_d = ExactLinearDrag(m, gamma)
     system = Natural(lambda q: torch.zeros_like(q[..., 0]), gamma, m)
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        """q1 = q0 + (p0/m) hφ(−γh), p1 = E p0, s1 = E s0 + E (|p0|²/2m) hφ(−γh)."""
-        h = as_step(h, q)
-        span, E = h * expm1w(-gamma * h), torch.exp(-gamma * h)
-        return q + p / m * span[..., None], p * E[..., None], E * (s + (p * p).sum(-1) / (2 * m) * span)
-
-    def H_plus(q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1·q0 + |p1|² hφ(γh)/2m + (1−E)s0."""
-        h = as_step(h, q0)
-        kinetic = (p1 * p1).sum(-1) * h * expm1w(gamma * h) / (2 * m)
-        return (p1 * q0).sum(-1) + kinetic - torch.expm1(-gamma * h) * s0
-
-    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
-        """H⁻ = −p0·q1 + |p0|² hφ(−γh)/2m + (1/E − 1)s1."""
-        h = as_step(h, q1)
-        kinetic = (p0 * p0).sum(-1) * h * expm1w(-gamma * h) / (2 * m)
-        return -(p0 * q1).sum(-1) + kinetic + torch.expm1(gamma * h) * s1
-
     return Scene(
         name="linear_drag",
         description="linear drag, q̈ = −γq̇, in closed form",
@@ -96,14 +99,14 @@ def linear_drag(m: float = 1.0, gamma: float = 0.2) -> Scene:
         units=("m",),
         parameters={"m": m, "gamma": gamma},
         **system.functions(),
-        flow=flow,
+        flow=L_d.flow,
         L_d=L_d,
         exact=True,
         L_d_rules=all_rules(system.lagrangian),
         q_range=(-1.0, 1.0),
         v_range=(-1.0, 1.0),
         h=0.1,
-        H_plus=H_plus,
-        H_minus=H_minus,
+        H_plus=L_d.H_plus,
+        H_minus=L_d.H_minus,
         examples=({"m": 1.7, "gamma": 0.6}, {"m": 0.6, "gamma": 0.0}),
     )

@@ -69,6 +69,37 @@ class ExactOscillator:
         D11, D12, D22 = (torch.diag_embed(b.expand_as(D1)) for b in blocks)
         return Partials(L, D1, D2, D3, D11, D12, D22, D13=zero, D23=zero, D33=torch.zeros_like(L))
 
+    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
+        m, gamma, omega0 = self.m, self.gamma, self.omega0
+        h = as_step(h, q)
+        x = (omega0**2 - gamma**2 / 4) * h**2
+        C, S, root = (y[..., None] for y in (cosw(x), h * sincw(x), torch.exp(-0.5 * gamma * h)))
+        q1 = root * (q * C + (p / m + 0.5 * gamma * q) * S)
+        p1 = root * (p * C - (m * omega0**2 * q + 0.5 * gamma * p) * S)
+        s1 = 0.5 * (p1 * q1).sum(-1) + torch.exp(-gamma * h) * (s - 0.5 * (p * q).sum(-1))
+        return q1, p1, s1
+
+    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
+        """H⁺ = p1²/2a + (b/a)p1·q0 + E m²Ω²q0²/2a + (1−E)s0, a = m(C/S − γ/2), b = m√E/S."""
+        m, gamma, omega0 = self.m, self.gamma, self.omega0
+        h = as_step(h, q0)
+        decay, k, _, C = self.coefficients(h)
+        a, root = k * C - 0.5 * m * gamma, 1.0 + decay
+        quadratic = 0.5 * (p1 * p1).sum(-1) + root * k * (p1 * q0).sum(-1)
+        quadratic = quadratic + 0.5 * m * (m * omega0**2) * root**2 * (q0 * q0).sum(-1)
+        return quadratic / a - torch.expm1(-gamma * h) * s0
+
+    def H_minus(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = p0²/2a − (b/a)p0·q1 + m²Ω²q1²/(2Ea) + (1/E − 1)s1, a = m(C/S + γ/2), b = m/(√E S)."""
+        m, gamma, omega0 = self.m, self.gamma, self.omega0
+        h = as_step(h, q1)
+        decay, k, _, C = self.coefficients(h)
+        a, root = k * C + 0.5 * m * gamma, 1.0 + decay
+        quadratic = 0.5 * (p0 * p0).sum(-1) - k / root * (p0 * q1).sum(-1)
+        quadratic = quadratic + 0.5 * m * (m * omega0**2) / root**2 * (q1 * q1).sum(-1)
+        return quadratic / a + torch.expm1(gamma * h) * s1
+
 
 def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -> Scene:
     """The damped harmonic oscillator q̈ = −ω₀²q − γq̇.
@@ -98,34 +129,6 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
 
     system = Natural(potential, gamma, m)
 
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        """(q1, p1, s1). From d/dt(s − p·q/2) = −γ(s − p·q/2), s1 needs no S in a denominator: no conjugate points."""
-        h = as_step(h, q)
-        x = (omega0**2 - gamma**2 / 4) * h**2
-        C, S, root = (y[..., None] for y in (cosw(x), h * sincw(x), torch.exp(-0.5 * gamma * h)))
-        q1 = root * (q * C + (p / m + 0.5 * gamma * q) * S)
-        p1 = root * (p * C - (stiffness * q + 0.5 * gamma * p) * S)
-        s1 = 0.5 * (p1 * q1).sum(-1) + torch.exp(-gamma * h) * (s - 0.5 * (p * q).sum(-1))
-        return q1, p1, s1
-
-    def H_plus(q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1²/2a + (b/a)p1·q0 + E m²Ω²q0²/2a + (1−E)s0, a = m(C/S − γ/2), b = m√E/S."""
-        h = as_step(h, q0)
-        decay, k, _, C = L_d.coefficients(h)
-        a, root = k * C - 0.5 * m * gamma, 1.0 + decay
-        quadratic = 0.5 * (p1 * p1).sum(-1) + root * k * (p1 * q0).sum(-1)
-        quadratic = quadratic + 0.5 * m * stiffness * root**2 * (q0 * q0).sum(-1)
-        return quadratic / a - torch.expm1(-gamma * h) * s0
-
-    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
-        """H⁻ = p0²/2a − (b/a)p0·q1 + m²Ω²q1²/(2Ea) + (1/E − 1)s1, a = m(C/S + γ/2), b = m/(√E S)."""
-        h = as_step(h, q1)
-        decay, k, _, C = L_d.coefficients(h)
-        a, root = k * C + 0.5 * m * gamma, 1.0 + decay
-        quadratic = 0.5 * (p0 * p0).sum(-1) - k / root * (p0 * q1).sum(-1)
-        quadratic = quadratic + 0.5 * m * stiffness / root**2 * (q1 * q1).sum(-1)
-        return quadratic / a + torch.expm1(gamma * h) * s1
-
     return Scene(
         name="damped_oscillator",
         description="damped harmonic oscillator, q̈ = −ω₀²q − γq̇, in closed form at any damping",
@@ -133,14 +136,14 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
         units=("m",),
         parameters={"m": m, "omega0": omega0, "gamma": gamma},
         **system.functions(),
-        flow=flow,
+        flow=L_d.flow,
         L_d=L_d,
         exact=True,
         L_d_rules={**all_rules(system.lagrangian), "strang": strang(potential, m, gamma)},
         q_range=(-1.5, 1.5),
         v_range=(-1.5, 1.5),
         h=0.1,
-        H_plus=H_plus,
-        H_minus=H_minus,
+        H_plus=L_d.H_plus,
+        H_minus=L_d.H_minus,
         examples=({"m": 1.7, "omega0": 1.3, "gamma": 0.6}, {"m": 0.6, "omega0": 0.7, "gamma": 3.1}),
     )

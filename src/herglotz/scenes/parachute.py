@@ -21,7 +21,7 @@ from herglotz.scenes.special import as_step, cosw, sincw, versw
 
 @dataclass(frozen=True)
 class ExactParachute:
-    """The exact discrete Lagrangian of the parachute, one degree of freedom, with closed-form derivatives.
+    """The exact discrete Lagrangian of the parachute, one degree of freedom, and the system that it belongs to.
 
     L_d = (e^{2λΔ}−1)s0 + (m/2λ²S)[(1+e^{2λΔ})C − 2e^{λΔ}] − (mgh/2λ)e^{2λq1}
         = (e^{2λΔ}−1)s0 + (m/2λ²S)(e^{λΔ}−1)² + (mgh/2λ)[(t−1) + (t/2)(e^{2λΔ}−1) − (e^{2λq1}−1)]
@@ -70,6 +70,85 @@ class ExactParachute:
         D23 = (2 * lam * e * e).expand_as(L)[..., None]
         return Partials(*first, D11, D12, D22, D13=-D23, D23=D23, D33=torch.zeros_like(L))
 
+    def potential(self, q: Tensor) -> Tensor:
+        """V = (mg/2λ)(e^{2λq} − 1), (...)."""
+        return self.m * self.g / (2 * self.lam) * torch.expm1(2 * self.lam * q[..., 0])
+
+    def lagrangian(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
+        """L, (...)."""
+        return 0.5 * self.m * v[..., 0] ** 2 - self.potential(q) + 2 * self.lam * v[..., 0] * s
+
+    def hamiltonian(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+        """H, (...)."""
+        return (p[..., 0] - 2 * self.lam * s) ** 2 / (2 * self.m) + self.potential(q)
+
+    def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG002
+        """P = L_v, (..., 1)."""
+        return self.m * v + 2 * self.lam * s[..., None]
+
+    def velocity(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG002
+        """V = H_p, (..., 1)."""
+        return (p - 2 * self.lam * s[..., None]) / self.m
+
+    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
+        """q1 = q0 − ln(C − λv0 S)/λ, v1 = (v0 C − g S)/(C − λv0 S); NaN if the solution has escaped before h."""
+        g, lam = self.g, self.lam
+        h = as_step(h, q)
+        v = self.velocity(q, p, s)
+        x = -lam * g * h**2
+        S, C1 = (h * sincw(x))[..., None], -versw(x)[..., None]  # C1 = C − 1
+        w = C1 - lam * v * S
+        q1 = q - torch.log1p(w) / lam
+        v1 = (v * (1.0 + C1) - g * S) / (1.0 + w)
+        s1 = s + self(q, q1, s, h)
+        return q1, self.momentum(q1, v1, s1), s1
+
+    def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
+        """H⁺ = p1·q1 − L_d, q1 = q0 + ln(x)/λ where A x² − B x = p1, on the branch that tends to q0 as h → 0.
+
+        B = m/(λS), A = B + a with a = 2λs0 + mgh t/2 − mgh e^{2λq0}; solved for x − 1, which is O(h). The branch is the
+        flow's while D2D2 L_d > 0, about 2λgh²e^{2λq} < 1; beyond that fold H⁺ is not single-valued (NaN where A/B < 0).
+        """
+        m, g, lam = self.m, self.g, self.lam
+        h = as_step(h, q0)
+        S, t = self.coefficients(h)
+        B = m / (lam * S)
+        a = 2 * lam * s0 + m * g * h * (0.5 * t - torch.exp(2 * lam * q0[..., 0]))
+        p = p1[..., 0]
+        # B → ±∞ as h → 0 with the sign of λ; the root must cancel nothing against it on the near-identity branch.
+        root = torch.sign(B) * torch.sqrt(B**2 + 4 * (B + a) * p)
+        q1 = q0 + (torch.log1p(2 * (p - a) / (B + 2 * a + root)) / lam)[..., None]
+        return (p1 * q1).sum(-1) - self(q0, q1, s0, h)
+
+    def H_minus(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
+        """H⁻ = −p0·q0 − (s1 − s0), q0 = q1 + ln(y)/λ, where (a − B)y² + By = p0, on the branch that tends to q1.
+
+        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); solved for y − 1, which is
+        O(h). y = C − λv0S along the flow, whose branch it is while 2(1 − a/B)y > 1; beyond that fold H⁻ is not
+        single-valued, and NaN where the root is not real.
+        """
+        m, g, lam = self.m, self.g, self.lam
+        h = as_step(h, q1)
+        S, t = self.coefficients(h)
+        B = m / (lam * S)
+        a = 2 * lam * s1 - m * g * h * (0.5 * t - torch.exp(2 * lam * q1[..., 0]))
+        p = p0[..., 0]
+        root = torch.sign(B) * torch.sqrt(B**2 - 4 * (B - a) * p)
+        delta = -torch.log1p(2 * (a - p) / (B - 2 * a + root)) / lam
+        q0 = q1 - delta[..., None]
+        # L_d = e^{2λΔ}s0 − s0 + A, solved for s1 − s0 at fixed s1.
+        A = self(q0, q1, torch.zeros_like(s1), h)
+        increment = A * torch.exp(-2 * lam * delta) - torch.expm1(-2 * lam * delta) * s1
+        return -(p0 * q0).sum(-1) - increment
+
+    def strang_exponential(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """L_d = (e^{2λΔ}−1)(s0 − hV0/2) + (m/2λ²h)(e^{λΔ}−1)² − (h/2)(V0+V1): order 2, explicit, c = e^{2λΔ}."""
+        m, lam = self.m, self.lam
+        h = as_step(h, q0)
+        V0, V1, delta = self.potential(q0), self.potential(q1), (q1 - q0)[..., 0]
+        kinetic = m / (2 * lam**2 * h) * torch.expm1(lam * delta) ** 2
+        return torch.expm1(2 * lam * delta) * (s0 - 0.5 * h * V0) + kinetic - 0.5 * h * (V0 + V1)
+
 
 def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
     """Fall with quadratic drag, q̈ = λq̇² − g.
@@ -95,94 +174,24 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
         raise InputError(f"parachute: drag lam must not be 0, got {lam}; without drag use a value such as 1e-6")
     L_d = ExactParachute(m, g, lam)
 
-    def potential(q: Tensor) -> Tensor:
-        return m * g / (2 * lam) * torch.expm1(2 * lam * q[..., 0])
-
-    def lagrangian(q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        return 0.5 * m * v[..., 0] ** 2 - potential(q) + 2 * lam * v[..., 0] * s
-
-    def hamiltonian(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-        return (p[..., 0] - 2 * lam * s) ** 2 / (2 * m) + potential(q)
-
-    def momentum(q: Tensor, v: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return m * v + 2 * lam * s[..., None]
-
-    def velocity(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001
-        return (p - 2 * lam * s[..., None]) / m
-
-    def flow(q: Tensor, p: Tensor, s: Tensor, h: Step) -> State:
-        """q1 = q0 − ln(C − λv0 S)/λ, v1 = (v0 C − g S)/(C − λv0 S); NaN if the solution has escaped before h."""
-        h = as_step(h, q)
-        v = velocity(q, p, s)
-        x = -lam * g * h**2
-        S, C1 = (h * sincw(x))[..., None], -versw(x)[..., None]  # C1 = C − 1
-        w = C1 - lam * v * S
-        q1 = q - torch.log1p(w) / lam
-        v1 = (v * (1.0 + C1) - g * S) / (1.0 + w)
-        s1 = s + L_d(q, q1, s, h)
-        return q1, momentum(q1, v1, s1), s1
-
-    def H_plus(q0: Tensor, p1: Tensor, s0: Tensor, h: Step) -> Tensor:
-        """H⁺ = p1·q1 − L_d, q1 = q0 + ln(x)/λ where A x² − B x = p1, on the branch that tends to q0 as h → 0.
-
-        B = m/(λS), A = B + a with a = 2λs0 + mgh t/2 − mgh e^{2λq0}; solved for x − 1, which is O(h). The branch is the
-        flow's while D2D2 L_d > 0, about 2λgh²e^{2λq} < 1; beyond that fold H⁺ is not single-valued (NaN where A/B < 0).
-        """
-        h = as_step(h, q0)
-        S, t = L_d.coefficients(h)
-        B = m / (lam * S)
-        a = 2 * lam * s0 + m * g * h * (0.5 * t - torch.exp(2 * lam * q0[..., 0]))
-        p = p1[..., 0]
-        # B → ±∞ as h → 0 with the sign of λ; the root must cancel nothing against it on the near-identity branch.
-        root = torch.sign(B) * torch.sqrt(B**2 + 4 * (B + a) * p)
-        q1 = q0 + (torch.log1p(2 * (p - a) / (B + 2 * a + root)) / lam)[..., None]
-        return (p1 * q1).sum(-1) - L_d(q0, q1, s0, h)
-
-    def H_minus(p0: Tensor, q1: Tensor, s1: Tensor, h: Step) -> Tensor:
-        """H⁻ = −p0·q0 − (s1 − s0), q0 = q1 + ln(y)/λ, where (a − B)y² + By = p0, on the branch that tends to q1.
-
-        B = m/(λS) and a = 2λs1 − mgh(t/2 − e^{2λq1}), from p0 = ∂s0/∂q0 at fixed (q1, s1); solved for y − 1, which is
-        O(h). y = C − λv0S along the flow, whose branch it is while 2(1 − a/B)y > 1; beyond that fold H⁻ is not
-        single-valued, and NaN where the root is not real.
-        """
-        h = as_step(h, q1)
-        S, t = L_d.coefficients(h)
-        B = m / (lam * S)
-        a = 2 * lam * s1 - m * g * h * (0.5 * t - torch.exp(2 * lam * q1[..., 0]))
-        p = p0[..., 0]
-        root = torch.sign(B) * torch.sqrt(B**2 - 4 * (B - a) * p)
-        delta = -torch.log1p(2 * (a - p) / (B - 2 * a + root)) / lam
-        q0 = q1 - delta[..., None]
-        # L_d = e^{2λΔ}s0 − s0 + A, solved for s1 − s0 at fixed s1.
-        A = L_d(q0, q1, torch.zeros_like(s1), h)
-        increment = A * torch.exp(-2 * lam * delta) - torch.expm1(-2 * lam * delta) * s1
-        return -(p0 * q0).sum(-1) - increment
-
-    def strang_exponential(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        """L_d = (e^{2λΔ}−1)(s0 − hV0/2) + (m/2λ²h)(e^{λΔ}−1)² − (h/2)(V0+V1): order 2, explicit, c = e^{2λΔ}."""
-        h = as_step(h, q0)
-        V0, V1, delta = potential(q0), potential(q1), (q1 - q0)[..., 0]
-        kinetic = m / (2 * lam**2 * h) * torch.expm1(lam * delta) ** 2
-        return torch.expm1(2 * lam * delta) * (s0 - 0.5 * h * V0) + kinetic - 0.5 * h * (V0 + V1)
-
     return Scene(
         name="parachute",
         description="fall with quadratic drag, q̈ = λq̇² − g, in closed form; damping depends on the motion",
         coordinates=("q",),
         units=("m",),
         parameters={"m": m, "g": g, "lam": lam},
-        hamiltonian=hamiltonian,
-        lagrangian=lagrangian,
-        momentum=momentum,
-        velocity=velocity,
-        flow=flow,
+        hamiltonian=L_d.hamiltonian,
+        lagrangian=L_d.lagrangian,
+        momentum=L_d.momentum,
+        velocity=L_d.velocity,
+        flow=L_d.flow,
         L_d=L_d,
         exact=True,
-        L_d_rules={**all_rules(lagrangian), "strang_exponential": strang_exponential},
+        L_d_rules={**all_rules(L_d.lagrangian), "strang_exponential": L_d.strang_exponential},
         q_range=(50.0, 150.0),
         v_range=(-20.0, 5.0),
         h=0.1,
-        H_plus=H_plus,
-        H_minus=H_minus,
+        H_plus=L_d.H_plus,
+        H_minus=L_d.H_minus,
         examples=({"m": 1.4, "g": 7.0, "lam": 0.012},),
     )

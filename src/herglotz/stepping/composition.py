@@ -17,14 +17,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.single_step import SingleStep
-from herglotz.stepping.state import (
-    State,
-    Status,
-    Step,
-    check_h,
-    check_state,
-    throw_failure,
-)
+from herglotz.stepping.state import State, Status, Step, check_h, check_state
 
 
 @runtime_checkable
@@ -49,8 +42,6 @@ class Composition(OneStepMethod):
     stages
         Pairs (method, fraction) in the order of application. A method is a discrete Lagrangian, which is stepped as
         `Stepper` steps it, or has a `substep`, as `ContactSplitting` has. Fractions may be negative.
-    throw
-        Raise `StepError` at the first sample that fails, instead of reporting its status.
     self_adjoint
         Warn at the first step if the first method is not its own adjoint, Φ_{−h}∘Φ_h ≠ 1: the order counts on that.
 
@@ -60,7 +51,7 @@ class Composition(OneStepMethod):
         If the fractions do not sum to 1.
     """
 
-    def __init__(self, stages: Sequence[tuple[Method, float]], *, throw: bool = False, self_adjoint: bool = False):
+    def __init__(self, stages: Sequence[tuple[Method, float]], *, self_adjoint: bool = False):
         total = sum(fraction for _, fraction in stages)
         if not abs(total - 1.0) < 1e-12:
             raise InputError(f"the fractions of a composition must sum to 1, got {total:.15g}")
@@ -68,7 +59,7 @@ class Composition(OneStepMethod):
         for method, _ in stages:
             if not isinstance(method, Substeps):
                 single_steps[id(method)] = SingleStep(method, None, MAX_ITERATIONS, False)
-        self.stages, self.throw, self._single_steps = tuple(stages), throw, single_steps
+        self.stages, self._single_steps = tuple(stages), single_steps
         self._to_check = self_adjoint
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
@@ -84,10 +75,7 @@ class Composition(OneStepMethod):
         if self._to_check and not torch.compiler.is_compiling():
             self._to_check = False
             self._warn_unless_self_adjoint(state, h)
-        out = self.substep(state, h)
-        if self.throw:
-            throw_failure(out.status, out.residual)
-        return out
+        return self.substep(state, h)
 
     def substep(self, state: State, h: Tensor) -> Step:
         """The same for h of either sign, unchecked, so that compositions can be composed."""
@@ -123,17 +111,17 @@ class Composition(OneStepMethod):
         return self._single_steps[id(method)](state, h, state.q)[0]
 
 
-def yoshida(method: Method, order: int = 4, *, throw: bool = False) -> Composition:
+def yoshida(method: Method, order: int = 4) -> Composition:
     """Order 4 with 3 stages or 6 with 7, from a method of order 2 that is its own adjoint.
 
     Source: H. Yoshida, Phys. Lett. A 150 (1990) 262: the triple jump, and solution A of order 6.
     """
     cube = 2.0 ** (1 / 3)
     outer = {4: (1 / (2 - cube),), 6: (0.784513610477560, 0.235573213359357, -1.17767998417887)}
-    return _symmetric(method, outer, order, "yoshida", throw)
+    return _symmetric(method, outer, order, "yoshida")
 
 
-def suzuki(method: Method, order: int = 4, *, throw: bool = False) -> Composition:
+def suzuki(method: Method, order: int = 4) -> Composition:
     """Order 4 with 5 stages or 6 with 25, from a method of order 2 that is its own adjoint.
 
     More stages than Yoshida's and a much smaller error constant: the fractions stay below 1 in size.
@@ -146,29 +134,27 @@ def suzuki(method: Method, order: int = 4, *, throw: bool = False) -> Compositio
     part = 1 / (4 - root)
     base = method if order == 4 else suzuki(method, 4)
     middle = 1 - 4 * part
-    return Composition(
-        [(base, part), (base, part), (base, middle), (base, part), (base, part)], throw=throw, self_adjoint=True
-    )
+    return Composition([(base, part), (base, part), (base, middle), (base, part), (base, part)], self_adjoint=True)
 
 
-def kahan_li(method: Method, order: int = 6, *, throw: bool = False) -> Composition:
+def kahan_li(method: Method, order: int = 6) -> Composition:
     """Order 6 with 9 stages, from a method of order 2 that is its own adjoint.
 
     Source: W. Kahan, R.-C. Li, Math. Comp. 66 (1997) 1089, s9odr6a.
     """
     outer = {6: (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)}
-    return _symmetric(method, outer, order, "kahan_li", throw)
+    return _symmetric(method, outer, order, "kahan_li")
 
 
-def adjoint_pair(method: Method, adjoint: Method, *, throw: bool = False) -> Composition:
+def adjoint_pair(method: Method, adjoint: Method) -> Composition:
     """Half a step of a method, then half of its adjoint: its own adjoint, of even order; left and right give 2."""
-    return Composition([(method, 0.5), (adjoint, 0.5)], throw=throw)
+    return Composition([(method, 0.5), (adjoint, 0.5)])
 
 
-def _symmetric(method: Method, outer: dict[int, tuple[float, ...]], order: int, name: str, throw: bool) -> Composition:
+def _symmetric(method: Method, outer: dict[int, tuple[float, ...]], order: int, name: str) -> Composition:
     """The fractions w_1, …, w_k, 1 − 2Σw, w_k, …, w_1."""
     if order not in outer:
         raise InputError(f"{name} has order {' or '.join(map(str, outer))}, got {order}")
     half = outer[order]
     middle = 1.0 - 2.0 * sum(half)
-    return Composition([(method, w) for w in (*half, middle, *reversed(half))], throw=throw, self_adjoint=True)
+    return Composition([(method, w) for w in (*half, middle, *reversed(half))], self_adjoint=True)

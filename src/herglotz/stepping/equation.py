@@ -17,9 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import (
-    DiscreteLagrangian,
-)
+from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
@@ -267,12 +265,7 @@ class StepOfModel:
         return _Slopes(value, weighted @ frame.to_q0, weighted, rows.movedim(0, -1))
 
     def _affine(
-        self,
-        damping: AffineDamping,
-        v: Tensor,
-        mv: Tensor,
-        features: tuple[Tensor, Tensor] | None,
-        second: bool,
+        self, damping: AffineDamping, v: Tensor, mv: Tensor, features: tuple[Tensor, Tensor] | None, second: bool
     ) -> tuple[Tensor, Tensor | None, tuple[Any, ...]]:
         """F and J without N and forces, where g depends on (q̄, v)."""
         k, maker = self.constants, self.maker

@@ -58,16 +58,12 @@ def explain_step(
         i = tuple(index)
         reasons = [CONDITIONS[name] for name in STEPPING if bool(lost[name][i])]
         status = Status(int(solution.status[i]))
-        if status != Status.CONVERGED and bool(escapes[i]):
-            reasons = [f"the motion escapes: q1 grows without bound as h → {float(reach[i])!r}"]
-        elif status != Status.CONVERGED and bool(reach[i] >= at.h[i]):
-            reasons = ["a solution exists, continued from smaller h, but Newton does not reach it from q0"]
-        elif bool(lost["pole"][i]):
+        instead = [] if status == Status.CONVERGED else _not_reached(at, i, reach, escapes)
+        if bool(lost["pole"][i]) and not instead:
             status = Status.SINGULAR
-        if status != Status.CONVERGED and not reasons:
-            reasons = [_no_solution(at, i, float(solution.q1[i].abs().max()), float(solution.residual[i]))]
-        elif status != Status.CONVERGED:
-            reasons.append(f"Newton ended at |q1| = {float(solution.q1[i].abs().max()):.3g}")
+        if status != Status.CONVERGED:
+            size, residual = float(solution.q1[i].abs().max()), float(solution.residual[i])
+            reasons = _with_the_end(instead or reasons, _no_solution(at, i, size, residual), size)
         if reasons:
             where = f"sample {i}, " if i else ""
             lines.append(f"{where}h = {float(at.h[i])!r}: {status.name}: {'; '.join(reasons)}")
@@ -112,6 +108,18 @@ def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations:
         if bool(((at >= h) | (stride < 1e-9 * h)).all()):
             break
     return at, q1
+
+
+def _not_reached(at: Regularity, i: tuple[int, ...], reach: Tensor, escapes: Tensor) -> list[str]:
+    """Why Newton did not find q1 although all shorter steps exist; nothing where that is not so."""
+    if bool(escapes[i]):
+        return [f"the motion escapes: q1 grows without bound as h → {float(reach[i])!r}"]
+    known = "a solution exists, continued from smaller h, but Newton does not reach it from q0"
+    return [known] if bool(reach[i] >= at.h[i]) else []
+
+
+def _with_the_end(reasons: list[str], otherwise: str, size: float) -> list[str]:
+    return [*reasons, f"Newton ended at |q1| = {size:.3g}"] if reasons else [otherwise]
 
 
 def _no_solution(at: Regularity, i: tuple[int, ...], size: float, residual: float) -> str:

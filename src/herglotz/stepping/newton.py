@@ -124,7 +124,7 @@ class _Sizes:
         """The same of one sample."""
         size = norm(x.flatten().tolist())
         if self.increments:
-            other = newton_step(point.J, self.equation.push(point)).left + size
+            other = newton_step(point.J, self.equation.push(point))[1] + size
         else:
             other = norm(self.q0.flatten().tolist())
         limits = torch.finfo(x.dtype)

@@ -6,14 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics import (
-    DiscreteLagrangian,
-    Driven,
-    Partials,
-    momentum_plus,
-    momentum_residual,
-    partials,
-)
+from herglotz.mechanics import DiscreteLagrangian, Driven, Partials, momentum_plus, momentum_residual, partials
 from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
 from herglotz.stepping.equation import End, ModelEquation, PartialsEquation, StepEquation, StepOfModel, model_equation
@@ -46,12 +39,7 @@ class SingleStep:
         self._fine: tuple[Tensor, Tensor] | None = None  # the status and the residual of explicit steps
 
     def __call__(
-        self,
-        state: State,
-        h: Tensor,
-        guess: Tensor | None = None,
-        u: Tensor | None = None,
-        low: State | None = None,
+        self, state: State, h: Tensor, guess: Tensor | None = None, u: Tensor | None = None, low: State | None = None
     ) -> tuple[Step, State | None]:
         """The step with input u, and the rounding errors to carry on; `low` is what the step before has handed on."""
         if self.leapfrog is not None:

@@ -98,10 +98,7 @@ class Rollout:
 
 
 def check_state(
-    state: State,
-    L_d: Any = None,
-    names: tuple[str, str, str] = ("q", "p", "s"),
-    finite: bool = False,
+    state: State, L_d: Any = None, names: tuple[str, str, str] = ("q", "p", "s"), finite: bool = False
 ) -> State:
     """The same state.
 

@@ -61,12 +61,7 @@ class Stepper(OneStepMethod):
         self.explicit = explicit
 
     def init(
-        self,
-        q0: Tensor,
-        q1: Tensor,
-        s0: Tensor | None = None,
-        h: Tensor | float = 1.0,
-        u: Tensor | None = None,
+        self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
     ) -> State:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0 (a choice of gauge).
 

@@ -7,11 +7,9 @@ from herglotz.theory.constrained import ConstrainedStepper
 from herglotz.theory.continuous import contact_vector_field, derivatives, evolution_vector_field, herglotz_acceleration
 from herglotz.theory.continuous_equation import ContinuousEquation, FractionalStepper, inverse_step
 from herglotz.theory.degenerate import LegendrianStepper, legendrian_relation
-from herglotz.theory.discrete_gradient import increment_gradient, mean_value_gradient, midpoint_gradient
-from herglotz.theory.evolution import EvolutionStepper
+from herglotz.theory.evolution import EvolutionStepper, midpoint_gradient
 from herglotz.theory.explicit_time import TimeDependent, energies, time_defect
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
-from herglotz.theory.gauge import Rescaled, joined_action
 from herglotz.theory.generating import (
     GeneratingFunction,
     generating_function,
@@ -109,7 +107,6 @@ __all__ = [
     "PointSource",
     "Propagated",
     "Quadratic",
-    "Rescaled",
     "RightHamiltonian",
     "RigidBodyStepper",
     "Symmetries",
@@ -145,13 +142,11 @@ __all__ = [
     "herglotz_acceleration",
     "herglotz_action",
     "hopf_lax",
-    "increment_gradient",
     "infinitesimal_generator",
     "initial_value",
     "invariance_defect",
     "inverse_step",
     "jacobi_bracket",
-    "joined_action",
     "left_equations",
     "left_generating_function",
     "left_hamilton_jacobi_residual",
@@ -165,7 +160,6 @@ __all__ = [
     "legendrian_relation",
     "lie_derivative_of_contact_form",
     "linear_damping",
-    "mean_value_gradient",
     "midpoint_gradient",
     "momentum_map",
     "noether_defect",

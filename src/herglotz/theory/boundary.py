@@ -108,7 +108,7 @@ def boundary_value(
     line = straight_line(first, last, h_all) if guess is None else guess
     if line.shape != (*batch, h_all.shape[-1] + 1, q_end.shape[-1]):
         raise InputError(f"guess needs shape (..., N+1, n) with N = {h_all.shape[-1]}, got {tuple(line.shape)}")
-    return _critical(L_d, line[..., 1:-1, :], [first, last], s, h_all, lambda _: None, throw, beyond=True)
+    return checked(_critical(L_d, line[..., 1:-1, :], [first, last], s, h_all, beyond=True), throw)
 
 
 def family_value(
@@ -118,10 +118,16 @@ def family_value(
     h: Tensor,  # (N,) or (..., N)
     guess: Tensor,  # (..., N, n) q_0 … q_{N−1}
     beyond: bool,
-    throw: bool,
 ) -> Curve:
     """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0)."""
-    return _critical(L_d, guess, [y], None, h, lambda q0: germ(S, q0), throw, beyond)
+    return _critical(L_d, guess, [y], S, h, beyond)
+
+
+def checked(curve: Curve, throw: bool) -> Curve:
+    """The curve; with `throw` a `StepError` that names the samples that failed."""
+    if throw and not bool(curve.ok.all()):
+        raise StepError(f"no discrete curve at {'; '.join(curve.failures()[:3])}")
+    return curve
 
 
 def initial_value(
@@ -163,20 +169,48 @@ def _critical(
     L_d: DiscreteLagrangian,
     guess: Tensor,  # (..., K, n) the unknown points
     ends: list[Tensor],  # [q_N], or [q_0, q_N]
-    s0: Tensor | None,  # None: S(q_0)
+    source: Tensor | Function,  # s_0, or S with s_0 = S(q_0)
     h: Tensor,
-    start: Callable[[Tensor], FunctionGerm | None],
-    throw: bool,
     beyond: bool,
 ) -> Curve:
-    n, fixed = ends[-1].shape[-1], len(ends) == 2
-
     def curve(x: Tensor) -> tuple[Tensor, Tensor, Partials, FunctionGerm | None]:
         interior = x.unflatten(-1, guess.shape[-2:]) if x.shape[-1] else guess
         q = torch.cat([*(e[..., None, :] for e in ends[:-1]), interior, ends[-1][..., None, :]], -2)
-        S = start(q[..., 0, :])
-        s = curve_action(L_d, q, S.S if s0 is None and S is not None else _given(s0), h)
+        if isinstance(source, Tensor):
+            S, s0 = None, source
+        else:
+            S = germ(source, q[..., 0, :])
+            s0 = S.S
+        s = curve_action(L_d, q, s0, h)
         return q, s, curve_partials(L_d, q, s, h, order=2), S
+
+    with torch.no_grad():
+        x, converged, error, iterations = _solved(curve, guess, ends)
+        q, s, P, S = curve(x)
+        p0 = momentum_minus(P)[..., 0, :] if S is None else S.dS
+        p = torch.cat([p0[..., None, :], momentum_plus(P)], -2)
+        family = opening(P, p[..., :-1, :], _parameters(q[..., 0, :], S))
+        finite = torch.isfinite(s).all(-1) & torch.isfinite(q).all(-1).all(-1)
+        singular = (family.final < 1e3 * torch.finfo(q.dtype).eps) | (P.c == 0).any(-1) | ~torch.isfinite(error)
+        if not beyond:
+            singular = singular | (family.crossed >= 0)
+        status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
+        status = torch.where(singular, int(Status.SINGULAR), status)
+        status = torch.where(finite, status, int(Status.DIVERGED)).to(torch.uint8)
+        nan = torch.where(status == Status.CONVERGED, 0.0, torch.nan).to(q)
+        sigma = torch.cat([torch.ones_like(s[..., :1]), P.c.cumprod(-1)], -1)
+        q, p, s, sigma = q + nan[..., None, None], p + nan[..., None, None], s + nan[..., None], sigma + nan[..., None]
+        return Curve(q, p, s, sigma, status, error, family, iterations)
+
+
+def _solved(
+    curve: Callable[[Tensor], tuple[Tensor, Tensor, Partials, FunctionGerm | None]], guess: Tensor, ends: list[Tensor]
+) -> tuple[Tensor, Tensor, Tensor, int]:
+    """The unknown points side by side, whether each sample converged, its last Newton step, and iterations."""
+    x, n = guess.detach().flatten(-2), guess.shape[-1]
+    size = torch.cat([e.abs() for e in ends] + [x.abs()], -1).amax(-1, keepdim=True)
+    if not x.shape[-1]:
+        return x, torch.ones_like(size[..., 0], dtype=torch.bool), 0 * size[..., 0], 0
 
     def equations(x: Tensor) -> tuple[Tensor, Blocks]:
         _, _, P, S = curve(x)
@@ -188,40 +222,8 @@ def _critical(
         rhs = torch.cat([rhs, torch.zeros_like(rhs[..., :1])], -1)
         return solve_blocks(blocks, rhs)[..., :n].flatten(-2)  # type: ignore[arg-type]
 
-    with torch.no_grad():
-        x = guess.detach().flatten(-2)
-        size = torch.cat([e.abs() for e in ends] + [x.abs()], -1).amax(-1, keepdim=True)
-        if x.shape[-1]:
-            root = find_root(equations, x, size.expand(x.shape), solver)
-            x, converged, error, iterations = root.x, root.converged, root.error, root.iterations
-        else:
-            converged, error, iterations = torch.ones_like(size[..., 0], dtype=torch.bool), 0 * size[..., 0], 0
-        q, s, P, S = curve(x)
-        p0 = momentum_minus(P)[..., 0, :] if S is None else S.dS
-        p = torch.cat([p0[..., None, :], momentum_plus(P)], -2)
-        family = opening(P, p[..., :-1, :], _parameters(q[..., 0, :], None if fixed else S))
-        finite = torch.isfinite(s).all(-1) & torch.isfinite(q).all(-1).all(-1)
-        singular = (family.final < 1e3 * torch.finfo(q.dtype).eps) | (P.c == 0).any(-1) | ~torch.isfinite(error)
-        if not beyond:
-            singular = singular | (family.crossed >= 0)
-        status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
-        status = torch.where(singular, int(Status.SINGULAR), status)
-        status = torch.where(finite, status, int(Status.DIVERGED)).to(torch.uint8)
-        nan = torch.where(status == Status.CONVERGED, 0.0, torch.nan).to(q)
-        sigma = torch.cat([torch.ones_like(s[..., :1]), P.c.cumprod(-1)], -1)
-        out = Curve(
-            q + nan[..., None, None],
-            p + nan[..., None, None],
-            s + nan[..., None],
-            sigma + nan[..., None],
-            status,
-            error,
-            family,
-            iterations,
-        )
-    if throw and not bool(out.ok.all()):
-        raise StepError(f"no discrete curve at {'; '.join(out.failures()[:3])}")
-    return out
+    root = find_root(equations, x, size.expand(x.shape), solver)
+    return root.x, root.converged, root.error, root.iterations
 
 
 def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:
@@ -263,8 +265,3 @@ def _parameters(q0: Tensor, S: FunctionGerm | None) -> Tensor:
     if S is None:
         return torch.cat([torch.zeros_like(eye), eye, torch.zeros_like(eye[..., :1, :])], -2)
     return torch.cat([eye, S.d2S, S.dS[..., None, :]], -2)
-
-
-def _given(s0: Tensor | None) -> Tensor:
-    assert s0 is not None
-    return s0

@@ -25,14 +25,7 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.newton import Root, attached, find_root
 from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.state import (
-    State,
-    Step,
-    check_h,
-    check_state,
-    status_of_root,
-    throw_failure,
-)
+from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.continuous import jacobian
 
 Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
@@ -52,25 +45,12 @@ class ConstrainedStepper(OneStepMethod):
         g(q), (..., n) → (..., m), differentiable by autograd; its rows Dg must be independent where it vanishes.
     velocity
         v = H_p(q, p, s), (..., n), e.g. a scene's; for a constant mass p / m.
-    max_iterations
-        Bound on Newton iterations.
-    throw
-        Raise `StepError` at the first sample that fails.
 
     Source: section 6 of `docs/mathematics.md`.
     """
 
-    def __init__(
-        self,
-        L_d: DiscreteLagrangian,
-        constraint: Constraint,
-        velocity: Velocity,
-        *,
-        max_iterations: int = 30,
-        throw: bool = False,
-    ):
+    def __init__(self, L_d: DiscreteLagrangian, constraint: Constraint, velocity: Velocity):
         self.L_d, self.constraint, self.velocity = L_d, constraint, velocity
-        self.max_iterations, self.throw = max_iterations, throw
 
     def project(self, state: State) -> State:
         """The same position and action with the momentum nearest in the constraint forces: p + Dgᵀμ, Dg·v = 0."""
@@ -112,8 +92,6 @@ class ConstrainedStepper(OneStepMethod):
         end = torch.isfinite(p1).all(-1) & torch.isfinite(s1)
         singular = (P.c == 0) | (root.converged & ~end)
         status = status_of_root(root, torch.isfinite(root.x).all(-1), singular)
-        if self.throw:
-            throw_failure(status, root.error)
         return Step.of(State(q1, p1, s1), P.c, status, root.error, root.iterations)
 
     def multiplier(self, state: State, h: Tensor | float) -> Tensor:
@@ -165,7 +143,7 @@ class ConstrainedStepper(OneStepMethod):
             impulse = (P.c[..., None] * p0).abs() + P.D1.abs()
             impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
             scale = torch.cat([size.expand(q0.shape), impulse], -1)
-            root = find_root(equations, start, scale, iterations=self.max_iterations)
+            root = find_root(equations, start, scale)
         x = root.x
         if torch.is_grad_enabled():
             x = attached(x, root.J, balance(x, 1)[0])

@@ -28,7 +28,7 @@ from herglotz.mechanics import momentum_minus, momentum_plus, partials
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials
 from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.state import State, Status, Step, check_h, check_state, throw_failure
+from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.stepping.stepper import Stepper
 from herglotz.theory.continuous import gradient, jacobian
 from herglotz.theory.jacobi import join, split
@@ -238,8 +238,8 @@ class FractionalStepper(OneStepMethod):
     The status is `UNRESOLVED` where two orders differ by more than `tolerance`, relative to a whole step.
     """
 
-    def __init__(self, equation: ContinuousEquation, *, tolerance: float = 1e-6, throw: bool = False):
-        self.equation, self.tolerance, self.throw = equation, tolerance, throw
+    def __init__(self, equation: ContinuousEquation, *, tolerance: float = 1e-6):
+        self.equation, self.tolerance = equation, tolerance
         self._last: tuple[Tensor, _Iterates, float, Tensor] | None = None  # the last q, its motion, time and ln σ
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002  nothing to guess
@@ -261,8 +261,6 @@ class FractionalStepper(OneStepMethod):
             lost = ~(error <= self.tolerance) & (status == Status.CONVERGED)
             status = torch.where(lost, torch.full_like(status, Status.UNRESOLVED), status)
         iterates.forget(whole - iterates.most)
-        if self.throw:
-            throw_failure(status, error)
         step = Step.of(State(*split(x[..., :-1])), (x[..., -1] - log_c).exp(), status, error, 0)
         self._last = (step.state.q, iterates, time, x[..., -1])
         return step

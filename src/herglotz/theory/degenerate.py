@@ -26,11 +26,13 @@ from herglotz.mechanics import (
 )
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
 from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.state import State, Status, Step, check_h, check_state, throw_failure
+from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.theory.continuous import jacobian
 from herglotz.theory.jacobi import Triple
 from herglotz.theory.legendrian import contact_product_point
 
+RANK = 0.5  # power of eps: singular values below this times the largest count as zero
+ITERATIONS = 30  # of Gauss–Newton, as many as of `Stepper`
 System = Callable[[Tensor], tuple[Tensor, Tensor]]  # x → equations and the size of their terms, both (..., m)
 
 
@@ -59,29 +61,14 @@ class LegendrianStepper(OneStepMethod):
     ahead
         How many further steps must exist after this one: 0 for a regular M, 1 where M is singular and the next step
         fixes what this one leaves open, more for a longer chain of constraints.
-    rank_tol
-        Singular values below this times the largest count as zero, rows and columns scaled first; default eps^(1/2).
-    max_iterations
-        Bound on Gauss–Newton iterations.
-    throw
-        Raise `StepError` at the first sample that fails.
 
     Source: section 6 of `docs/mathematics.md`; the paper treats regular L_d only.
     """
 
-    def __init__(
-        self,
-        L_d: DiscreteLagrangian,
-        *,
-        ahead: int = 1,
-        rank_tol: float | None = None,
-        max_iterations: int = 30,
-        throw: bool = False,
-    ):
+    def __init__(self, L_d: DiscreteLagrangian, *, ahead: int = 1):
         if ahead < 0:
             raise InputError(f"ahead must be >= 0, got {ahead}")
-        self.L_d, self.ahead, self.rank_tol = L_d, ahead, rank_tol
-        self.max_iterations, self.throw = max_iterations, throw
+        self.L_d, self.ahead = L_d, ahead
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
         """One step; `residual` is the relation's |c p0 + D1 L_d|, of this step and those ahead, relative to its terms.
@@ -118,8 +105,6 @@ class LegendrianStepper(OneStepMethod):
         P = partials(self.L_d, q0, q1, s0, h)
         failed = (status != Status.CONVERGED) | (P.c == 0)
         status = torch.where(failed & (status == Status.CONVERGED), Status.SINGULAR, status).to(torch.uint8)
-        if self.throw:
-            throw_failure(status, residual)
         new = State(*(x.detach() for x in (q1, momentum_plus(P), s0 + P.L)))
         return Step.of(new, P.c.detach(), status, residual, iterations)
 
@@ -135,7 +120,7 @@ class LegendrianStepper(OneStepMethod):
         n = q0.shape[-1]
         J = momentum_jacobian(partials(self.L_d, q0, q0, s0, h, order=2), p0)
         _, sizes, V = torch.linalg.svd(J)
-        small = sizes <= self._tolerance(q0) * sizes.amax(-1, keepdim=True)
+        small = sizes <= torch.finfo(q0.dtype).eps ** RANK * sizes.amax(-1, keepdim=True)
         kernel = V.mT * small[..., None, :].to(V.dtype)  # columns: a basis of ker J beside zeros
 
         def moved(y: Tensor) -> State:
@@ -183,7 +168,7 @@ class LegendrianStepper(OneStepMethod):
             return scale, eps ** (2 / 3) * scale
 
         solver = lambda inverse, F: (inverse @ F[..., None])[..., 0]  # noqa: E731
-        rules = Rules(4 * eps, self.max_iterations, natural=True, shortest=SHORTEST, solver=solver)
+        rules = Rules(4 * eps, ITERATIONS, natural=True, shortest=SHORTEST, solver=solver)
         found = newton(at, start, rules, sizes)
         point = at(found.x) if found.mixed else found.point
         residual = largest(point.F / point.rest)
@@ -192,9 +177,6 @@ class LegendrianStepper(OneStepMethod):
         return found.x, status, residual, found.iterations
 
     def _pseudo_inverse(self, J: Tensor) -> Tensor:
-        """J⁺ with the rank decided at `rank_tol`; zeros where J is not finite."""
+        """J⁺, zeros where J is not finite."""
         J = torch.where(torch.isfinite(J).all(-1).all(-1)[..., None, None], J, 0.0)
-        return torch.linalg.pinv(J, rtol=self._tolerance(J))
-
-    def _tolerance(self, like: Tensor) -> float:
-        return torch.finfo(like.dtype).eps ** 0.5 if self.rank_tol is None else self.rank_tol
+        return torch.linalg.pinv(J, rtol=torch.finfo(J.dtype).eps ** RANK)

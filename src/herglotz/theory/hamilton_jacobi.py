@@ -62,12 +62,7 @@ def projected_flow(flow: Flow, S: Function, q: Tensor) -> Tensor:
 
 
 def projected_step(
-    H_plus: DiscreteLagrangian,
-    S0: Function,
-    S1: Function,
-    q0: Tensor,
-    h: Tensor | float,
-    guess: Tensor | None = None,
+    H_plus: DiscreteLagrangian, S0: Function, S1: Function, q0: Tensor, h: Tensor | float, guess: Tensor | None = None
 ) -> Tensor:
     """q_{k+1} = D2H⁺(q_k, dS^{k+1}(q_{k+1}), S^k(q_k)), solved for q_{k+1} by Newton; (..., n), NaN where it has none.
 

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.stepping.state import Status, step_sizes
-from herglotz.theory.boundary import Curve, family_value
+from herglotz.theory.boundary import Curve, checked, family_value
 from herglotz.theory.function_germ import Function, FunctionGerm
 
 
@@ -74,7 +74,7 @@ def hopf_lax(
     sizes = step_sizes(sizes, steps if sizes.ndim == 0 else None)
     y = y.detach().expand(*torch.broadcast_shapes(y.shape[:-1], sizes.shape[:-1]), y.shape[-1])
     points = y[..., None, :].expand(*y.shape[:-1], sizes.shape[-1], y.shape[-1]) if guess is None else guess
-    curve = family_value(L_d, S, y, sizes, points, beyond, throw)
+    curve = checked(family_value(L_d, S, y, sizes, points, beyond), throw)
     slope = torch.where((curve.status == Status.CONVERGED)[..., None, None], curve.opening.slope, torch.nan)
     return HopfLax(curve.s[..., -1], curve.p[..., -1, :], slope, curve.q[..., 0, :], curve.status, curve)
 

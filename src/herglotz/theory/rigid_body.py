@@ -22,7 +22,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
-from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes, throw_failure
+from herglotz.stepping.state import Status, Step, check_h, status_of_root, step_sizes
 from herglotz.theory.rotations import cayley, hat
 
 
@@ -60,8 +60,6 @@ class RigidBodyStepper:
         (3,) principal moments or (3, 3) symmetric inertia matrix J in the body frame, kg m².
     gamma
         Damping rate γ, 1/s.
-    throw
-        Raise `StepError` at the first sample that fails.
 
     Raises
     ------
@@ -71,13 +69,13 @@ class RigidBodyStepper:
     Source: section 6 of `docs/mathematics.md`.
     """
 
-    def __init__(self, inertia: Tensor, gamma: float = 0.0, *, throw: bool = False):
+    def __init__(self, inertia: Tensor, gamma: float = 0.0):
         J = torch.diag(inertia) if inertia.ndim == 1 else inertia
         if J.shape != (3, 3) or not bool(torch.isfinite(J).all()) or not torch.equal(J, J.mT):
             raise InputError(f"inertia must be 3 moments or a symmetric (3, 3) matrix, got {inertia.tolist()}")
         if not bool((torch.linalg.eigvalsh(J) > 0).all()):
             raise InputError(f"inertia must be positive, its principal moments are {torch.linalg.eigvalsh(J).tolist()}")
-        self.inertia, self.gamma, self.throw = J, gamma, throw
+        self.inertia, self.gamma = J, gamma
 
     def energy(self, M: Tensor) -> Tensor:
         """½ M·J⁻¹M, shape (...), J."""
@@ -117,8 +115,6 @@ class RigidBodyStepper:
             c[..., None] * (F.mT @ M[..., None])[..., 0],
             s + torch.expm1(-self.gamma * h) * s + root / h * action,
         )
-        if self.throw:
-            throw_failure(status, residual)
         return Step.of(new, c, status, residual, iterations)
 
     def rollout(

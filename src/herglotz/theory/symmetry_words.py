@@ -13,17 +13,11 @@ SMALL = 1e-6  # of the largest entry: not written
 def name_of(A: Tensor, b: Tensor, a: float, coordinates: Sequence[str]) -> str:
     """Words for ξ(q) = A q + b with s ↦ s + ε a s, such as "translation along x"."""
     A, b = _clean(A, b)
-    moved = [coordinates[i] for i in range(len(b)) if b[i] != 0]
-    if not bool(A.any()) and abs(a) <= SMALL:
-        if len(moved) == 1:
-            return f"translation along {moved[0]}"
-        if len(set(b[b != 0].tolist())) == 1:
-            return f"translation of {_and(moved)} together"
-        return f"translation along ({', '.join(f'{x:.4g}' for x in b.tolist())})"
-    about = _fixed_point(A, b)
-    turned = (A != 0).nonzero().tolist()
-    if abs(a) <= SMALL and len(turned) == 2 and bool((A * A.mT).sum() < 0) and about is not None:
-        i, j = turned[0]
+    keeps_s, about = abs(a) <= SMALL, _fixed_point(A, b)
+    if keeps_s and not bool(A.any()):
+        return _translation(b, coordinates)
+    if keeps_s and about is not None and (plane := _plane(A)):
+        i, j = plane
         kind = "rotation" if bool(torch.allclose(A, -A.mT)) else "elliptic rotation"
         return f"{kind} in the plane ({coordinates[i]}, {coordinates[j]}){_around(about)}"
     eye = torch.eye(len(b), dtype=A.dtype)
@@ -31,12 +25,28 @@ def name_of(A: Tensor, b: Tensor, a: float, coordinates: Sequence[str]) -> str:
         return f"scaling of q, and of s by its square{_around(about)}"
     parts = [f"{name}′ = {_sum([*zip(A[i].tolist(), coordinates, strict=True), (float(b[i]), '')])}"
              for i, name in enumerate(coordinates) if bool(A[i].any()) or b[i] != 0]  # fmt: skip
-    parts += [f"s′ = {a:.4g} s"] if abs(a) > SMALL else []
-    return f"affine motion {', '.join(parts)}"
+    return f"affine motion {', '.join(parts if keeps_s else [*parts, f's′ = {a:.4g} s'])}"
 
 
-def formula(A: Tensor, b: Tensor, a: Tensor, k: Tensor, w: Tensor, B: Tensor, coordinates: Sequence[str]) -> str:
-    """J = p·(A q + b) − a s − χ(q) as text; entries below a millionth of the largest are left out."""
+def _translation(b: Tensor, coordinates: Sequence[str]) -> str:
+    """Words for ξ(q) = b."""
+    moved = [name for name, x in zip(coordinates, b.tolist(), strict=True) if x]
+    if len(moved) == 1:
+        return f"translation along {moved[0]}"
+    if len(set(b[b != 0].tolist())) == 1:
+        return f"translation of {', '.join(moved[:-1])} and {moved[-1]} together"
+    return f"translation along ({', '.join(f'{x:.4g}' for x in b.tolist())})"
+
+
+def _plane(A: Tensor) -> list[int]:
+    """The two coordinates that A turns into one another, as a rotation or along ellipses; none if it does more."""
+    turned = (A != 0).nonzero().tolist()
+    return turned[0] if len(turned) == 2 and bool((A * A.mT).sum() < 0) else []
+
+
+def formula(generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates: Sequence[str]) -> str:
+    """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ; small entries are left out."""
+    (A, b, a), (k, w, B) = generator, boundary
     terms = []
     for i, name in enumerate(coordinates):
         terms.append((float(b[i]), f"p_{name}"))
@@ -78,7 +88,3 @@ def _around(point: Tensor) -> str:
     if float(point.abs().max()) <= SMALL:
         return ""
     return f" about ({', '.join(f'{x:.4g}' for x in point.tolist())})"
-
-
-def _and(names: Sequence[str]) -> str:
-    return ", ".join(names[:-1]) + f" and {names[-1]}"

@@ -105,6 +105,7 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
+        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
@@ -157,7 +158,7 @@ class DictionarySearch:
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
-        base, own = self.base, own_terms(self.data.angles[0]) if self.data.dof == 1 else {}
+        base, own = self.base, self.own
         values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
         features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
         return NamedTerms(tuple(own)), {**values, **features}
@@ -199,16 +200,15 @@ class DictionarySearch:
         if found.whole:
             return found
         stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
-        done = found.fit.problem.grid.longest / found.config.substeps
-        stages.lengths = [0, *(length for length in stages.lengths if length > 1.01 * done)]
+        done = found.fit.problem.grid.length
+        stages.lengths = [0, *(length for length in stages.lengths if length > done)]
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
     def _problem(self, found: Found, terms: NamedTerms, substeps: int) -> tuple[SegmentStages, ShootingProblem]:
         """The problem with other terms over the same segments."""
         stages = self._stages(terms, found.values, substeps, found.config.sticking)
         old, base = found.fit.problem, stages.task.base
-        length = round(old.grid.longest / found.config.substeps)
-        grid = segment_grid(self.data, length, base.model_step)
+        grid = segment_grid(self.data, old.grid.length, base.model_step)
         model = stages.model
         problem = ShootingProblem(
             model, self.data, grid, sigma=max(found.rms, self.floor), prior=prior_of(model, base, None),
@@ -304,7 +304,8 @@ class DictionarySearch:
         _, A, _ = problem.normal_equations(x)
         A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
         free = torch.tensor([i for own in at.values() for i in own])
-        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0)[0].tolist())
+        simplest = torch.tensor([i for name in self.own for i in at.get(name, ())], dtype=torch.long)
+        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, simplest)[0].tolist())
         return found.terms.only([name for name, own in at.items() if stay & set(own)])
 
     def _finer(self, found: Found) -> Found:

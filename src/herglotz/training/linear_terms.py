@@ -82,7 +82,9 @@ class LinearTerms:
         A = X.T @ X / size / overlap
         place = self._linear_places(fit, columns)
         free = torch.tensor([i for own in place.values() for i in own])
-        kept, less = prune(A, x[columns][1:], free, math.log(max(3, int(r.numel() / overlap))))
+        simplest = torch.tensor([i for name in self.own for i in place[name]], dtype=torch.long)
+        worth = math.log(max(3, int(r.numel() / overlap)))
+        kept, less = prune(A, x[columns][1:], free, worth, simplest=simplest)
         stay = set(kept.tolist())
         terms = self.all.only([name for name, own in place.items() if stay & set(own)])
         left = columns.clone()

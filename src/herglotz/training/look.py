@@ -100,7 +100,8 @@ def look(
     task = replace(task, base=terms.base, config=terms.settings)
     if plan is not None and plan.network == "covered":
         terms = replace(terms, motion=_baseline_motion(task))
-    wanted = plan.continues_probe if plan is not None else terms.settings.objective == "auto" and terms.motion is None
+    wanted = terms.settings.objective == "auto" and terms.motion is None and not terms.settings.sticking
+    wanted = wanted if plan is None else plan.continues_probe
     probe = _probe(task) if wanted and settings.supervision == "q" else None
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,

@@ -12,22 +12,28 @@ def prune(
     candidates: Tensor,  # indices of the coefficients that may be left out
     worth: float,  # twice the cost above which a coefficient stays; log N by the Bayesian information criterion
     least: int = 0,  # how many stay whatever they cost
+    simplest: Tensor | None = None,  # those of them that go only where no other one can
 ) -> tuple[Tensor, Tensor]:
     """(kept, x): the candidates that stay, and the parameters moved to where the others' absence sends them.
 
     Leaving out coefficient i costs ½ x_i² / (A⁻¹)_ii in the quadratic model of the fit; the one that costs least goes
     while that is less than ½ `worth`: backward elimination without fitting again (Schwarz 1978 for log N, N the number
-    of residuals).
+    of residuals). Where two sets of terms make nearly the same force, rounding and noise would choose; the set with
+    the simplest terms is kept instead (marginality, Nelder 1977).
     """
     keep = torch.ones(len(x), dtype=torch.bool, device=x.device)
     out, x = torch.zeros_like(keep), x.clone()
     out[candidates] = True
+    late = torch.zeros_like(keep)
+    late[candidates[:0] if simplest is None else simplest] = True
     scale = A.diagonal().clamp_min(1e-300).sqrt()
     S, y = A / scale[:, None] / scale, x * scale
     while int((out & keep).sum()) > least:
         rows = keep.nonzero()[:, 0]
         C = torch.linalg.pinv(S[rows][:, rows], hermitian=True)
         cost = torch.where(out[rows], y[rows].square() / C.diagonal().clamp_min(1e-300), torch.inf)
+        early = torch.where(late[rows], torch.inf, cost)
+        cost = early if float(early.min()) <= worth else cost
         i = int(cost.argmin())
         if float(cost[i]) > worth:
             break

@@ -6,7 +6,7 @@ import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 ARTEFACTS = ("eager", "c")
 
@@ -54,23 +54,20 @@ class TuneConfig:
     rounds: int = 7
 
     def __post_init__(self):
-        wrong = [x for x in self.artefacts if x not in ARTEFACTS]
-        if wrong or not self.artefacts:
-            raise InputError(f"artefacts must be some of {', '.join(ARTEFACTS)}, got {self.artefacts}")
-        if not self.multiples:
-            raise InputError("multiples is empty; give at least one, such as 1")
-        if not all(m >= 1 and float(m).is_integer() for m in self.multiples):
-            raise InputError(f"multiples must be whole numbers >= 1, got {self.multiples}")
-        if any(w < 1 for w in self.widths):
-            raise InputError(f"widths must be >= 1, got {self.widths}; give an empty tuple for no distillation")
-        if any(k < 1 for k in self.kicks):
-            raise InputError(f"kicks must be >= 1, got {self.kicks}; give an empty tuple for none")
-        for name in ("quantile", "confidence"):
-            if not 0 < getattr(self, name) < 1:
-                raise InputError(f"{name} must be in (0, 1), got {getattr(self, name):g}")
-        for name in ("iterations", "pairs", "rounds"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be >= 1, got {getattr(self, name)}")
+        unknown = [x for x in self.artefacts if x not in ARTEFACTS]
+        whole = all(m >= 1 and float(m).is_integer() for m in self.multiples)
+        refuse({
+            f"artefacts must be some of {', '.join(ARTEFACTS)}, got {self.artefacts}": unknown or not self.artefacts,
+            "multiples is empty; give at least one, such as 1": not self.multiples,
+            f"multiples must be whole numbers >= 1, got {self.multiples}": not whole,
+            f"widths must be >= 1, got {self.widths}; give an empty tuple for no distillation":
+                min(self.widths, default=1) < 1,
+            f"kicks must be >= 1, got {self.kicks}; give an empty tuple for none": min(self.kicks, default=1) < 1,
+            **{f"{name} must be in (0, 1), got {x:g}": not 0 < x < 1
+               for name, x in (("quantile", self.quantile), ("confidence", self.confidence))},
+            **{f"{name} must be >= 1, got {getattr(self, name)}": getattr(self, name) < 1
+               for name in ("iterations", "pairs", "rounds")},
+        })  # fmt: skip
         allowed_failures(self.starts, self.quantile, self.confidence)
 
     def to_dict(self) -> dict[str, Any]:

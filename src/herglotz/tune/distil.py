@@ -99,12 +99,7 @@ def pairs_of(states: State, stride: int, count: int, seed: int) -> tuple[State, 
 
 
 def distil(
-    model: ContactLagrangian,
-    before: State,
-    after: State,
-    h: float,
-    *,
-    iterations: int = 80,
+    model: ContactLagrangian, before: State, after: State, h: float, *, iterations: int = 80
 ) -> tuple[ContactLagrangian, float]:
     """Fit every parameter of a model to a flow map over h; the given model is the starting point.
 

@@ -130,13 +130,7 @@ def can_kick(model: ContactLagrangian) -> bool:
 
 
 def fit_kicks(
-    model: ContactLagrangian,
-    before: State,
-    after: State,
-    h: float,
-    *,
-    kicks: int,
-    iterations: int = 150,
+    model: ContactLagrangian, before: State, after: State, h: float, *, kicks: int, iterations: int = 150
 ) -> KickStepper:
     """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
 

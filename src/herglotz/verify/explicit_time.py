@@ -32,14 +32,15 @@ def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bo
     strict, bound
         Of the contact property, and of the other identities.
     """
-    members = [replace(known, L_d=family.at(_time(family, k, known.h))) for k in range(steps)]
-    w = _rollout(members, known.states)
+    times = torch.as_tensor(family.t0, dtype=known.states.s.dtype) + known.h * torch.arange(steps).to(known.states.s)
+    members = [replace(known, L_d=family.at(t.reshape(1))) for t in times]
+    w = _rollout(family, known, times)
     q0, p0, s0 = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
-    t = torch.cat([_time(family, k, known.h) for k in range(steps)]).to(w.s).expand_as(w.c)[w.ok]
+    t = times.expand_as(w.c)[w.ok]
     by_t, by_h = time_defect(family, State(q0, p0, s0), t, known.h)
     E = torch.stack(energies(family.L_d, q0, w.q[:, 1:][w.ok], s0, t, known.h)).abs()
     time = worst(torch.stack([by_t, by_h]).abs() / E.sum(0).clamp_min(torch.finfo(E.dtype).tiny))
-    fan = _fan(members, known.states, w)
+    fan = _fan(family, known, w)
     checks = [convergence(w), positive_factor(w), contact(w, strict), volume(w, bound)]
     checks.append(Check.at_most("time", "time: step keeps η + E dt up to c", time, bound))
     checks.append(_matching(members, w, bound))
@@ -52,48 +53,28 @@ def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bo
     return checks
 
 
-def _time(family: TimeDependent, k: int, h: float) -> Tensor:
-    """t_k, (1,)."""
-    return (torch.as_tensor(family.t0, dtype=torch.float64) + k * h).reshape(1)
-
-
-def _stepped(members: list[Subject], k: int) -> Flow:
-    """The map of the first k steps."""
-
-    def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        state = State(q, p, s)
-        for member in members[:k]:
-            state = _step(member, state)
-        return state
-
-    return flow
-
-
-def _step(member: Subject, state: State) -> State:
-    assert member.L_d is not None
-    return Stepper(member.L_d).step(state, member.h).state
-
-
-def _rollout(members: list[Subject], start: State) -> SampledRollout:
+def _rollout(family: TimeDependent, known: Subject, times: Tensor) -> SampledRollout:
     """Motions with the derivative of every step; a sample whose step fails stays NaN, and is not ok."""
-    states, rows = [start], []
-    for member in members:
-        assert member.L_d is not None
-        step = Stepper(member.L_d).step(states[-1], member.h)
-        _, D = flow_derivative(_stepped([member], 1), *states[-1])
-        states.append(State(*(x.detach() for x in step.state)))
-        rows.append((step.c.detach(), step.status, D))
-    c, status, D = (torch.stack(x, 1) for x in zip(*rows, strict=True))
-    q, p, s = (torch.stack([getattr(x, name) for x in states], 1) for name in ("q", "p", "s"))
-    return SampledRollout(q, p, s, c, status, D)
+    with torch.no_grad():
+        out = Stepper(family).rollout(*known.states, h=known.h, steps=len(times), inputs=times[:, None])
+    t, h = times.expand(out.status.shape).flatten(), known.h
+    q, p, s = (x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s))
+    _, D = flow_derivative(lambda *x: family.step_at(State(*x), t, h).state, q, p, s)
+    c = partials(family.at(t[:, None]), q, out.q[:, 1:].flatten(0, 1), s, h).c.detach()
+    c, D = (x.unflatten(0, out.status.shape) for x in (c, D))
+    return SampledRollout(out.q, out.p, out.s, c, out.status, D)
 
 
-def _fan(members: list[Subject], start: State, w: SampledRollout) -> Fan:
+def _fan(family: TimeDependent, known: Subject, w: SampledRollout) -> Fan:
     """S^k for k = 1, 2, K − 1, K along the motions, where all their steps converged."""
     whole = (w.status == Status.CONVERGED).all(-1)
-    start = State(*(x[whole] for x in start))
-    count = len(members)
-    S = {k: generating_function(_stepped(members, k), *start) for k in sorted({1, 2, count - 1, count})}
+    start = State(*(x[whole] for x in known.states))
+
+    def stepped(k: int) -> Flow:
+        """The map of the first k steps."""
+        return lambda q, p, s: family.rollout(State(q, p, s), float(family.t0), known.h, k).final
+
+    S = {k: generating_function(stepped(k), *start) for k in sorted({1, 2, w.steps - 1, w.steps})}
     sigma = dict(enumerate(w.c[whole].cumprod(-1).unbind(-1), 1))
     keep = {k: (g.spread > CAUSTIC * k * S[1].spread) & torch.isfinite(g.D2).all(-1) for k, g in S.items()}
     return Fan(start, S, sigma, keep, int((~whole).sum()))

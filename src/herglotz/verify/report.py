@@ -42,6 +42,14 @@ class Check:
         """Return a check of an object that does not exist for this target: it neither passes nor fails."""
         return cls(name, statement, math.nan, math.nan, True, note, applies=False)
 
+    @property
+    def verdict(self) -> tuple[str, str, str]:
+        """Return value, bound and result as a table shows them."""
+        if not self.applies:
+            return "–", "", "n/a"
+        sign = "≤" if self.relation == "<=" else self.relation
+        return f"{self.value:.3g}", f"{sign} {self.bound:.3g}", "ok" if self.passed else "FAIL"
+
     def to_dict(self) -> dict[str, Any]:
         """Return a plain dictionary for JSON; a value that is not finite becomes None."""
         value, bound = (x if math.isfinite(x) else None for x in (self.value, self.bound))
@@ -94,10 +102,7 @@ class Report:
         notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
         for check in self.checks:
             mark = f" [{notes.index(check.note) + 1}]" if check.note else ""
-            sign = "≤" if check.relation == "<=" else check.relation
-            verdict = "ok" if check.passed else "FAIL"
-            row = (check.statement + mark, f"{check.value:.3g}", f"{sign} {check.bound:.3g}", verdict)
-            rows.append(row if check.applies else (check.statement + mark, "–", "", "n/a"))
+            rows.append((check.statement + mark, *check.verdict))
         widths = [max(_width(row[i]) for row in rows) for i in range(3)]
         lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
         lines += [

@@ -11,7 +11,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces, partials
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
-from herglotz.verify.action import derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
+from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.derivative import derivative
 from herglotz.verify.explicit_time import in_time
@@ -96,18 +96,10 @@ def verify(
     """
     if steps < 2:
         raise InputError(f"steps must be >= 2, got {steps}; momentum matching joins two")
-    if tolerance is not None and not tolerance > 0:
-        raise InputError(f"tolerance must be > 0, got {tolerance}")
     known = subject(target, h, samples, seed)
-    dtype = known.states.q.dtype
-    if dtype not in IDENTITY:
-        raise InputError(f"states must be float32 or float64, got {dtype}; convert them with .double()")
-    usual = DIFFERENCED if known.differenced else IDENTITY
-    identity = usual[dtype] if tolerance is None else tolerance
-    strict = CONTACT[dtype] if tolerance is None and known.L_d is not None else identity
-
+    strict, identity = _bounds(known, tolerance)
+    details = _details(known, steps, seed)
     if isinstance(known.L_d, TimeDependent):
-        details = _details(known, steps, seed)
         return Report(known.name, tuple(in_time(known, known.L_d, steps, strict, identity)), details)
     w = sampled_rollout(known, steps)
     behind = replace(known, L_d=model) if known.forced else known
@@ -116,32 +108,47 @@ def verify(
     missing: tuple[str, ...] = ()
     if not known.differenced:  # else DΦ̃ is made of differences
         checks.append(derivative(known, w))
-    if known.forced and force is None:
+    if force is not None:  # not a contact map: no generating function, and the volume is not c^{n+1}
+        checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
+    elif known.forced:
         missing = ("contact", "momentum")
         checks[2] = replace(checks[2], note=f"{checks[2].note}. {FORCED}")
-    elif force is None:
-        loose = identity
-        if tolerance is None:
-            strict, loose = (rounded(bound, w) for bound in (strict, identity))
-        checks.append(contact(w, strict))
-        f = fan(known, steps, seed + 1)
-        checks += [volume(w, identity), momentum_matching(known, w, identity), *derivatives(f, loose, identity)]
-        right, left = hamiltonians_exist(known, w)
-        checks.append(hamilton_jacobi(known, f, identity) if right else NO_H_PLUS)
-        if known.L_d is not None and left:
-            checks += [left_formalism(known, w, loose), left_hamilton_jacobi(known, f, identity)]
-        elif known.L_d is not None:
-            checks += NO_H_MINUS
-    else:  # not a contact map: no generating function, and the volume is not c^{n+1}
-        checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
-    details = _details(known, steps, seed)
+    else:
+        fixed = tolerance is not None
+        loose = identity if fixed else rounded(identity, w)
+        checks.append(contact(w, strict if fixed else rounded(strict, w)))
+        checks += _of_a_contact_map(known, w, identity, loose, fan(known, steps, seed + 1))
     if known.scene is not None and known.scene.exact:
         checks.append(_exact_flow(known, w, identity))
     if known.run is not None:
-        more, numbers = data_checks(known.run)
+        more, details["data"] = data_checks(known.run)
         checks += more
-        details["data"] = numbers
     return Report(known.name, tuple(checks), details, missing)
+
+
+def _bounds(known: Subject, tolerance: float | None) -> tuple[float, float]:
+    """Bounds of the contact property and of the other identities."""
+    if tolerance is not None and not tolerance > 0:
+        raise InputError(f"tolerance must be > 0, got {tolerance}")
+    dtype = known.states.q.dtype
+    if dtype not in IDENTITY:
+        raise InputError(f"states must be float32 or float64, got {dtype}; convert them with .double()")
+    if tolerance is not None:
+        return tolerance, tolerance
+    identity = (DIFFERENCED if known.differenced else IDENTITY)[dtype]
+    return identity if known.L_d is None else CONTACT[dtype], identity
+
+
+def _of_a_contact_map(known: Subject, w: SampledRollout, bound: float, loose: float, f: Fan) -> list[Check]:
+    """The identities that hold without forces only; `loose` bounds those that the rounding of q enters."""
+    right, left = hamiltonians_exist(known, w)
+    checks = [volume(w, bound), momentum_matching(known, w, bound), *derivatives(f, loose, bound)]
+    checks.append(hamilton_jacobi(known, f, bound) if right else NO_H_PLUS)
+    if known.L_d is None:
+        return checks
+    if not left:
+        return [*checks, *NO_H_MINUS]
+    return [*checks, left_formalism(known, w, loose), left_hamilton_jacobi(known, f, bound)]
 
 
 def _details(known: Subject, steps: int, seed: int) -> dict[str, Any]:

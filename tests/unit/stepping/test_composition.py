@@ -8,7 +8,7 @@ import torch
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_defect, flow_derivative
 from herglotz.scenes import damped_pendulum, left, midpoint, midpoint_heun, reference_flow, right, scene
-from herglotz.stepping import Composition, State, Status, StepError, Stepper, adjoint_pair, kahan_li, suzuki, yoshida
+from herglotz.stepping import Composition, State, Status, Stepper, adjoint_pair, kahan_li, suzuki, yoshida
 from herglotz.theory import ContactSplitting
 
 GAMMA, HORIZON = 0.4, 2.0
@@ -177,8 +177,6 @@ def test_failure_in_one_sample():
     assert out.state.q.isnan().flatten().tolist() == [False, True, False]
     singular = Composition([(lambda q0, q1, s0, h: (q0**2 + q1**2).sum(-1) / 2 + 0 * s0 * h, 0.5), (STRANG, 0.5)])
     assert set(singular.step(start(), 0.1).status.tolist()) == {int(Status.SINGULAR)}
-    with pytest.raises(StepError, match=r"step 0: step failed at sample \(1,\): DIVERGED"):
-        suzuki(STRANG, throw=True).rollout(*state, h=0.1, steps=2)
 
 
 @pytest.mark.parametrize(

@@ -7,23 +7,19 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.scenes import reference_flow, scene
-from herglotz.stepping import State, Status, StepError
+from herglotz.stepping import State, Status
 from herglotz.theory import (
     EvolutionStepper,
     commutation_defect,
     contact_vector_field,
     energy_on_section,
     evolution_vector_field,
-    increment_gradient,
     legendrian_defect,
-    mean_value_gradient,
-    midpoint_gradient,
     prolongation,
 )
 from herglotz.theory.jacobi import join
 
 PENDULUM = scene("damped_pendulum").hamiltonian
-GRADIENTS = [midpoint_gradient, increment_gradient, mean_value_gradient]
 
 
 def coupled(q, p, s):
@@ -65,46 +61,36 @@ def test_H_is_kept_to_round_off(H, n, steps):
     assert float((out.s[:, -1] - out.s[:, 0]).min()) > 0.1  # something happened
 
 
-@pytest.mark.parametrize("discrete", GRADIENTS)
-def test_every_discrete_gradient_keeps_H(discrete):
-    # fails if a discrete gradient loses its secant condition inside the solve
-    assert drift(EvolutionStepper(coupled, discrete_gradient=discrete), start(2), 25)[0] <= 3e-14
-
-
-@pytest.mark.parametrize("discrete", GRADIENTS)
-def test_H_shrinks_by_c_along_the_contact_field(discrete):
+def test_H_shrinks_by_c_along_the_contact_field():
     # fails if H̄ is not the mean of both ends: H1 = c H0 with the c that the step reports
-    stepper = EvolutionStepper(coupled, field="contact", discrete_gradient=discrete)
-    worst, out = drift(stepper, start(2), 40)
+    worst, out = drift(EvolutionStepper(coupled, field="contact"), start(2), 40)
     assert worst <= 1e-13
     assert float(out.sigma[:, -1].max()) < 0.5
 
 
 def test_the_two_fields_are_not_exchanged():
-    # fails if "contact" keeps H, or "evolution" does not; the mean-value gradient gives ∇̄_sH = γ = 0.2 exactly
-    for field, factor in (("evolution", 1.0), ("contact", (0.99 / 1.01) ** 20)):
-        out = EvolutionStepper(PENDULUM, field=field, discrete_gradient=mean_value_gradient).rollout(
-            *start(1), h=0.1, steps=20
-        )
-        energy = PENDULUM(out.q, out.p, out.s)
+    # fails if "contact" keeps H, or "evolution" does not; ∇̄_sH is γ = 0.2 but for the correction, 1e-4 of σ here
+    for field in ("evolution", "contact"):
+        out = EvolutionStepper(PENDULUM, field=field).rollout(*start(1), h=0.1, steps=20)
+        energy, factor = PENDULUM(out.q, out.p, out.s), out.sigma[:, -1] if field == "contact" else 1.0
         assert float((energy[:, -1] / energy[:, 0] - factor).abs().max()) < 1e-13
-        torch.testing.assert_close(out.sigma[:, -1], torch.full_like(out.s[:, 0], (0.99 / 1.01) ** 20))
+        torch.testing.assert_close(
+            out.sigma[:, -1], torch.full_like(out.s[:, 0], (0.99 / 1.01) ** 20), rtol=1e-3, atol=0
+        )
 
 
-@pytest.mark.parametrize("discrete", GRADIENTS)
 @pytest.mark.parametrize("field", ["evolution", "contact"])
-def test_order_two_on_a_nonlinear_damped_problem(field, discrete):
+def test_order_two_on_a_nonlinear_damped_problem(field):
     # fails if p in B is taken at an end (order 1), or H̄ is H0
     vector_field = {"evolution": evolution_vector_field, "contact": contact_vector_field}[field]
     exact = join(*reference_flow(partial(vector_field, coupled), *start(2), 0.8, 1e-11))
     errors = []
     with torch.no_grad():
         for steps in (5, 10):
-            stepper = EvolutionStepper(coupled, field=field, discrete_gradient=discrete)
-            out = stepper.rollout(*start(2), h=0.8 / steps, steps=steps)
+            out = EvolutionStepper(coupled, field=field).rollout(*start(2), h=0.8 / steps, steps=steps)
             errors.append(float((join(*out.final) - exact).abs().max()))
     slope = torch.log2(torch.tensor(errors[0] / errors[1])).item()
-    print(f"{field} {discrete.__name__}: errors {errors[0]:.1e}, {errors[1]:.1e}, slope {slope:.2f}")
+    print(f"{field}: errors {errors[0]:.1e}, {errors[1]:.1e}, slope {slope:.2f}")
     assert slope == pytest.approx(2, abs=0.15)
 
 
@@ -205,12 +191,10 @@ def test_failures_are_per_sample():
 
     q = torch.tensor([[1.0], [0.01], [2.0]], dtype=torch.float64)
     state = State(q, torch.tensor([[0.1], [-9.0], [0.1]], dtype=torch.float64), q[:, 0])
-    out = EvolutionStepper(wall, max_iterations=8).step(state, 0.1)
+    out = EvolutionStepper(wall).step(state, 0.1)
     assert out.status[[0, 2]].tolist() == [Status.CONVERGED] * 2
     assert int(out.status[1]) != Status.CONVERGED
     assert bool(out.state.q[1].isnan().all())
-    with pytest.raises(StepError, match=r"step 0: step failed at sample \(1,\)"):
-        EvolutionStepper(wall, max_iterations=8, throw=True).rollout(*state, h=0.1, steps=2)
 
 
 @pytest.mark.parametrize(

@@ -220,7 +220,7 @@ def test_what_is_printed():
     assert name_of(0.5 * one + turn, zero, 1.5, names) == "affine motion x′ = 0.5 x − y, y′ = x + 0.5 y, s′ = 1.5 s"
     assert name_of(one, zero, 2.0, names) == SCALING
     B = torch.tensor([[2.0, 0.3], [0.3, 0.0]], dtype=F64)
-    J = formula(turn, zero, torch.tensor(2.0), torch.tensor(-4.0), torch.tensor([0.5, 0.0]), B, names)
+    J = formula((turn, zero, torch.tensor(2.0)), (torch.tensor(-4.0), torch.tensor([0.5, 0.0]), B), names)
     assert J == "x p_y − y p_x − 2 s − 0.5 x − x² − 0.3 x y + 4"
 
 

@@ -67,6 +67,22 @@ def test_terms_are_found_without_a_linear_start(monkeypatch):
     assert found.rms < 1.2 * 0.003
 
 
+def test_other_terms_are_fitted_over_the_same_segments():
+    # fails if a gap, which several model steps cross, makes segments of another number for the next terms
+    q = simulate(scene("damped_pendulum"), trajectories=1, steps=100, h=0.1, noise=0.003, seed=0).q
+    stay = torch.ones(101, dtype=torch.bool)
+    stay[5:15] = False
+    data = Trajectories.of((torch.arange(101).double() * 0.1)[stay], q[stay], angles=(True,))
+    search = DictionarySearch(data, estimate_baseline(data, outliers=False, drag=False), FitConfig().resolved(data))
+    terms, values = search._bare()
+    stages = search._stages(terms, values, 1)
+    fitted = stages.fit(20, 0.003, None, None)
+    assert fitted is not None
+    assert fitted.problem.grid.segments == 4
+    found = search._found(terms, stages, fitted)
+    assert search._problem(found, search.all, 1)[1].grid.segments == 4
+
+
 def test_fewer_residuals_than_a_dictionary_needs_give_no_start():
     # fails if noise chooses the smallest singular value: 206 coefficients from 188 windows of three coordinates
     t = torch.arange(60).double() * 0.1

@@ -166,6 +166,33 @@ def test_lifted_solution_is_the_stepped_one():
         torch.testing.assert_close(path.x[..., 2], out.s, rtol=1e-9, atol=1e-10)
 
 
+@pytest.mark.parametrize("level", ["linear", "affine", "dry"])
+def test_linear_sweeps_give_the_path_that_solved_steps_give(level, monkeypatch):
+    # fails if a step that is linear about the guess ends where its equation does not hold, or friction lets go
+    if level == "dry":
+        model, data = model_of("forced", coulomb=True, sticking=True, potential_width=0), data_of()
+        with torch.no_grad():
+            model.friction.coulomb.fill_(0.3)
+        problem = ShootingProblem(model, data, segment_grid(data, 30, 1.0), sigma=0.1)
+        x = problem.pack(problem.parameters.get(), torch.tensor([[1.0, 0.4]] * 3, dtype=torch.float64))
+    else:
+        problem, x = shooting_problem(level)
+    theta, states = problem.unpack(x)
+    start = problem.with_s(states)
+    rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
+    given = problem.parameters, theta, start, problem.grid.h, rough, 1e-12
+    swept = solve_path(*given, sweeps=30, u=problem.u)
+    monkeypatch.setattr(lifted_newton, "linear_steps", lambda *_: None)
+    solved = solve_path(*given, sweeps=30, u=problem.u)
+    assert swept is not None
+    assert solved is not None
+    torch.testing.assert_close(swept.x, solved.x, rtol=1e-9, atol=1e-11)
+    torch.testing.assert_close(swept.A, solved.A, rtol=1e-7, atol=1e-9)
+    if level == "dry":
+        still = (swept.x[0, 1:, 0] == swept.x[0, :-1, 0]).sum()
+        assert 0 < int(still) < 60  # it slides and sticks
+
+
 class Rosenbrock:
     """A curved valley: r = (10 (y − x²), 1 − x)."""
 

@@ -234,6 +234,18 @@ def test_pruning_leaves_out_what_is_noise():
     torch.testing.assert_close(x[kept], again, rtol=1e-6, atol=1e-9)
 
 
+def test_the_simplest_of_terms_that_do_the_same_stays():
+    # fails if noise chooses between a tilt and a third harmonic that make nearly the same force
+    make = torch.Generator().manual_seed(0)
+    J = torch.randn(400, 3, generator=make, dtype=torch.float64)
+    J[:, 1] = J[:, 0] + 1e-3 * J[:, 1]  # 1 is the simple one; 0 is what the data were made with
+    y = J @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64) + torch.randn(400, generator=make, dtype=torch.float64)
+    A = J.T @ J
+    x = torch.linalg.solve(A, J.T @ y)
+    assert prune(A, x, torch.arange(3), math.log(400), simplest=torch.tensor([1]))[0].tolist() == [1]
+    assert prune(A, x, torch.arange(3), math.log(400), simplest=torch.tensor([2]))[0].tolist() != [1, 2]  # 2 may go
+
+
 def test_triples_spread_out():
     # fails if the first ones are taken instead of an even choice
     t = double_pendulum().triples(None)

@@ -147,11 +147,7 @@ COMMENTS = {
 
 
 def function(
-    program: Program,
-    head: str,
-    numbers: Iterable[int],
-    outputs: Outputs,
-    handed_on: Mapping[int, str],
+    program: Program, head: str, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> str:
     """One C function of statements and outputs."""
     name = lambda m: _name(program, int(m[1]), handed_on)  # noqa: E731

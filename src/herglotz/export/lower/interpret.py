@@ -37,7 +37,8 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
     inputs
         The numbers of each argument, in its order.
     """
-    places = [node for node in graph.code.graph.nodes if node.op == "placeholder"]
+    nodes = list(graph.code.graph.nodes)
+    places = [node for node in nodes if node.op == "placeholder"]
     values: dict[fx.Node, Any] = {}
     for node, numbers in zip(places, inputs, strict=False):
         shape = (1, *node.meta["example"].shape[1:])
@@ -46,23 +47,13 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
         array = constant.detach().cpu().numpy()
         values[node] = array.astype(object) if array.dtype.kind == "f" else array
     table = operations(program)
-
-    def value(x: Any) -> Any:
-        if isinstance(x, fx.Node):
-            return values[x]
-        if isinstance(x, (list, tuple)):
-            return [value(y) for y in x]
-        return x
-
-    for node in graph.code.graph.nodes:
-        if node.op == "call_function":
-            if node.target not in table:
-                raise InputError(f"{node.target} cannot be written as C yet; export the model as .pt2 instead")
-            options = {k: value(v) for k, v in node.kwargs.items() if k in ("value", "alpha")}
-            values[node] = table[node.target](*value(node.args), **options)
-        elif node.op == "output":
-            return [value(x) for x in node.args[0]]
-    raise AssertionError("a graph without output")
+    known = lambda x: fx.map_arg(x, values.__getitem__)  # noqa: E731
+    for node in (node for node in nodes if node.op == "call_function"):
+        if node.target not in table:
+            raise InputError(f"{node.target} cannot be written as C yet; export the model as .pt2 instead")
+        options = {k: x for k, x in node.kwargs.items() if k in ("value", "alpha")}
+        values[node] = table[node.target](*known(node.args), **known(options))
+    return list(known(nodes[-1].args[0]))  # the output
 
 
 def _array(atoms: Sequence[Atom]) -> np.ndarray:

@@ -57,10 +57,7 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
         programs = programs_of(model, entries, ("rollout", "linearise", "init"))
     u = ("u",) if entries["inputs"] else ()
     said = OUTPUTS if entries["box"] is not None else OUTPUTS[:-1]
-    further = {
-        "init": (("q0", "q1", "s0", "h"), ("p", "s")),
-        "linearise": (("q", "p", "s", "h"), (*said, "jacobian")),
-    }
+    further = {"init": (("q0", "q1", "s0", "h"), ("p", "s")), "linearise": (("q", "p", "s", "h"), (*said, "jacobian"))}
     properties = {KEY: text}
     for name, (inputs, outputs) in further.items():
         second = graph_of(programs[name], (*inputs, *u), outputs, {})

@@ -191,15 +191,13 @@ class Program:
 
     def product(self, x: Sequence[Atom], weight: np.ndarray, bias: Sequence[Atom] | None) -> list[Atom]:
         """Σ_j x_j w_jk + b_k for one row x (k,), w (k, m) and b (m,)."""
-        kept = [j for j, value in enumerate(x) if value != 0.0 and any(w != 0.0 for w in weight[j])]
+        kept = [j for j, value in enumerate(x) if value != 0.0 and np.any(weight[j] != 0.0)]
         x, weight = [x[j] for j in kept], weight[kept]
         size = weight.shape[1]
         start = [0.0] * size if bias is None else list(bias)
         if not kept:
             return start
-        constant = all(isinstance(w, float) for w in weight.flat)
-        fixed = all(not isinstance(v, Ref) for v in x)
-        if constant and not fixed and all(isinstance(b, float) for b in start):
+        if not _varies([*weight.flat, *start]) and _varies(x):
             if size >= LOOP and len(kept) <= 4:
                 return self._few_inputs(x, weight, start)
             if max(len(kept), size) >= LOOP and np.count_nonzero(weight) >= min(DENSE, weight.size):
@@ -304,6 +302,11 @@ def literal(value: float) -> str:
         )
     text = repr(float(value))
     return f"R({text})" if value >= 0 else f"(-R({text[1:]}))"
+
+
+def _varies(atoms: Iterable[Atom]) -> bool:
+    """Whether any of these numbers is a result of a statement."""
+    return any(isinstance(x, Ref) for x in atoms)
 
 
 def _reads(atoms: Iterable[Atom]) -> set[int]:

@@ -28,6 +28,7 @@ class SegmentGrid:
     end: Tensor  # (S,) last node of each segment
     row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
     part: Tensor  # (S, K) where in this recorded step the middle of the model step is, from 0 to 1
+    length: int  # recorded steps of a segment that were asked for: the same length gives the same segments
 
     @property
     def segments(self) -> int:
@@ -98,4 +99,5 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         end=torch.tensor([len(line) for line in steps], device=device),
         row=torch.tensor(padded_rows, device=device),
         part=torch.tensor(padded_parts, dtype=data.t.dtype, device=device),
+        length=length,
     )

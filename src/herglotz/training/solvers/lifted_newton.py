@@ -4,11 +4,15 @@ With a guess X for every state, each sweep evaluates all K steps Φ̃(X_k) and t
 then carries the defects forward, e_{k+1} = A_k e_k + Φ̃(X_k) − X_{k+1}. It converges quadratically, needs two to four
 sweeps from the trajectory of a slightly different parameter vector, and costs a few batched evaluations where
 stepping costs K small ones (Albersmeyer & Diehl 2010, the lifted Newton method).
+
+Φ̃ is implicit: its own equation F(q_k, q_{k+1}) = 0 is linearised about the guess of q_{k+1} in the same sweep, so that
+a sweep costs one evaluation of L_d. Where these sweeps do not converge, sweeps that solve every step follow.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +20,10 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
+from herglotz.mechanics.legendre import beyond
 from herglotz.stepping import Status, solve_step
+from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.parameter_vector import FixedModel, ParameterVector
 
@@ -42,10 +49,22 @@ def solve_path(
     u: Tensor | None = None,  # (S, K, m) input of every step
 ) -> Path | None:
     """The trajectories from `start`, or None where the sweeps do not converge."""
+    L_d, n = parameters.at(theta, u), (start.shape[-1] - 1) // 2
+    if not L_d.capabilities.sticking or n == 1:
+        path = _swept(linear_steps, L_d, start, h, guess, tol, sweeps)
+        if path is not None:
+            return path
+    return _swept(all_steps, L_d, start, h, guess, tol, sweeps)
+
+
+def _swept(
+    step: Callable[[FixedModel, Tensor, Tensor], tuple[Tensor, Tensor] | None], L_d: FixedModel, start: Tensor,
+    h: Tensor, guess: Tensor, tol: float, sweeps: int,
+) -> Path | None:  # fmt: skip
     x = torch.cat([start[:, None], guess[:, 1:]], 1)
     previous = float("inf")
     for _ in range(sweeps):
-        stepped = all_steps(parameters.at(theta, u), x, h)
+        stepped = step(L_d, x, h)
         if stepped is None:
             return None
         y, A = stepped
@@ -98,6 +117,27 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     P = solution.P
     y = torch.cat([solution.q1, momentum_plus(P), (s0 + P.L)[..., None]], -1)
     return y, step_derivative(P, p0)
+
+
+def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
+    """The same with F linear about the next state's q; exact, and equal to `all_steps`, where F = 0 there.
+
+    Where friction is set-valued (one coordinate), F at rest tells whether it holds.
+    """
+    n = (x.shape[-1] - 1) // 2
+    q0, p0, s0, q1 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n], x[:, 1:, :n]
+    if L_d.capabilities.sticking:
+        rest = at_rest(PartialsEquation(L_d, q0, p0, s0, h, 2, increments=False))
+        delta = beyond(rest.start, rest.bound)
+        q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
+    P = partials(L_d, q0, q1, s0, h, order=2)
+    dq = -torch.linalg.solve_ex(momentum_jacobian(P, p0), momentum_residual(P, p0)[..., None])[0]
+    p1_q1 = P.D22
+    if P.force is not None:
+        p1_q1 = p1_q1 + P.force.plus_2
+        dq = dq if P.force.held is None else torch.where((P.force.held > 0)[..., None], 0.0, dq)
+    p1, s1 = momentum_plus(P) + (p1_q1 @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
+    return torch.cat([q1 + dq[..., 0], p1, s1[..., None]], -1), step_derivative(P, p0)
 
 
 def parameter_derivatives(
