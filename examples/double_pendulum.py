@@ -34,6 +34,9 @@ plot_prediction(found)
 # And moving: `herglotz plot RUN --animate`, or
 
 # %%
+from pathlib import Path
+
 from herglotz.plots import save_animation
 
-save_animation(run, "double_pendulum.gif", trajectory=2)
+save_animation(run, "motion.gif", trajectory=2)
+Path("motion.gif")

@@ -1,12 +1,14 @@
 """Run the scripts of examples/ cell by cell and write each as a page: `python tools/pages.py [NAME ...]`.
 
 A cell begins with `# %%`; one with `# %% [markdown]` holds text behind `# `. What a cell prints stands below its code,
-and so does the value of its last line; a figure becomes a PNG beside the page, in docs/tutorials/.
+and so does the value of its last line; a figure becomes a PNG beside the page, in docs/tutorials/, and the path of a
+GIF this animation. `make docs` offers each page as a notebook (`notebook`), with what was shown.
 """
 
 from __future__ import annotations
 
 import ast
+import base64
 import contextlib
 import io
 import os
@@ -66,10 +68,47 @@ def page(name: str) -> str:
             few = Image.open("figure.png").convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
             few.save(PAGES / f"{name}-{drawn}.png", optimize=True)
             parts.append(f"![{value.get_suptitle()}]({name}-{drawn}.png)")
+        elif isinstance(value, Path) and value.suffix == ".gif":
+            (PAGES / f"{name}-{value.name}").write_bytes(value.read_bytes())
+            parts.append(f"![{value.stem}]({name}-{value.name})")
         elif value is not None:
             parts.append(f"```text\n{value}\n```")
     parts.append(f"*This page is `examples/{name}.py`, executed by `python tools/pages.py {name}`.*")
     return "\n\n".join(parts) + "\n"
+
+
+def notebook(written: str, folder: Path) -> dict[str, Any]:
+    """An executed page as a Jupyter notebook (nbformat 4.5): its text, its code, and what each cell showed."""
+    found: list[dict[str, Any]] = []
+    for kind, body in parts_of(written):
+        if kind in ("markdown", "python"):
+            code = {} if kind == "markdown" else {"execution_count": None, "outputs": []}
+            name = "markdown" if kind == "markdown" else "code"
+            found.append({"cell_type": name, "id": f"cell-{len(found)}", "metadata": {}, "source": body, **code})
+            continue
+        if kind == "text":
+            output = {"output_type": "stream", "name": "stdout", "text": body + "\n"}
+        else:
+            picture = base64.b64encode((folder / body).read_bytes()).decode()
+            data = {f"image/{Path(body).suffix[1:]}": picture}
+            output = {"output_type": "display_data", "metadata": {}, "data": data}
+        found[-1]["outputs"].append(output)
+    kernel = {"kernelspec": {"name": "python3", "display_name": "Python 3", "language": "python"}}
+    return {"nbformat": 4, "nbformat_minor": 5, "metadata": kernel, "cells": found}
+
+
+def parts_of(written: str) -> list[tuple[str, str]]:
+    """An executed page in pieces: markdown, python, text (what was printed) and picture (its file)."""
+    found = []
+    pattern = r"^```(\w+)\n(.*?)\n```$|^!\[[^\n]*\]\(([\w.-]+)\)$"
+    at = 0
+    for match in [*re.finditer(pattern, written, re.M | re.S), None]:
+        between = written[at : match.start() if match else None].strip()
+        found += [("markdown", between)] if between else []
+        if match:
+            found.append((match[1], match[2]) if match[1] else ("picture", match[3]))
+            at = match.end()
+    return found
 
 
 def main(chosen: list[str]) -> None:

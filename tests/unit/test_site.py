@@ -1,6 +1,7 @@
 """The documentation site, the tutorials and the package's metadata: what can be checked without building them."""
 
 import ast
+import base64
 import importlib
 import re
 import sys
@@ -12,7 +13,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 sys.path.insert(0, str(ROOT))
-from tools.pages import cells, page  # noqa: E402
+from tools.pages import cells, notebook, page, parts_of  # noqa: E402
 from tools.readme import elsewhere  # noqa: E402
 
 
@@ -43,8 +44,25 @@ def test_a_tutorial_is_its_script(path):
     assert all(text in shown for is_text, text in cells(path.read_text(encoding="utf-8")) if is_text)
     for body in code:
         ast.parse(body)
-    for picture in re.findall(r"\]\(([\w-]+\.png)\)", shown):
+    for picture in re.findall(r"\]\(([\w-]+\.(?:png|gif))\)", shown):
         assert (ROOT / "docs" / "tutorials" / picture).exists()
+
+
+@pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.stem)
+def test_a_tutorial_is_offered_as_a_notebook(path):
+    # fails if a cell, an output or a picture of the page is lost on its way into the notebook
+    folder = ROOT / "docs" / "tutorials"
+    written = (folder / f"{path.stem}.md").read_text(encoding="utf-8")
+    made = notebook(written, folder)
+    code = [cell for cell in made["cells"] if cell["cell_type"] == "code"]
+    assert [c["source"] for c in code] == [body for text, body in cells(path.read_text("utf-8")) if not text]
+    outputs = [output for cell in code for output in cell["outputs"]]
+    kinds = [kind for kind, _ in parts_of(written)]
+    assert len(outputs) == kinds.count("text") + kinds.count("picture") > 0
+    assert len({cell["id"] for cell in made["cells"]}) == len(made["cells"])
+    for output in outputs:
+        for kind, body in output.get("data", {}).items():
+            assert base64.b64decode(body)[:4] in {"image/png": [b"\x89PNG"], "image/gif": [b"GIF8"]}[kind]
 
 
 @pytest.mark.slow

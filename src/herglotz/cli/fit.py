@@ -8,12 +8,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import print_json, say
+from herglotz.cli.common import check_output_folder, print_json, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
 
 if TYPE_CHECKING:
-    from herglotz.training import Run
+    from herglotz.data import Trajectories
+    from herglotz.training import FitConfig, Run
 
 NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 DESCRIPTION = """\
@@ -37,6 +38,9 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_run_flags(parser)
     add_progress_flags(parser)
     parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
+    parser.add_argument(
+        "--tensorboard", type=Path, metavar="FOLDER", help="log for TensorBoard too (the log in RUN is history.csv)"
+    )
     add_machine_flags(parser)
     add_model_flags(parser.add_argument_group("model"))
     add_optimiser_flags(parser.add_argument_group("objective and optimiser"))
@@ -50,12 +54,32 @@ def run(arguments: argparse.Namespace) -> int:
     check_run_folder(out, arguments.resume)
 
     from herglotz.data import load
-    from herglotz.data.lock import locked
-    from herglotz.training import fit, load_run, save_run
+    from herglotz.training import load_run
+    from herglotz.training.tensorboard import summary_writer, write_tensorboard
 
     config = settings_of(arguments)
+    if arguments.tensorboard is not None:
+        check_output_folder(arguments.tensorboard)
+        summary_writer()  # missing, it is found before training
     data = load(arguments.data, **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
+    _fit_into(out, data, config, arguments)
+    result = load_run(out)  # what later commands will see, and on the cpu
+    if arguments.tensorboard is not None:
+        write_tensorboard(result, arguments.tensorboard)
+    drawn = _draw(result, out) if not arguments.no_plots else []
+    if arguments.json:
+        print_json(result.metrics)
+    else:
+        report(result, out, drawn)
+    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
+
+
+def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argparse.Namespace) -> None:
+    """Train and save; a folder that was made for nothing goes again."""
+    from herglotz.data.lock import locked
+    from herglotz.training import fit, save_run
+
     made = _make(out)
     try:
         with locked(out):
@@ -68,13 +92,6 @@ def run(arguments: argparse.Namespace) -> int:
         for folder in made:  # innermost first; only what is empty, so only after a failure
             with suppress(OSError):
                 folder.rmdir()
-    result = load_run(out)  # what later commands will see, and on the cpu
-    drawn = _draw(result, out) if not arguments.no_plots else []
-    if arguments.json:
-        print_json(result.metrics)
-    else:
-        report(result, out, drawn)
-    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
 
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:

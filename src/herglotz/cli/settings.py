@@ -131,6 +131,11 @@ def add_optimiser_flags(parser: argparse._ActionsContainer) -> None:
         help="random initialisations of the one-step fit; the best after 30 iterations is kept (default: 4 for a "
         "correction of one layer, else 1)",
     )  # fmt: skip
+    _add_amount_flags(parser)
+
+
+def _add_amount_flags(parser: argparse._ActionsContainer) -> None:
+    """How many samples, steps and iterations, and how strong a prior."""
     _setting(
         parser, "--substeps", type=count, metavar="M",
         help="model steps in a recorded step, for samples far apart; with --objective trajectory (default 1)",

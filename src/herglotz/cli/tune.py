@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, seed
 from herglotz.errors import InputError
@@ -67,8 +67,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Search, save, draw and report."""
     if (arguments.max_error is None) == (arguments.budget_us is None):
         raise InputError("give either --max-error or --budget-us")
-    names = ("multiples", "widths", "kicks")
-    multiples, widths, kicks = (_whole(f"--{name}", getattr(arguments, name)) for name in names)
+    lists: dict[str, Any] = {
+        name: _whole(f"--{name}", getattr(arguments, name)) for name in ("multiples", "widths", "kicks")
+    }
     if arguments.source.is_file():
         raise InputError(f"{arguments.source}: is a file; give the folder that `herglotz fit --out` wrote")
     out: Path = arguments.out or arguments.source / "tuned"
@@ -83,14 +84,9 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.tune import TuneConfig, export_kicks_c, tune
 
     config = TuneConfig(
-        multiples=multiples,
-        widths=widths,
-        kicks=kicks,
-        artefacts=("eager",) if arguments.no_c else ("eager", "c"),
-        starts=arguments.starts,
-        seed=arguments.seed,
-        iterations=arguments.iterations,
-    )
+        **lists, artefacts=("eager",) if arguments.no_c else ("eager", "c"), starts=arguments.starts,
+        seed=arguments.seed, iterations=arguments.iterations,
+    )  # fmt: skip
     found = tune(
         load_run(arguments.source), max_error=arguments.max_error, budget_us=arguments.budget_us,
         horizon=arguments.horizon, config=config,

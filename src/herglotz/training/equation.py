@@ -81,7 +81,7 @@ class Equation:
             every = [term for term in self.terms if term.left == left]
             own = [term for term in every if term.shown] or every
             right = " ".join(map(str, own)) or "0"
-            right = right.removeprefix("+ ").replace("− ", "−", 1) if right.startswith(("+", "−")) else right
+            right = "−" + right.removeprefix("− ") if right.startswith("− ") else right.removeprefix("+ ")
             lines += textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
@@ -125,6 +125,7 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
             deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
+    terms[:0] = _kinetic(run)
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
     units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
@@ -143,6 +144,20 @@ def _lefts(run: Run) -> list[str]:
     kinetic, names = run.model.kinetic, run.data.names
     mass = kinetic.mass().detach().diagonal().tolist()  # type: ignore[operator]
     return [f"{name}″" if i == 0 else f"{mass[i]:.4g} {name}″" for i, name in enumerate(names)]
+
+
+def _kinetic(run: Run) -> list[Term]:
+    """½ vᵀ M v where L is printed as one function and M is constant; the first entry of M is 1."""
+    if _newtonian(run.model) or not run.model.capabilities.constant_mass or not run.model.config.baseline:
+        return []
+    mass, names = run.model.kinetic.mass().detach(), run.data.names  # type: ignore[operator]
+    n = range(len(names))
+    return [
+        Term("L", f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′", value, None, "")
+        for i in n
+        for j in n[i:]
+        if (value := float(mass[i, j]) * (0.5 if i == j else 1.0)) != 0.0
+    ]
 
 
 def _newtonian(model: ContactLagrangian) -> bool:
@@ -318,4 +333,4 @@ def network_of(run: Run) -> str | None:
 
 
 def _share(part: Tensor, whole: Tensor) -> str:
-    return f"{100 * float((part.square().mean() / whole.square().mean()).sqrt()):.2g} %"
+    return f"{100 * float((part.square().mean() / whole.square().mean()).sqrt()):.3g} %"

@@ -1,6 +1,7 @@
 """The terms that recordings of one coordinate need, found with nothing told, and the equation that is printed."""
 
 import json
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -60,6 +61,21 @@ def test_the_equation_has_the_names_of_the_file():
     text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
     assert " + 2 F " in text
     assert "theta in rad, F in N, theta recorded in deg" in " ".join(text.split())
+
+
+def test_signs_of_an_equation():  # fails if the first minus inside a line loses its blank
+    line = Equation((Term("L", "a", 2.0, None, ""), Term("L", "b", -1.0, None, "")), ("L",), "m", None)
+    assert str(line).splitlines()[0] == "L = 2 a − 1 b"
+    assert str(replace(line, terms=line.terms[::-1])).splitlines()[0] == "L = −1 b + 2 a"
+
+
+def test_a_lagrangian_has_its_kinetic_energy():
+    # fails if L of several coordinates is printed without ½ vᵀ M v ("L = 0" where V is a network)
+    two = (1.0, 1.0)
+    model = ContactLagrangian(ModelConfig((False, False), "linear", two, two, (0.0, 0.0), (0.0, 0.0)))
+    t = torch.arange(5, dtype=torch.float64)
+    data = Trajectories.of(t, torch.stack([t, t], 1), names=("a", "b"))
+    assert str(equation_of(SimpleNamespace(model=model, data=data))).startswith("L = 0.5 a′² + 0.5 b′²")  # pyright: ignore
 
 
 def test_an_equation_is_never_empty():

@@ -1,10 +1,16 @@
 """What a fit shows while it works, and the log that it leaves."""
 
+import sys
+from types import SimpleNamespace
+
+import pytest
 import torch
 
+from herglotz.errors import InputError
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 from herglotz.training.stages import Progress, Stages
+from herglotz.training.tensorboard import write_tensorboard
 
 
 def optimise(x, callback):
@@ -39,3 +45,36 @@ def test_one_bar_goes_through_all_stages():  # fails if a stage's unused bound s
 def test_the_log_has_every_iteration():  # fails if a stage's name is lost or cut
     history = [{"stage": "horizon 3, τ 1", "iteration": 0, "cost": 8.0}, {"stage": "b", "iteration": 1, "cost": 0.1}]
     assert _log(history).decode() == 'stage,iteration,cost\n"horizon 3, τ 1",0,8.0\nb,1,0.1\n'
+
+
+def test_the_log_for_tensorboard(monkeypatch, tmp_path):
+    # fails if costs, metrics or words do not reach the writer, or a missing TensorBoard is a traceback
+    rows = []
+
+    class Writer:
+        def __init__(self, folder):
+            rows.append(folder)
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            rows.append("closed")
+
+        def add_scalar(self, *row):
+            rows.append(row)
+
+        def add_text(self, name, text):
+            rows.append((name, text))
+
+    history = [{"stage": "noise", "iteration": 0, "cost": 8.0}, {"stage": "noise", "iteration": 1, "cost": 2.0}]
+    metrics = {"train_rms": 0.01, "verdict": "fits", "follows_data": True, "rate": float("nan")}
+    run = SimpleNamespace(history=history, metrics=metrics, summary=lambda: "S", equation=lambda: "E")
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    write_tensorboard(run, tmp_path)  # pyright: ignore
+    costs = [("cost/noise", 8.0, 0), ("cost/noise", 2.0, 1), ("metrics/train_rms", 0.01, 0)]
+    words = [("summary", "```\nS\n```"), ("equation", "```\nE\n```")]
+    assert rows == [str(tmp_path), *costs, *words, "closed"]
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with pytest.raises(InputError, match=r"pip install 'herglotz\[tensorboard\]'"):
+        write_tensorboard(run, tmp_path)  # pyright: ignore

@@ -107,7 +107,7 @@ def test_nothing_is_overwritten_unasked(tmp_path, capsys):
     for command in (
         simulate,
         ["rollout", "x", "--steps", "3", "--out", str(out)],
-        ["predict", "x", "y", "--out", str(out)],
+        ["predict", "x", str(out), "--out", str(out)],
     ):
         assert main([*command, "--seed", "1"] if command is simulate else command) == 2
         assert "exists already; choose another name, or overwrite it with --force" in capsys.readouterr().err
