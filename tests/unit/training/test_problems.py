@@ -172,7 +172,7 @@ def test_linear_sweeps_give_the_path_that_solved_steps_give(level, monkeypatch):
     if level == "dry":
         model, data = model_of("forced", coulomb=True, sticking=True, potential_width=0), data_of()
         with torch.no_grad():
-            model.friction.coulomb.fill_(0.3)
+            dict(model.named_parameters())["friction.coulomb"].fill_(0.3)
         problem = ShootingProblem(model, data, segment_grid(data, 30, 1.0), sigma=0.1)
         x = problem.pack(problem.parameters.get(), torch.tensor([[1.0, 0.4]] * 3, dtype=torch.float64))
     else:
