@@ -3,7 +3,8 @@
 Three errors are compared with the precision of the data, which is estimated from the data alone:
 
 * free runs over windows of 20 recorded steps of the training part, from the fitted states;
-* the same over the unseen part, from states that are fitted there with the parameters held;
+* the same over the unseen part, from states that are fitted there with the parameters held, or from those of the
+  free run, whichever are nearer to the data;
 * the one free run over the whole unseen part, `extrapolation_rms`.
 
 A free run that is lost rejects a model, unless what the data leave open of its start explains that: chaotic motion
@@ -112,6 +113,8 @@ def judged(
     unseen = None if seen.unseen is None else unseen_window_errors(task, fitted, seen.unseen)
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)
     scaled = replace(kept, q=kept.q / unit)
+    if unseen is not None and free is not None and _rms(unseen / unit) > _rms(free / unit):
+        unseen = free  # the free run's states are better than those that were found for the windows
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), _rms(scaled.q - scaled.q.mean(0)))
     ahead = foresee(task, fitted, seen, everywhere)
