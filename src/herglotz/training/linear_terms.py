@@ -60,52 +60,58 @@ class LinearTerms:
 
     def start(self, local: LocalPolynomials) -> LinearStart | None:
         """Terms and values of the linear problem, pruned, and its error; None where no mass fits."""
-        t, u = smooth_triples(self.data, local)
-        rows = torch.linspace(0, len(t) - 1, min(ROWS, len(t))).round().long()
-        if len(t) > ROWS:
-            t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed, u)
-        fit = LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
+        fit = self._problem(local)
         columns = self._columns(fit)
         if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
             return None
         x = fit.solve(columns)
-        if float(x[0]) == 0:
+        if float(x[0]) == 0 or not bool(torch.isfinite(fit.errors(x := x / x[0])).all()):
             return None
-        x = x / x[0]
+        terms, left, alone = self._pruned(fit, columns, x, max(1.0, local.width / 2))
+        for x in (fit.solve(left), alone):
+            start = fit.start(x)
+            if start is not None:
+                return LinearStart(terms, self._named(start), float(fit.errors(x).square().mean().sqrt()))
+        return None
+
+    def _problem(self, local: LocalPolynomials) -> LinearFit:
+        """The linear problem of every candidate over the smoothed samples."""
+        t, u = smooth_triples(self.data, local)
+        if len(t) > ROWS:
+            rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
+            t, u = t.spread_out(ROWS), None if u is None else u[rows]
+        forces = NamedForces(self.all.drag, self.base.speed, u)
+        return LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
+
+    def _pruned(self, fit: LinearFit, columns: Tensor, x: Tensor, overlap: float) -> tuple[NamedTerms, Tensor, Tensor]:
+        """The terms that are worth it, their columns, and the coefficients that the others' absence leaves.
+
+        Smoothed samples that share half a window say the same: N is over the `overlap`.
+        """
         r = fit.errors(x)
-        if not bool(torch.isfinite(r).all()):
-            return None
         X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
         size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
-        overlap = max(1.0, local.width / 2)
-        A = X.T @ X / size / overlap
         place = self._linear_places(fit, columns)
         free = torch.tensor([i for own in place.values() for i in own])
         simplest = torch.tensor([i for name in self.own for i in place[name]], dtype=torch.long)
         worth = math.log(max(3, int(r.numel() / overlap)))
-        kept, less = prune(A, x[columns][1:], free, worth, simplest=simplest)
+        kept, less = prune(X.T @ X / size / overlap, x[columns][1:], free, worth, simplest=simplest)
         stay = set(kept.tolist())
         terms = self.all.only([name for name, own in place.items() if stay & set(own)])
-        left = columns.clone()
-        at = columns.nonzero()[1:, 0]
+        left, at = columns.clone(), columns.nonzero()[1:, 0]
         for name, own in place.items():
             if name not in terms.names:
                 left[at[own]] = False
         alone = torch.zeros_like(x)
         alone[at], alone[columns.nonzero()[0]] = less, 1.0
-        x = fit.solve(left)
-        start = fit.start(x)
-        if start is None:
-            x = alone
-            start = fit.start(x)
-        if start is None:
-            return None
+        return terms, left, alone
+
+    def _named(self, start: dict[str, Tensor]) -> dict:
+        """Starting values by the name of a term or of a parameter."""
         values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
         for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
             values |= zip(names, values.pop(parameter, ()), strict=True)
-        values |= {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
-        return LinearStart(terms, values, float(fit.errors(x).square().mean().sqrt()))
+        return values | {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
 
     @property
     def _still(self) -> list[str]:
