@@ -50,7 +50,7 @@ class CLibrary:
             raise InputError(f"C has no derivatives beyond {MAX_DERIVATIVES} coordinates; use Stepper.linearise")
         if self.differentiates is None:  # built on first use: most steppers are not differentiated
             assert self.whole is not None
-            self.differentiates = build(self.whole(), self.metadata["name"])
+            self.differentiates = build(self.whole(), library_of(self.metadata["name"]))
         count, size = len(s), 2 * self.dof + 1
         widths = ((self.dof,), (self.dof,), (), ())
         *new, sigma = (self._empty(count, *width) for width in widths)

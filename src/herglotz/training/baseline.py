@@ -45,6 +45,12 @@ class Baseline:
         return len(self.input_map) // len(self.angles)
 
 
+def _check_moved(data: Trajectories, speed: list[float]) -> None:
+    for name, moved in zip(data.names, speed, strict=True):
+        if moved == 0:
+            raise InputError(f"{data.source or 'data'}: coordinate '{name}' never moves; leave it out")
+
+
 def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False, substeps: int = 1) -> Baseline:
     """Fit q̈ᵢ = −kᵢ sin qᵢ − bᵢ cos qᵢ − γ q̇ᵢ + (G u)ᵢ (angles) or −kᵢ qᵢ − bᵢ − γ q̇ᵢ + (G u)ᵢ to finite differences.
 
@@ -72,9 +78,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     # The size of an angle that turns over and over is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
-    for name, moved in zip(data.names, speed, strict=True):
-        if moved == 0:
-            raise InputError(f"{data.source or 'data'}: coordinate '{name}' never moves; leave it out")
+    _check_moved(data, speed)
     # A rate from noisy differences can have either sign; start from a small damping of the right order.
     typical = min(v / s for v, s in zip(speed, scale, strict=True))
     rate = x[2 * n] if x[2 * n] > 1e-3 * typical else 1e-2 * typical

@@ -104,25 +104,31 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures,
-        reasons={
-            "level": _level_reason(seen, user_settings),
+        reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
             "objective": why,
             "network": why_network,
-            "order": _structure_reason(seen, c.order == user_settings.order),
-            "features": _structure_reason(seen, c.features == user_settings.features),
-            "drag": _structure_reason(seen, c.drag == user_settings.drag),
-            "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
-            "hold": seen.hold,
-            "forces": _forces_reason(seen),
-            "start": "least squares on finite differences" if not base.start else "one linear problem",
-            "outliers": _outlier_reason(seen),
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
             "sigma": "what the search for terms left" if named else _sigma_reason(seen, one_step, sigma),
-            "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
             "restarts": _restart_reason(user_settings, covered),
-            "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
         },
     )  # fmt: skip
+
+
+def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: bool) -> dict[str, str]:
+    """Why the fields of a plan are as they are, where the look at the data says it."""
+    c = seen.settings
+    as_set = {"order": c.order == user_settings.order, "features": c.features == user_settings.features}
+    as_set["drag"] = c.drag == user_settings.drag
+    return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
+        "level": _level_reason(seen, user_settings),
+        "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
+        "hold": seen.hold,
+        "forces": _forces_reason(seen),
+        "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
+        "outliers": _outlier_reason(seen),
+        "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
+        "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
+    }
 
 
 def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:

@@ -173,18 +173,10 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
     for i, (name, unit) in enumerate(zip(data.names, data.units, strict=True)):
         left = lefts[i] if newton else lefts[i + 1]
         yield from _friction(run, left, i, name, unit, newton)
-    named = dict(run.model.named_parameters())
     n = config.dof
     for i, (name, angle) in enumerate(zip(data.names, data.angles, strict=True)):
-        if "potential.stiffness" in named:
-            at = [("potential.stiffness", i, 1.0), ("potential.tilt", i, 1.0)]
-        elif config.order == 4 and not config.alike:  # −k, b of an angle; k/2, b of a length
-            coefficient = "potential.features.sum.coefficient"
-            at = [(coefficient, 2 * i, -1.0 if angle else 2.0), (coefficient, 2 * i + 1, 1.0)]
-        else:
-            continue
-        for (parameter, entry, by), power in zip(at, (2, 1), strict=True):
-            yield _baseline(run, lefts, newton, i, name, angle, power, (parameter, entry, by))
+        for power, place in _springs(run, i, angle):
+            yield _baseline(run, lefts, newton, i, name, angle, power, place)
     texts = expand(config.features, config.angles)
     offset = 2 * n if config.order == 4 and not config.alike else 0
     still = [text for text in texts if not parse(text, config.angles)[0].velocities]
@@ -193,6 +185,16 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
         yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
     for g, text in enumerate(moving):
         yield "L", _named(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
+
+
+def _springs(run: Run, i: int, angle: bool) -> list[tuple[int, tuple[str, int, float]]]:
+    """The power of a coordinate in its stiffness and its tilt, with the parameter of each, its entry and a factor."""
+    config, coefficient = run.model.config, "potential.features.sum.coefficient"
+    if any(name == "potential.stiffness" for name, _ in run.model.named_parameters()):
+        return [(2, ("potential.stiffness", i, 1.0)), (1, ("potential.tilt", i, 1.0))]
+    if config.order == 4 and not config.alike:  # −k, b of an angle; k/2, b of a length
+        return [(2, (coefficient, 2 * i, -1.0 if angle else 2.0)), (1, (coefficient, 2 * i + 1, 1.0))]
+    return []
 
 
 def _friction(

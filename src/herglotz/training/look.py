@@ -100,9 +100,7 @@ def look(
     task = replace(task, base=terms.base, config=terms.settings)
     if plan is not None and plan.network == "covered":
         terms = replace(terms, motion=_baseline_motion(task))
-    wanted = terms.settings.objective == "auto" and terms.motion is None and not terms.settings.sticking
-    wanted = wanted if plan is None else plan.continues_probe
-    probe = _probe(task) if wanted and settings.supervision == "q" else None
+    probe = _probe(task) if (terms.leaves_objective if plan is None else plan.continues_probe) else None
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
         friction=why_friction, noise=roughness(kept), settings=terms.settings, base=terms.base,
@@ -119,6 +117,12 @@ class _Terms:
     structure: str | None = None
     found: Structure | None = None
     motion: tuple[Triples, float] | None = None
+
+    @property
+    def leaves_objective(self) -> bool:
+        """Whether the objective hangs on the noise, which a probe measures."""
+        c = self.settings
+        return c.objective == "auto" and c.supervision == "q" and self.motion is None and not c.sticking
 
 
 def _read(data: Trajectories, settings: FitConfig, hold: str) -> tuple[Trajectories, str]:

@@ -113,16 +113,14 @@ def started(
         name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")
     }
     rate = float(rest.pop("damping.rate", (0.0,))[0])
+    if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
+        rate += float(rest.pop("friction.viscous", (0.0,))[0])
     moving = [name for name in of.features if "v" in name]
     still = [name for name in of.features if "v" not in name]
     for parameter, names in ((STILL, still), (MOVING, moving), (DRAG, of.drag)):
-        if names:
-            rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
-    zero = (0.0,) * data.dof
-    if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
-        rate += float(rest.pop("friction.viscous", (0.0,))[0])
-    known = _parameters(of, bool(moving))
-    rest = {name: x for name, x in ((known(name), x) for name, x in rest.items()) if name and x}
+        rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
+    zero, known = (0.0,) * data.dof, _parameters(of, bool(moving))
+    rest = {own: x for name, x in rest.items() if x and (own := known(name))}
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
     assert isinstance(stiffness, tuple)
     assert isinstance(tilt, tuple)

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models import LEVELS
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
@@ -158,23 +158,25 @@ def select(
     data = as_trajectories(data, **reading)
     levels = levels_for(data, config) if levels is None else levels
     unknown = [level for level in levels if level not in LADDER]
-    if unknown or not levels:
-        raise InputError(f"unknown level {unknown or 'list'}; choose some of {', '.join(LADDER)}")
-    if seeds < 1:
-        raise InputError(f"seeds must be >= 1, got {seeds}")
-    if config.train_fraction == 1:
-        raise InputError("train fraction 1 holds nothing out to compare levels on; use 0.667, say")
+    refuse({
+        f"unknown level {unknown or 'list'}; choose some of {', '.join(LADDER)}": unknown or not levels,
+        f"seeds must be >= 1, got {seeds}": seeds < 1,
+        "train fraction 1 holds nothing out to compare levels on; use 0.667, say": config.train_fraction == 1,
+    })  # fmt: skip
     candidates, ladder = [], [level for level in LADDER if level in levels]
     told = _Told(len(ladder) * seeds, progress)
+
+    def one(level: str, seed: int) -> Run:
+        folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
+        if folder is not None:
+            folder.mkdir(parents=True, exist_ok=True)
+        settings = replace(config, level=level, seed=seed)
+        run = fit(data, settings, out=folder, progress=progress, resume=resume)
+        told(run)
+        return run
+
     for level in ladder:
-        runs = []
-        for seed in range(config.seed, config.seed + seeds):
-            folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
-            if folder is not None:
-                folder.mkdir(parents=True, exist_ok=True)
-            settings = replace(config, level=level, seed=seed)
-            runs.append(fit(data, settings, out=folder, progress=progress, resume=resume))
-            told(runs[-1])
+        runs = [one(level, config.seed + k) for k in range(seeds)]
         errors = torch.stack([block_errors(run) for run in runs])
         candidates.append(Candidate(level, tuple(runs), errors, _step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))

@@ -47,6 +47,9 @@ BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this sh
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 AT_THE_NOISE = 1.5  # times the precision, and without noise
 EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
+# Settings that name a term of the model.
+NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
+         "coupled")  # fmt: skip
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
@@ -76,20 +79,8 @@ def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def _nothing_named(c: FitConfig) -> bool:
-    named = (
-        c.features
-        or c.known
-        or c.terms
-        or c.alike
-        or c.diagonal
-        or c.mass_width
-        or c.coulomb
-        or c.sticking
-        or c.drag
-        or c.translations
-    )
-    plain = c.order == 2 and c.objective != "raw" and c.supervision == "q" and c.optimiser == "lm" and not c.coupled
-    return c.level == "auto" and not named and plain
+    plain = (c.level, c.order, c.supervision, c.optimiser) == ("auto", 2, "q", "lm") and c.objective != "raw"
+    return plain and not any(getattr(c, name) for name in NAMED)
 
 
 def dictionary(data: Trajectories) -> tuple[str, ...]:
@@ -183,8 +174,8 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     model's: shared or known coefficients, a mass network, inputs, s in L, features that the baseline has too.
     """
     names = tuple(expand(config.features, data.angles))
-    other = config.known or config.terms or config.alike or config.mass_width or config.coulomb or data.u is not None
-    other = other or config.translations or config.objective == "raw"  # a network alone
+    other = any(getattr(config, name) for name in ("known", "terms", "alike", "mass_width", "coulomb", "translations"))
+    other = other or data.u is not None or config.objective == "raw"  # a network alone
     own = set(baseline_features(data.angles, base.stiffness, base.tilt)[0])
     if other or config.level not in ("conservative", "linear", "forced") or own & set(names):
         return base
@@ -192,10 +183,9 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
-    left_out = {COUPLING} if not config.coupled else set()
-    left_out |= {"friction.viscous"} if config.level != "forced" else set()
-    left_out |= {"kinetic.base.off_diagonal"} if config.diagonal else set()
-    values = {name: tuple(x.tolist()) for name, x in start.items() if name not in left_out}
+    has = {COUPLING: config.coupled, "friction.viscous": config.level == "forced"}
+    has["kinetic.base.off_diagonal"] = not config.diagonal
+    values = {name: tuple(x.tolist()) for name, x in start.items() if has.get(name, True)}
     return replace(_with(base, values, names), rate=base.rate)
 
 

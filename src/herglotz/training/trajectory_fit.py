@@ -258,19 +258,12 @@ def fit_trajectories(
         From the longest segments that could be fitted; None if the model cannot follow even the shortest.
     """
     if model.potential.network is None:
-        task = replace(task, config=replace(task.config, departures=task.config.departures[:1]))
-    if known and model.potential.network is None and task.config.robust != "on":
-        last = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
-        if last is not None and (task.config.robust == "off" or not heavy_tailed(last.misfit)):
-            return Chosen(last, task.config.departures[0], {task.config.departures[0]: last.held_out_errors()})
+        return _without_prior(task, model, sigma, known=known)
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
         return None
     departures = stages.task.config.departures
     first = stages.robust_or_not(first, known=known)
-    if model.potential.network is None:  # no prior to choose
-        last = stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma)
-        return Chosen(last, departures[0], {departures[0]: last.held_out_errors()})
     last = (stages.whole(first, sigma) if known else None) or stages.grow(first, sigma)
     previous, noise = last, last.noise
 
@@ -291,6 +284,25 @@ def fit_trajectories(
     noise = (fit("noise", max(departures)) or last).noise
     found = strongest_not_beaten(departures, lambda departure: fit(f"prior {departure:g}", departure))
     return found or Chosen(last, departures[0], {})
+
+
+def _without_prior(task: Task, model: ContactLagrangian, sigma: float, *, known: bool) -> Chosen[TrajectoryFit] | None:
+    """The fit of a model without a network: there is no strength of its prior to choose."""
+    departure = task.config.departures[0]
+    task = replace(task, config=replace(task.config, departures=(departure,)))
+
+    def chosen(last: TrajectoryFit) -> Chosen[TrajectoryFit]:
+        return Chosen(last, departure, {departure: last.held_out_errors()})
+
+    if known and task.config.robust != "on":
+        last = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
+        if last is not None and (task.config.robust == "off" or not heavy_tailed(last.misfit)):
+            return chosen(last)
+    stages, first = _wide_enough(task, model, sigma)
+    if first is None:
+        return None
+    first = stages.robust_or_not(first, known=known)
+    return chosen(stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma))
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:

@@ -13,9 +13,9 @@ from herglotz.training import FitConfig, fit, stages
 
 SMALL = FitConfig(level="linear", objective="trajectory", iterations=6, potential_width=0)
 CASES = {
-    "one step": replace(SMALL, objective="residual", iterations=10, correction_width=3),
-    "trajectories": replace(SMALL, iterations=8, potential_width=2, departures=(0.1, 1.0)),
-    "smoothing": replace(SMALL, objective="smoothing", iterations=6),
+    "one step": replace(SMALL, objective="residual", iterations=20, correction_width=3),
+    "trajectories": replace(SMALL, iterations=12, potential_width=2, departures=(0.1, 1.0)),
+    "smoothing": replace(SMALL, objective="smoothing", iterations=8),
     "adam": replace(SMALL, objective="residual", optimiser="adamw", iterations=3, batch=16, correction_width=2),
 }
 

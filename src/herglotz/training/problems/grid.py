@@ -55,6 +55,23 @@ def substeps(h: float, max_step: float) -> int:
     return max(1, math.ceil(h / max_step - 1e-6))
 
 
+def _steps(
+    times: list[float], a: int, b: int, max_step: float
+) -> tuple[list[float], list[int], list[float], list[int]]:
+    """Model steps from sample a to b, the row and the middle of each, and the node of every sample after a."""
+    line: list[float] = []
+    rows: list[int] = []
+    middle: list[float] = []
+    ends: list[int] = []
+    for j in range(a, b):
+        m = substeps(times[j + 1] - times[j], max_step)
+        line += [(times[j + 1] - times[j]) / m] * m
+        rows += [j] * m
+        middle += [(k + 0.5) / m for k in range(m)]
+        ends.append(len(line))
+    return line, rows, middle, ends
+
+
 def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGrid:
     """Cut each trajectory into segments of about `length` recorded steps.
 
@@ -74,13 +91,9 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         for i, (a, b) in enumerate(pairwise(bounds)):
             joined.append(-1 if i == 0 else len(starts) - 1)
             starts.append(a)
-            line, from_row, middle, seen = [], [], [], [(0, a)] if i == 0 else []
-            for j in range(a, b):
-                m = substeps(times[j + 1] - times[j], max_step)
-                line += [(times[j + 1] - times[j]) / m] * m
-                from_row += [j] * m
-                middle += [(k + 0.5) / m for k in range(m)]
-                seen.append((len(line), j + 1))
+            line, from_row, middle, ends = _steps(times, a, b, max_step)
+            seen = [(0, a)] if i == 0 else []
+            seen += zip(ends, range(a + 1, b + 1), strict=True)
             steps.append(line)
             rows.append(from_row)
             parts.append(middle)

@@ -67,7 +67,7 @@ def adam(
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, max_iterations)
     best, best_x, history, reason = float("inf"), x, [], "max_iterations"
     last, quiet, iteration = float("nan"), 0, 0
-    rounds = None if batch is None or batch >= problem.rows else _rounds(problem.rows, batch, seed)
+    rounds = _rounds(problem.rows, batch, seed)
     resumed = None if callback is None else callback.resumed
     if resumed is not None:
         iteration, best, best_x = resumed["iteration"], resumed["best"], resumed["best_x"].to(x)
@@ -77,9 +77,8 @@ def adam(
         current.grad = torch.zeros_like(x)
         optimiser.load_state_dict(resumed["optimiser"])
         schedule.load_state_dict(resumed["schedule"])
-        if rounds is not None:
-            for _ in range(iteration):
-                next(rounds)
+        for _ in range(iteration):
+            next(rounds)
 
     def search() -> dict[str, Any]:
         return {
@@ -89,12 +88,12 @@ def adam(
 
     while iteration < max_iterations and quiet < PATIENCE:
         iteration += 1
-        rows, last_of_round = (None, True) if rounds is None else next(rounds)
+        rows, last_of_round = next(rounds)
         here = current.detach()
         cost, gradient = problem.cost_and_gradient(here, rows)
         if rows is not None and (last_of_round or iteration in (1, max_iterations)):
             cost, last_of_round = problem.cost(here), True
-        if not bool(torch.isfinite(cost)) or not bool(torch.isfinite(gradient).all()):
+        if not bool(torch.isfinite(cost + gradient.sum())):
             reason = "not_finite"
             break
         if last_of_round:
@@ -108,14 +107,14 @@ def adam(
         schedule.step()
         if callback is not None:
             callback(iteration, best, best_x, search)
-    if quiet >= PATIENCE:
-        reason = "converged"
-    return OptimiserResult(best_x, best, reason, iteration, history)
+    return OptimiserResult(best_x, best, "converged" if quiet >= PATIENCE else reason, iteration, history)
 
 
-def _rounds(count: int, batch: int, seed: int) -> Iterator[tuple[Tensor, bool]]:
-    """Batches of row numbers, and whether each is the last of its round; the same on every machine."""
+def _rounds(count: int, batch: int | None, seed: int) -> Iterator[tuple[Tensor | None, bool]]:
+    """Batches of row numbers, None for all, and whether each is the last of its round; the same on every machine."""
     make = torch.Generator().manual_seed(seed)
+    while batch is None or batch >= count:
+        yield None, True
     while True:
         batches = torch.randperm(count, generator=make).split(batch)
         for i, rows in enumerate(batches):

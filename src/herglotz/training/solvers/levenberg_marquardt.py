@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any, Protocol, cast
@@ -145,21 +146,15 @@ def levenberg_marquardt(
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
         step = _damped_step(A, b, at.damping * _floored(at.scale))
-        new = of_first(problem.cost(at.x + step))[0] if step is not None else None
-        predicted = 0.0 if step is None else float(-(b @ step) - 0.5 * step @ (A @ step))
-        if new is not None and abs(at.best - float(new)) <= rounding * at.best:
-            # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
-            at.quiet += 1
-            at.damping, at.growth = at.damping * at.growth, at.growth * 2
-        elif (
-            step is not None
-            and new is not None
-            and bool(torch.isfinite(new))
-            and float(new) < at.best
-            and predicted > 0
-        ):
-            gain = (at.best - float(new)) / predicted
-            at.quiet = at.quiet + 1 if at.best - float(new) <= rtol * at.best else 0
+        new, predicted = math.inf, 0.0
+        if step is not None:
+            new = float(of_first(problem.cost(at.x + step))[0])
+            predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
+        # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
+        settled = abs(at.best - new) <= rounding * at.best
+        if step is not None and not settled and new < at.best and predicted > 0:
+            gain = (at.best - new) / predicted
+            at.quiet = at.quiet + 1 if at.best - new <= rtol * at.best else 0
             at.x = at.x + step
             cost, A, b = _of_first(problem.normal_equations(at.x))
             at.best = float(cost)
@@ -168,6 +163,7 @@ def levenberg_marquardt(
             at.damping *= max(1 / 3, 1 - (2 * gain - 1) ** 3)
             at.damping, at.growth = max(at.damping, 1e-14), 2.0
         else:
+            at.quiet += settled
             at.damping, at.growth = at.damping * at.growth, at.growth * 2
         if callback is not None:
             callback(at.iteration, at.best, at.x, lambda: {"search": asdict(at), "memory": memory_of(problem)})
