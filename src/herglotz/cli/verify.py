@@ -58,10 +58,9 @@ def run(arguments: argparse.Namespace) -> int:
     """Verify and report; 1 when a check fails."""
     if arguments.samples < 1 or arguments.steps < 2:
         raise InputError(f"--samples must be >= 1 and --steps >= 2, got {arguments.samples} and {arguments.steps}")
-    target, path = arguments.target, None
+    target = arguments.target
     if Path(target).is_file():
-        path = Path(target)
-        target = _opened(path, arguments)
+        target = _opened(Path(target), arguments)
     elif arguments.against is not None:
         raise InputError(f"--against compares an exported file with a run; {target} is no file")
 
@@ -84,14 +83,18 @@ def run(arguments: argparse.Namespace) -> int:
         more |= {} if agreement is None else {"passed": passed, "against": agreement}
         print_json({**report.to_dict(), **more})
     else:
-        print(report.table())
-        if found is not None:
-            print(found)
-        if agreement is not None:
-            print(_table(agreement, arguments.against))
-        elif path is not None:
-            print("not compared with its model: no run with these weights was found; name it with --against RUN")
-    return 0 if passed else 1
+        print(_text(report, found, agreement, arguments))
+    return int(not passed)
+
+
+def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: argparse.Namespace) -> str:
+    """The report, the symmetries that were found, and how a file compares with its run."""
+    parts = [report.table()] if found is None else [report.table(), str(found)]
+    if agreement is not None:
+        parts.append(_table(agreement, arguments.against))
+    elif Path(arguments.target).is_file():
+        parts.append("not compared with its model: no run with these weights was found; name it with --against RUN")
+    return "\n".join(parts)
 
 
 def _opened(path: Path, arguments: argparse.Namespace) -> Any:

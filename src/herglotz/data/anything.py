@@ -18,7 +18,7 @@ from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles")
 
@@ -44,28 +44,22 @@ def as_trajectories(
     InputError
         If arrays come without times, or as `load` and `read_csv` do.
     """
-    if isinstance(data, Trajectories):
-        if (h, time, coordinates, inputs, group) != (None,) * 5 or drop:
-            raise InputError("trajectories have their columns already; of the options, only angles changes them")
-        return _marked(data, angles)
-    if isinstance(data, FunctionType):
-        raise InputError(f"a function is no recording; {OF_AN_L_D}")
     names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
-    if isinstance(data, (str, Path)):
-        return _marked(load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}), angles)
-    if hasattr(data, "columns"):
+    refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
+    if isinstance(data, Trajectories):
+        wrong = "trajectories have their columns already; of the options, only angles changes them"
+        refuse({wrong: (h, time, coordinates, inputs, group) != (None,) * 5 or drop})
+        found = data
+    elif isinstance(data, (str, Path)):
+        found = load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())})
+    elif hasattr(data, "columns"):
         found = from_frame(data, Wanted(time, **names)) if h is None else _array(np.asarray(data), h, time, names)
-        return _marked(in_radians_and_seconds(found), angles)
-    if _is_list_of_recordings(data):
-        options = {"h": h, "time": time, **names, "angles": angles}
-        if len(data) > 1 and (time is not None or inputs is not None) and not isinstance(time, str):
-            raise InputError("time and inputs of several arrays: give h, or Trajectories.of(...) for each of them")
-        rows = [_floats("positions", one) if isinstance(one, (list, tuple)) else one for one in data]
-        return Trajectories.cat([as_trajectories(one, **options) for one in rows])
-    if time is None and h is None and hasattr(data, "index") and not callable(data.index):
-        time = _index(data.index)
-        names["coordinates"] = coordinates or (str(data.name) if data.name is not None else None)
-    return _marked(_array(data, h, time, names), angles)
+        found = in_radians_and_seconds(found)
+    elif _is_list_of_recordings(data):
+        return _of_each(data, {"h": h, "time": time, **names, "angles": angles})
+    else:
+        found = _array(data, h, time, names)
+    return _marked(found, angles)
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -76,12 +70,29 @@ def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
 def _is_list_of_recordings(data: Any) -> bool:
     if isinstance(data, (np.ndarray, Tensor)):
         return data.ndim == 3
-    if hasattr(data, "index") and not callable(data.index):  # a Series
+    if _is_series(data):
         return False
     return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
 
 
+def _is_series(data: Any) -> bool:
+    return hasattr(data, "index") and not callable(data.index)
+
+
+def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
+    """The recordings of a list, each read with the same options."""
+    time, inputs = options["time"], options["inputs"]
+    if len(data) > 1 and (time is not None or inputs is not None) and not isinstance(time, str):
+        raise InputError("time and inputs of several arrays: give h, or Trajectories.of(...) for each of them")
+    rows = [_floats("positions", one) if isinstance(one, (list, tuple)) else one for one in data]
+    return Trajectories.cat([as_trajectories(one, **options) for one in rows])
+
+
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
+    called = names["coordinates"]
+    if h is None and time is None and _is_series(data):
+        time = _index(data.index)
+        called = called or (None if data.name is None else str(data.name))
     q = data.detach().double() if isinstance(data, Tensor) else torch.from_numpy(_floats("positions", data))
     if (h is None) == (time is None):
         raise InputError("positions without times: give h, the time between two samples, or time, an array of times")
@@ -89,8 +100,7 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
         raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
     n = len(q)
     t = np.arange(n) * float(h) if h is not None else _floats("time", time)
-    coordinates = names["coordinates"]
-    called = (coordinates,) if isinstance(coordinates, str) else coordinates
+    called = (called,) if isinstance(called, str) else called
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
     return Trajectories.of(t, q, names=called, u=u, source="array")
 

@@ -21,12 +21,16 @@ def column_table(
     for name, role, unit in columns:
         if role == "coordinate" and name in now:
             role = "angle" if now[name][1] else role
-            unit = unit if unit in ("", now[name][0]) else f"{unit}, converted to {now[name][0]}"
+            unit = _converted(unit, now[name][0])
             if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
                 unit = f"- (an angle in rad? --angles {name})"
-        elif role == "time" and unit not in ("", labels.time_unit):
-            unit = f"{unit}, converted to {labels.time_unit}"
+        elif role == "time":
+            unit = _converted(unit, labels.time_unit)
         rows.append((name, role, unit or "-"))
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
     return "\n".join([f"{source or 'table'}:", *lines])
+
+
+def _converted(unit: str, now: str) -> str:
+    return unit if unit in ("", now) else f"{unit}, converted to {now}"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from herglotz.data.rows import quote
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)\s*(?:\[([^\[\]]*)\])?")
 ROLES = {
@@ -95,22 +95,21 @@ def assign(
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
-    for asked in wanted.names:
-        if asked not in place:
-            raise InputError(f"{where}: there is no column {quote(asked)}; the columns are {', '.join(names)}")
+    every = ", ".join(names)
+    refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         roles[wanted.role(name) or _by_itself(name, unit, wanted)].append(i)
     clock = _clock(where, names, roles["time"])
     q = tuple(roles["q"] if wanted.coordinates is None else (place[x] for x in _several(wanted.coordinates)))
     if not q:
-        raise InputError(f"{where}: no coordinate column, only {', '.join(names)}; add a column such as q[rad]")
+        raise InputError(f"{where}: no coordinate column, only {every}; add a column such as q[rad]")
     if len(roles["trajectory"]) > 1:
         both = " and a column ".join(names[i] for i in roles["trajectory"])
         raise InputError(f"{where}: both a column {both}; keep one")
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
-    one = {x: roles[x][0] if roles[x] else None for x in ("trajectory", "action")}
-    return Columns(names, units, clock, q, one["trajectory"], one["action"], p, tuple(roles["input"]))
+    trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
+    return Columns(names, units, clock, q, trajectory, action, p, tuple(roles["input"]))
 
 
 def _several(names: Names) -> Sequence[str]:

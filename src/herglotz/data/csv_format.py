@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -73,18 +73,17 @@ def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
     if not is_number(_cells(rows[1][1])[columns.time]):
         roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
         found = replace(found, columns=tuple(roles))
-    said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
-    return replace(found, hold=said[0]) if said else found
+    return _held(found, lines)
 
 
 def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
     """A table of plain numbers by numpy's parser, a fifth of the time and of the memory; None for any other file."""
-    said: list[str] = []
+    comments: list[str] = []
 
     def rows(file: TextIO) -> Iterator[str]:
         for line in file:
             if line.startswith("#"):
-                said.extend(match[1] for match in [re.fullmatch(HOLD, line.strip())] if match)
+                comments.append(line)
             elif not line.isspace():
                 if len(line) > LONG:
                     raise ValueError(line[:SHOWN])
@@ -99,13 +98,19 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
             table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
     except (OSError, ValueError, StopIteration, InputError):
         return None  # read row by row, the mistake has a place
-    if table.shape[1] != len(columns.names) or len(table) < MIN_SAMPLES or not np.isfinite(table).all():
-        return None
+    if table.shape[1] != len(columns.names) or len(table) < MIN_SAMPLES or not np.abs(table).max() < EXACT:
+        return None  # NaN is not below EXACT either
     labels = None if columns.trajectory is None else table[:, columns.trajectory]
-    if np.abs(table).max() >= EXACT or (labels is not None and np.any(labels != np.round(labels))):
+    if labels is not None and np.any(labels != np.round(labels)):
         return None
     found = from_numbers(path, columns, labels, table[:, columns.numeric])
-    return replace(found, hold=said[0]) if said and found is not None else found
+    return None if found is None else _held(found, comments)
+
+
+def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
+    """With what the first comment `# hold: …` among the lines says of the inputs."""
+    said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
+    return replace(found, hold=said[0]) if said else found
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:

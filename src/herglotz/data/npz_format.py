@@ -135,13 +135,15 @@ def _labels(path: Path, metadata: np.ndarray | None) -> dict:
         labels = json.loads(str(metadata))
     except (ValueError, RecursionError):
         labels = None
-    kinds = {"names": str, "units": str, "angles": bool, "columns": list}
-    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else {"names": ""}
-    sound = all(
-        isinstance(x, list) and all(isinstance(y, kinds[k]) for y in x) if k in kinds else isinstance(x, str)
-        for k, x in known.items()
-    )
-    columns = known.get("columns", []) if sound else []
-    if not sound or any(len(row) != 3 or not all(isinstance(x, str) for x in row) for row in columns):
+    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else None
+    if known is None or not all(_has_its_type(k, x) for k, x in known.items()):
         raise InputError(f"{path}: 'metadata' must be a JSON object of {', '.join(LABELS)}; write it again or drop it")
-    return {**known, "columns": tuple(map(tuple, columns))}
+    return {**known, "columns": tuple(map(tuple, known.get("columns", [])))}
+
+
+def _has_its_type(label: str, x: object) -> bool:
+    """Whether `x` is the list of texts, of truth values or of rows (name, role, unit), or the text, of this label."""
+    if label == "columns":
+        return isinstance(x, list) and all(_has_its_type("names", row) and len(row) == 3 for row in x)
+    kind = {"names": str, "units": str, "angles": bool}.get(label)
+    return isinstance(x, str) if kind is None else isinstance(x, list) and all(isinstance(y, kind) for y in x)

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
+from herglotz.data.csv_columns import Columns
 from herglotz.data.files import PathLike, read_lines
-from herglotz.data.rows import group_rows, number, quote
+from herglotz.data.rows import number, quote
+from herglotz.data.table import from_table
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
@@ -33,11 +36,12 @@ def read_schmidt_lipson(path: PathLike, *, time_unit: str = "1") -> Trajectories
     InputError
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
-    path, lines = Path(path), read_lines(path)
-    rows = [(i, line) for i, line in enumerate(lines, 1) if line.strip()]
-    match = HEADER.fullmatch(rows[0][1].strip()) if rows else None
+    path = Path(path)
+    rows = [(at, line.strip()) for at, line in enumerate(read_lines(path), 1) if line.strip()]
+    header = rows[0][1] if rows else ""
+    match = HEADER.fullmatch(header)
     if match is None:
-        got = quote(rows[0][1].strip()) if rows else "nothing"
+        got = quote(header) if header else "nothing"
         raise InputError(f"{path}: the first line must be like '% o v' or '% x v', got {got}; is this another format?")
     coordinates = match[1].split()
     width = 2 + len(coordinates) + len(match[2].split())
@@ -49,17 +53,9 @@ def read_schmidt_lipson(path: PathLike, *, time_unit: str = "1") -> Trajectories
             raise InputError(f"{path}, row {at}: {len(cells)} numbers where {width} belong; correct or delete the row")
         named = zip(labels, cells, strict=False)  # velocities come last and are not looked at
         numbers.append([number(cell, f"{path}, row {at}, column '{label}'") for label, cell in named])
+    names = tuple(label.replace("o", "theta") for label in labels)
+    units = ("", "", *("rad" if name.startswith("o") else "pixel" for name in coordinates))
+    columns = Columns(names, units, time=1, q=tuple(range(2, len(labels))), trajectory=0)
     trials = [f"{row[0]:g}" for row in numbers]
-    groups = group_rows(path, [at for at, _ in rows[1:]], trials, [row[1] for row in numbers], ("trial", "t"))
-    samples = [numbers[i] for group in groups for i in group]
-    angles = tuple(name.startswith("o") for name in coordinates)
-    return Trajectories.of(
-        [row[1] for row in samples],
-        [row[2:] for row in samples],
-        tuple(len(group) for group in groups),
-        names=tuple(name.replace("o", "theta") for name in coordinates),
-        units=tuple("rad" if angle else "pixel" for angle in angles),
-        angles=angles,
-        time_unit=time_unit,
-        source=path.name,
-    )
+    found = from_table(path, columns, [at for at, _ in rows[1:]], trials, [row[1:] for row in numbers])
+    return replace(found, time_unit=time_unit, columns=())  # the format, not a header, says what each column is

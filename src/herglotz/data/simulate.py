@@ -95,16 +95,7 @@ def simulate(
     q = q + noise * torch.randn(q.shape, generator=generator, dtype=q.dtype)
     keep = torch.stack([_kept(steps + 1, gaps, generator) for _ in range(trajectories)])  # (B, steps + 1) bool
     t = (h * torch.arange(steps + 1, dtype=torch.float64)).expand(trajectories, -1)
-    found = Trajectories(
-        t[keep],
-        q[keep],
-        tuple(keep.sum(1).tolist()),
-        names=tuple(scene.coordinates),
-        units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
-        angles=tuple(scene.angles),
-        time_unit=getattr(scene, "time_unit", "s"),
-        source=f"simulate({scene.name}, h={h:g}, seed={seed})",
-    )
+    found = _sampled(scene, t, q, keep, f"simulate({scene.name}, h={h:g}, seed={seed})")
     if u is not None:
         found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]), hold="zero")
     return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
@@ -128,6 +119,20 @@ def _roll(scene: Any, q: Tensor, v: Tensor, steps: int, h: float, u: Tensor | No
             states.append((q, p, s))
     qs, ps, ss = zip(*states, strict=True)
     return torch.stack(qs, 1), torch.stack(ps, 1), torch.stack(ss, 1)
+
+
+def _sampled(scene: Scene, t: Tensor, q: Tensor, keep: Tensor, source: str) -> Trajectories:
+    """The samples that are kept (B, steps + 1) of t (B, steps + 1) and q (B, steps + 1, n), as the scene calls them."""
+    return Trajectories(
+        t[keep],
+        q[keep],
+        tuple(keep.sum(1).tolist()),
+        names=tuple(scene.coordinates),
+        units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
+        angles=tuple(scene.angles),
+        time_unit=getattr(scene, "time_unit", "s"),
+        source=source,
+    )
 
 
 def _mean_inputs(u: Tensor, keep: Tensor) -> Tensor:
