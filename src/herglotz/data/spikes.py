@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
+from herglotz.least_squares import least_squares
 
 # A sample is compared with the polynomial of degree 3 through its four neighbours on either side.
 BESIDE, DEGREE = 4, 3
@@ -57,7 +58,7 @@ def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:
     x = times - times[:, BESIDE : BESIDE + 1]
     x = x / x.abs().amax(1, keepdim=True)
     A = torch.stack([x**k for k in range(DEGREE + 1)], -1)
-    c = torch.linalg.lstsq(A[:, ~inside], values[:, ~inside]).solution
+    c = least_squares(A[:, ~inside], values[:, ~inside])
     r = A @ c - values
     miss = r[:, inside].abs().amin(1)  # (W, n): the smallest departure in the run
     local = (r[:, ~inside].square().sum(1) / (2 * BESIDE - DEGREE - 1)).sqrt()

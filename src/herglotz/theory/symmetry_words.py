@@ -7,6 +7,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from herglotz.least_squares import least_squares
+
 SMALL = 1e-6  # of the largest entry: not written
 
 
@@ -80,7 +82,7 @@ def _clean(A: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
 
 def _fixed_point(A: Tensor, b: Tensor) -> Tensor | None:
     """The point q with A q + b = 0 nearest to 0, or None."""
-    point = torch.linalg.lstsq(A, -b[:, None], driver="gelsd").solution[:, 0]
+    point = least_squares(A, -b[:, None])[:, 0]
     return point if float((A @ point + b).abs().max()) <= SMALL * max(1.0, float(b.abs().max())) else None
 
 

@@ -13,6 +13,7 @@ from herglotz.data import Trajectories
 from herglotz.data.trajectories import GAP
 from herglotz.data.windows import Triples
 from herglotz.errors import InputError
+from herglotz.least_squares import least_squares
 from herglotz.training.problems.robust import FREEDOM, root_weights, scale_of
 
 ROUNDS = 10  # iterations of re-weighting for Student's t
@@ -74,7 +75,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         x, good = _robust(columns.cpu(), a.cpu())
         q, v = t.q1[good.to(q.device)], v[good.to(q.device)]
     else:
-        x = torch.linalg.lstsq(columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()).solution[:, 0].tolist()
+        x = least_squares(columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu())[:, 0].tolist()
     # The size of an angle that turns over and over is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
@@ -116,7 +117,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     if not jumps:
         return False
     rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    plain = scale_of(rows @ torch.linalg.lstsq(rows, right).solution - right)
+    plain = scale_of(rows @ least_squares(rows, right) - right)
     robust = scale_of(rows @ rows.new_tensor(_robust(columns.cpu(), a.cpu())[0])[:, None] - right)
     return plain > max(PULLED * robust, NEGLIGIBLE * size)
 
@@ -148,10 +149,10 @@ def differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor,
 def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:
     """Return the solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which rows are no outliers, (T,) bool."""
     rows, right = A.reshape(-1, A.shape[-1]), a.reshape(-1, 1)
-    x = torch.linalg.lstsq(rows, right).solution
+    x = least_squares(rows, right)
     for _ in range(ROUNDS):
         r = rows @ x - right
         by = root_weights(r / max(scale_of(r), torch.finfo(r.dtype).tiny), FREEDOM)
-        x = torch.linalg.lstsq(by * rows, by * right).solution
+        x = least_squares(by * rows, by * right)
     r = rows @ x - right
     return x[:, 0].tolist(), r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.windows import Triples
+from herglotz.least_squares import least_squares
 from herglotz.training.baseline import Baseline
 
 ROUNDS = 12  # Gauss–Newton iterations
@@ -91,7 +92,7 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
             break
         best = BaselineMotion(angles, parameters, substeps, error)
         A = torch.cat([torch.diag_embed(columns[0]), torch.diag_embed(columns[1]), columns[2][..., None]], -1)
-        x = torch.linalg.lstsq(A.flatten(0, 1).cpu(), -r.reshape(-1, 1).cpu(), driver="gelsd").solution[:, 0].to(r)
+        x = least_squares(A.flatten(0, 1).cpu(), -r.reshape(-1, 1).cpu())[:, 0].to(r)
         step = torch.stack([x[:n], x[n : 2 * n], x[2 * n].expand(n)])
         parameters, v = parameters + step, v_of(step)
     return best if best is not None and best.error <= worst else None

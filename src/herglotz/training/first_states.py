@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.least_squares import least_squares
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian
 from herglotz.training.inputs import step_inputs
@@ -61,12 +62,12 @@ def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
     x = data.t[near] - data.t[rows[here]][:, None]
     A = torch.stack([x**k for k in range(4)], -1)[:, None]  # (S, 1, START, 4)
     q = data.q[near].mT[..., None]  # (S, n, START, 1)
-    c = torch.linalg.lstsq(A.expand(*q.shape[:2], -1, -1), q).solution
+    c = least_squares(A.expand(*q.shape[:2], -1, -1), q)
     for _ in range(10):
         r = A @ c - q
         scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(q.dtype).tiny)
         by = root_weights(r / scale, FREEDOM)
-        c = torch.linalg.lstsq(by * A, by * q).solution
+        c = least_squares(by * A, by * q)
     values = (A @ c)[..., 0]
     first[here], second[here] = values[..., 0], values[..., 1]
     return first, second

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS
+from herglotz.least_squares import least_squares
 from herglotz.training.dry_friction import BLOCKS, acceleration_terms
 
 CLEARLY = 2.0  # standard errors of the difference
@@ -50,5 +51,5 @@ def _errors(train: Trajectories) -> Tensor:
     a, columns, v = acceleration_terms(train)
     A, y = torch.cat([columns, torch.diag_embed(v.sign())], -1).flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
     A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
-    left = A @ torch.linalg.lstsq(A, y, driver="gelsd").solution - y
+    left = A @ least_squares(A, y) - y
     return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])

@@ -21,6 +21,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.data.windows import Triples
+from herglotz.least_squares import least_squares
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.jet import pairs
@@ -116,7 +117,7 @@ class LinearFit:
             if not bool(torch.isfinite(Q).all()):  # each has a scale of its own, and some had none
                 return self.R.new_zeros(len(self.names))
             y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
-            x = torch.linalg.lstsq(U, y[:, None]).solution[:, 0] / size
+            x = least_squares(U, y[:, None])[:, 0] / size
             Jk = J @ x
         out = self.R.new_zeros(len(self.names))
         out[columns] = x

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
+from herglotz.least_squares import least_squares
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
@@ -73,7 +74,7 @@ class SupervisedProblem(OneStep):
         with torch.no_grad():
             L = self.parameters.partials(theta, t.q0, t.q1, torch.zeros_like(t.h0), t.h0, 1, u0).L
         columns = torch.stack([L, t.h0 * before], 1).cpu()
-        kappa = float(torch.linalg.lstsq(columns, (s[t.index + 1] - before)[:, None].cpu()).solution[0])
+        kappa = float(least_squares(columns, (s[t.index + 1] - before)[:, None].cpu())[0])
         return torch.cat([theta, theta.new_tensor([kappa if kappa > 0 else 1.0]).log()])
 
     def unit(self, x: Tensor) -> float:
