@@ -58,6 +58,12 @@ def test_named_terms_at_the_noise_have_no_rival(held):
     assert held.looks == []
 
 
+def test_networks_have_to_err_less_by_a_twentieth(held):
+    # fails if a richer model wins by what a held-out stretch of time cannot tell (3 % on a motor axis)
+    assert held.winner({"rms": 0.103, "sigma": NOISE}, {"rms": 0.1, "sigma": NOISE})[0].name == "named"
+    assert held.winner({"rms": 0.107, "sigma": NOISE}, {"rms": 0.1, "sigma": NOISE})[0].name == "networks"
+
+
 def test_the_smaller_error_wins_and_networks_go_on_from_their_fit(held):
     # fails if the larger error wins, or if the last fit starts from nothing or searches the prior again
     values = {"potential.network.weights.0": (0.5, 0.25)}

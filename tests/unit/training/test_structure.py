@@ -236,14 +236,18 @@ def test_pruning_leaves_out_what_is_noise():
 
 def test_the_simplest_of_terms_that_do_the_same_stays():
     # fails if noise chooses between a tilt and a third harmonic that make nearly the same force
-    make = torch.Generator().manual_seed(0)
-    J = torch.randn(400, 3, generator=make, dtype=torch.float64)
-    J[:, 1] = J[:, 0] + 1e-3 * J[:, 1]  # 1 is the simple one; 0 is what the data were made with
-    y = J @ torch.tensor([1.0, 0.0, 0.0], dtype=torch.float64) + torch.randn(400, generator=make, dtype=torch.float64)
-    A = J.T @ J
-    x = torch.linalg.solve(A, J.T @ y)
-    assert prune(A, x, torch.arange(3), math.log(400), simplest=torch.tensor([1]))[0].tolist() == [1]
-    assert prune(A, x, torch.arange(3), math.log(400), simplest=torch.tensor([2]))[0].tolist() != [1, 2]  # 2 may go
+    plain, simplest = set(), set()
+    for seed in range(10):
+        make = torch.Generator().manual_seed(seed)
+        J = torch.randn(400, 3, generator=make, dtype=torch.float64)
+        J[:, 1] = J[:, 0] + 1e-3 * J[:, 1]  # 1 is the simple one; 0 is what the data were made with
+        y = J[:, 0] + torch.randn(400, generator=make, dtype=torch.float64)
+        A = J.T @ J
+        of = A, torch.linalg.solve(A, J.T @ y), torch.tensor([0, 1]), math.log(400)
+        plain.add(tuple(prune(*of)[0].tolist()))
+        simplest.add(tuple(prune(*of, simplest=torch.tensor([1]))[0].tolist()))
+    assert plain == {(0,), (1,)}
+    assert simplest == {(1,)}
 
 
 def test_triples_spread_out():
