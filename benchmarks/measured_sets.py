@@ -30,6 +30,7 @@ from torch import Tensor
 
 from benchmarks.peers.rollouts import rk4
 from herglotz.data import Trajectories, load, simulate
+from herglotz.least_squares import least_squares
 from herglotz.models import ContactLagrangian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
@@ -124,7 +125,7 @@ def starts(data: Trajectories, rows: Tensor, beside: int = 8) -> tuple[Tensor, T
     """Positions and velocities at samples, (W, n) each, by cubics through their neighbours: the same for all models."""
     near = rows[:, None] + torch.arange(-beside, beside + 1)
     x = data.t[near] - data.t[rows][:, None]
-    c = torch.linalg.lstsq(torch.stack([x**k for k in range(4)], -1), data.q[near]).solution
+    c = least_squares(torch.stack([x**k for k in range(4)], -1), data.q[near])
     return c[:, 0], c[:, 1]
 
 

@@ -38,7 +38,7 @@ class Equation:
             top = torch.stack([C * a2 + S * v2**2, o, q1.sin(), o, v1, v1 - v2], -1)
             low = torch.stack([C * a1 - S * v1**2, a2, o, q2.sin(), o, v2 - v1], -1)
             matrix, right = torch.cat([top, low]), torch.cat([-a1, o])
-        return torch.linalg.lstsq(matrix, right[:, None]).solution[:, 0]
+        return torch.linalg.lstsq(matrix, right[:, None], driver="gelsd").solution[:, 0]
 
     def acceleration(self, q: Tensor, v: Tensor, theta: Tensor) -> Tensor:
         """(B, n); θ is (B, P)."""

@@ -48,7 +48,7 @@ def as_trajectories(
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, Trajectories):
         wrong = "trajectories have their columns already; of the options, only angles changes them"
-        refuse({wrong: (h, time, coordinates, inputs, group) != (None,) * 5 or drop})
+        refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         found = data
     elif isinstance(data, (str, Path)):
         found = load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())})

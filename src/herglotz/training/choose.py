@@ -13,6 +13,7 @@ from herglotz.training.plan import Plan
 from herglotz.training.task import NOISY
 
 RESTARTS = 4  # random initialisations of a single layer: some stall at a hundred times the error of others
+AS_FOUND = ("order", "features", "drag")  # what the search for terms sets, where the user does not
 
 
 class Rule(NamedTuple):
@@ -116,9 +117,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
 
 def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: bool) -> dict[str, str]:
     """Why the fields of a plan are as they are, where the look at the data says it."""
-    c = seen.settings
-    as_set = {"order": c.order == user_settings.order, "features": c.features == user_settings.features}
-    as_set["drag"] = c.drag == user_settings.drag
+    as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
         "substeps": "halved steps change the motion less than the data miss it" if named else "as set",

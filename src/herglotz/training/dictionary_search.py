@@ -105,7 +105,7 @@ class DictionarySearch:
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data)
-        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
+        self.own = own_terms(data.angles)
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)

@@ -30,7 +30,7 @@ from herglotz.training.parameter_vector import ParameterVector
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
-ROUNDS = 3  # of weights J_k: the first from the unit matrix, and two more change the coefficients less and less
+ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
 
 
 @dataclass(frozen=True)

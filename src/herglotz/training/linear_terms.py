@@ -56,7 +56,7 @@ class LinearTerms:
 
     def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms):
         self.data, self.base, self.all = data, base, every
-        self.own = own_terms(data.angles[0]) if data.dof == 1 else {}
+        self.own = own_terms(data.angles)
 
     def start(self, local: LocalPolynomials) -> LinearStart | None:
         """Terms and values of the linear problem, pruned, and its error; None where no mass fits."""
@@ -65,9 +65,13 @@ class LinearTerms:
         if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
             return None
         x = fit.solve(columns)
-        if float(x[0]) == 0 or not bool(torch.isfinite(fit.errors(x := x / x[0])).all()):
+        if float(x[0]) == 0:
             return None
-        terms, left, alone = self._pruned(fit, columns, x, max(1.0, local.width / 2))
+        x = x / x[0]
+        r = fit.errors(x)
+        if not bool(torch.isfinite(r).all()):
+            return None
+        terms, left, alone = self._pruned(fit, columns, x, r, max(1.0, local.width / 2))
         for x in (fit.solve(left), alone):
             start = fit.start(x)
             if start is not None:
@@ -83,12 +87,13 @@ class LinearTerms:
         forces = NamedForces(self.all.drag, self.base.speed, u)
         return LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
 
-    def _pruned(self, fit: LinearFit, columns: Tensor, x: Tensor, overlap: float) -> tuple[NamedTerms, Tensor, Tensor]:
-        """The terms that are worth it, their columns, and the coefficients that the others' absence leaves.
+    def _pruned(
+        self, fit: LinearFit, columns: Tensor, x: Tensor, r: Tensor, overlap: float
+    ) -> tuple[NamedTerms, Tensor, Tensor]:
+        """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
 
         Smoothed samples that share half a window say the same: N is over the `overlap`.
         """
-        r = fit.errors(x)
         X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
         size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
         place = self._linear_places(fit, columns)

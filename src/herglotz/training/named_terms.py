@@ -47,7 +47,7 @@ def candidates(data: Trajectories) -> NamedTerms:
     if n == 1:
         waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
         powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
-        features = [*own_terms(angles[0]), *(waves if angles[0] else powers)]
+        features = [*own_terms(angles), *(waves if angles[0] else powers)]
     else:
         features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r")]
         if any(angles):
@@ -85,9 +85,11 @@ def _difference(f: Product) -> dict[int, float]:
     return {} if i == j else {i: 1.0, j: -1.0}
 
 
-def own_terms(angle: bool) -> dict[str, tuple[str, float]]:
-    """The baseline's terms of one coordinate as features: the parameter of each, and its factor."""
-    if angle:
+def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
+    """The baseline's terms of one coordinate as features: the parameter of each, and its factor; of more none."""
+    if len(angles) > 1:
+        return {}
+    if angles[0]:
         return {"cos(q1)": ("potential.stiffness", -1.0), "sin(q1)": ("potential.tilt", 1.0)}
     return {"q1^2": ("potential.stiffness", 0.5), "q1": ("potential.tilt", 1.0)}
 

@@ -30,7 +30,7 @@ from herglotz.training.summary import COLUMNS
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
 LADDER = (*LEVELS, "auto")  # "auto", which `fit` takes without a level, is the richest and comes last
 BLOCKS = 5  # least number of blocks that the held-out time of all trajectories is divided into
-TIMED_STEPS = 20  # of a rollout whose time is measured: enough to leave its start behind
+TIMED_STEPS = 20  # of a rollout whose time is measured, over which the cost of the call itself is spread
 
 
 @dataclass(frozen=True)

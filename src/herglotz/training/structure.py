@@ -183,8 +183,10 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
-    has = {COUPLING: config.coupled, "friction.viscous": config.level == "forced"}
-    has["kinetic.base.off_diagonal"] = not config.diagonal
+    has = {
+        COUPLING: config.coupled, "friction.viscous": config.level == "forced",
+        "kinetic.base.off_diagonal": not config.diagonal,
+    }  # fmt: skip
     values = {name: tuple(x.tolist()) for name, x in start.items() if has.get(name, True)}
     return replace(_with(base, values, names), rate=base.rate)
 

@@ -104,4 +104,4 @@ def _error(value: float | None, unit: str, degrees: bool, after: str = "") -> st
 
 def show(value: Any, unit: str) -> str:
     """Three digits and a unit; "" where there is no value."""
-    return "" if value is None else f"{value:.3g} {unit}".rstrip()
+    return "" if value is None else size(value, unit)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
+from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.mechanics.legendre import beyond
 from herglotz.stepping import Status, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
@@ -119,6 +119,11 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     return y, step_derivative(P, p0)
 
 
+def _momentum_slope(P: Partials) -> Tensor:
+    """∂p1/∂q1, (..., n, n)."""
+    return P.D22 if P.force is None else P.D22 + P.force.plus_2
+
+
 def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
     """The same with F linear about the next state's q; exact, and equal to `all_steps`, where F = 0 there.
 
@@ -132,11 +137,9 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
         q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
     P = partials(L_d, q0, q1, s0, h, order=2)
     dq = -torch.linalg.solve_ex(momentum_jacobian(P, p0), momentum_residual(P, p0)[..., None])[0]
-    p1_q1 = P.D22
-    if P.force is not None:
-        p1_q1 = p1_q1 + P.force.plus_2
-        dq = dq if P.force.held is None else torch.where((P.force.held > 0)[..., None], 0.0, dq)
-    p1, s1 = momentum_plus(P) + (p1_q1 @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
+    if P.force is not None and P.force.held is not None:
+        dq = torch.where((P.force.held > 0)[..., None], 0.0, dq)
+    p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
     return torch.cat([q1 + dq[..., 0], p1, s1[..., None]], -1), step_derivative(P, p0)
 
 
@@ -170,8 +173,7 @@ def parameter_derivatives(
         with torch.no_grad():
             P = partials(parameters.at(theta, own), here[0], here[1], here[3], here[4], order=2)
             dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, here[2]), G[:, :n])[0]
-            p1_q1 = P.D22 if P.force is None else P.D22 + P.force.plus_2
-            dp1 = G[:, n : 2 * n] + p1_q1 @ dq1
+            dp1 = G[:, n : 2 * n] + _momentum_slope(P) @ dq1
             ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
         out[part] = torch.cat([dq1, dp1, ds1], 1)
     add_over_processes(out)
