@@ -74,8 +74,7 @@ class Potential(nn.Module):
 
     The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
     network is multiplied by the energy scale Σ speed², so that its weights are of order one. `features` joins V as it
-    is; The model's `alike`, `order` 4 and `translations` fix k and b:
-    features say there what V is.
+    is. A model's `alike`, `order` 4 and `translations` fix k and b: there the features say what V is.
     """
 
     def __init__(self, config: ModelConfig, generator: torch.Generator):

@@ -73,6 +73,7 @@ def test_tables():  # fails if a Series' index is not its time, or a DataFrame's
         ("nothing.csv", {}, "no such file"),
         (Q, {"h": 0.1, "group": "run"}, "group and drop are of tables"),
         (Trajectories.of(T, Q), {"h": 0.1}, "have their columns already"),
+        (Trajectories.of(T, Q), {"time": T}, "have their columns already"),
         ([Q, Q], {"time": T}, "time and inputs of several arrays"),
     ],
 )
