@@ -117,6 +117,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
 
 def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: bool) -> dict[str, str]:
     """Why the fields of a plan are as they are, where the look at the data says it."""
+    prior = "one-step fits use the last" if one_step else "held-out blocks of time choose among them"
     as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
@@ -126,7 +127,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
         "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
-        "departures": "held-out blocks of time choose among them" if not one_step else "one-step fits use the last",
+        "departures": "without a network there is no prior of it" if named else prior,
     }
 
 
