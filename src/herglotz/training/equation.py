@@ -125,7 +125,7 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
             deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
-    terms[:0] = _kinetic(run)
+    terms[:0] = [*_kinetic(run), *_relative_springs(run)]
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
     units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
@@ -158,6 +158,25 @@ def _kinetic(run: Run) -> list[Term]:
         for j in n[i:]
         if (value := float(mass[i, j]) * (0.5 if i == j else 1.0)) != 0.0
     ]
+
+
+def _relative_springs(run: Run) -> list[Term]:
+    """−½ k (Pq)² − b (Pq) of a model with translations, whose baseline acts on the projected position."""
+    V, names, sums = run.model.potential, run.data.names, {}
+    if V.across is None:
+        return []
+    for row, angle, k, b in zip(V.across.tolist(), V.angles, V.stiffness.tolist(), V.tilt.tolist(), strict=True):
+        size = next((w for w in row if w), 1.0)
+        form = " ".join(
+            f"{'−' if w * size < 0 else '+'} {'' if abs(abs(w / size) - 1) < 1e-9 else f'{abs(w / size):.4g} '}{name}"
+            for w, name in zip(row, names, strict=True)
+            if w
+        ).removeprefix("+ ")
+        x = f"({form})" if " " in form else form
+        named = ((f"cos {x}", k), (f"sin {x}", -b)) if angle else ((f"{x}²", -k * size**2 / 2), (x, -b * size))
+        for what, value in named if form else ():
+            sums[what] = sums.get(what, 0.0) + value
+    return [Term("L", what, value, None, "") for what, value in sums.items() if value]
 
 
 def _newtonian(model: ContactLagrangian) -> bool:

@@ -12,7 +12,7 @@ from herglotz.data.roughness import roughness
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
 from herglotz.models import ContactLagrangian
-from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
+from herglotz.training.baseline import Baseline, across_translations, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.dry_friction import friction_holds
@@ -95,6 +95,7 @@ def look(
     settings = settings if plan is None else plan.applied(settings)
     settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
+    base = across_translations(base, kept, settings.translations, outliers=outliers)
     task = Task(kept, base, settings, stages)
     terms = _Terms(settings, plan.started(base)) if plan is not None else _terms(task, user_settings, outliers, named)
     task = replace(task, base=terms.base, config=terms.settings)
