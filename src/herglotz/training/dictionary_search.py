@@ -128,7 +128,7 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._last_terms(self._pruned(found))
+        return self._one_rate(self._last_terms(self._pruned(found)))
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
@@ -281,6 +281,18 @@ class DictionarySearch:
                 break
             found = less
         return found
+
+    def _one_rate(self, found: Found) -> Found:
+        """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""
+        terms, count = found.terms, self.data.q.numel()
+        if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
+            return found
+        less = self._refit(found, replace(terms, one_rate=True))
+        if less is None:
+            return found
+        fewer = len(found.fit.theta) - len(less.fit.theta)
+        worth = (1 + fewer * math.log(count) / count) ** 0.5 * max(found.rms, self.floor)
+        return less if less.rms <= worth or (found.coloured and self._as_good(less, found)) else found
 
     def _as_good(self, less: Found, found: Found) -> bool:
         """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
