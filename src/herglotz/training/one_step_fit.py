@@ -21,7 +21,7 @@ NOISE_OF_R = 6**0.5  # standard deviation of q2 − 2 q1 + q0, hence of r, over 
 ITERATIONS_BEFORE_SELECTION = 30  # of each restart, at most a third of all iterations together; only the best goes on
 SEED_STRIDE = 7919  # between the seeds of restarts: no seed below 7919 shares a draw with another
 ADAM_STEPS = 20  # steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps
-TRIPLES = 4000  # of a short fit
+SHORT_ROWS = 10  # triples for each coefficient in a short fit
 ROWS = 50  # residuals for each coefficient in a one-step fit of found features: more only cost time
 
 
@@ -44,7 +44,8 @@ def one_step_problem(
     shared = {"max_step": base.max_step, "sigma": sigma, "prior": prior, "freedom": freedom}
     if config.supervision != "q":
         return SupervisedProblem(model, task.data, momenta=config.supervision == "qps", **shared)
-    most = ROWS * prior.start.numel() if config.coupled and base.start else TRIPLES if short else None
+    rows = SHORT_ROWS if short else ROWS if config.coupled and base.start else None
+    most = None if rows is None else rows * prior.start.numel()
     return ResidualProblem(model, task.data, metric=metric, expected=expected, most=most, **shared)
 
 
