@@ -82,7 +82,7 @@ def test_the_mass_of_what_moves_apart_is_not_left_open(run):
     # fails if the relative motion has no spring to start from: a network that makes its whole force is held small by
     # its prior, with it the relative mass, and det M goes to 0 (2e-5 of a mass; measured now: masses 1, 1.0004, −3e-4)
     fitted = hz.fit(run.data, level="linear", objective="trajectory", departures=(1e-3,), translations=("q1 + q2",))
-    mass = fitted.model.kinetic.mass().detach()
+    mass = fitted.model.kinetic.mass().detach()  # pyright: ignore
     assert float((mass - torch.eye(2)).abs().max()) < 0.02
     assert fitted.metrics["extrapolation_rms"] < 2 * run.metrics["extrapolation_rms"]
     assert "(x − y)²" in str(fitted.equation())
