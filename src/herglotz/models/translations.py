@@ -18,6 +18,7 @@ from herglotz.errors import InputError
 from herglotz.models.feature_grammar import parse
 from herglotz.models.features import expand
 
+SAME = 1e-9  # of 1: what the pseudo-inverse rounds
 HOW = "name what moves together, as 'q1 + q2'"
 
 
@@ -70,6 +71,20 @@ def projection(translations: Sequence[str], angles: Sequence[bool]) -> Tensor | 
     """(n, n) P with P d = 0 for every translation d and P x = x across them; None without translations."""
     moved = directions(translations, angles)
     return _across(torch.tensor(moved, dtype=torch.float64)) if moved else None
+
+
+def across_in_words(P: Tensor, names: Sequence[str]) -> list[tuple[str, float]]:
+    """The rows of a projection as "(x − y)" with the factor before it, "" for an empty one."""
+    found = []
+    for row in P.tolist():
+        size = next((w for w in row if w), 1.0)
+        parts = [(w / size, name) for w, name in zip(row, names, strict=True) if w]
+        texts = [
+            f"{'−' if w < 0 else '+'} {'' if abs(abs(w) - 1) < SAME else f'{abs(w):.4g} '}{name}" for w, name in parts
+        ]
+        form = " ".join(texts).removeprefix("+ ")
+        found.append((f"({form})" if len(parts) > 1 else form, size))
+    return found
 
 
 def _across(seen: Tensor) -> Tensor:

@@ -11,11 +11,9 @@ steps are halved while that changes the motion by as much as the data miss it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
@@ -24,6 +22,7 @@ from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
+from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import best_start
 from herglotz.training.named_terms import (
     DRY,
@@ -46,7 +45,6 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
-COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
@@ -55,38 +53,6 @@ FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
-
-
-@dataclass(frozen=True)
-class Found:
-    """A model of named terms with its fit."""
-
-    terms: NamedTerms
-    config: FitConfig
-    values: dict
-    base: Baseline
-    fit: TrajectoryFit
-    whole: bool  # every trajectory is one segment
-    spread: float  # of q, RMS
-
-    @property
-    def rms(self) -> float:
-        """Misfit of the data, in units of q."""
-        return self.fit.noise
-
-    @cached_property
-    def held_out(self) -> Tensor:
-        """RMS over held-out blocks of time, (FOLDS,)."""
-        return self.fit.held_out_errors()
-
-    @property
-    def coloured(self) -> bool:
-        """Whether the misfit goes on from sample to sample, by its autocorrelation: white noise has 0 ± 1/√N."""
-        problem = self.fit.problem
-        r = problem.misfit(self.fit.path)[problem.grid.sample.argsort()]
-        together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
-        with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
-        return float(with_next) > COLOURED / r.numel() ** 0.5
 
 
 class DictionarySearch:
@@ -236,9 +202,7 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(
-        self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1
-    ) -> Found | None:
+    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1) -> Found | None:
         """The fit with other terms, steps or samples, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps, every)
         assert problem.path is not None

@@ -22,6 +22,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
+from herglotz.models.translations import across_in_words
 
 
 class Run(Protocol):
@@ -162,19 +163,11 @@ def _kinetic(run: Run) -> list[Term]:
 
 def _relative_springs(run: Run) -> list[Term]:
     """−½ k (Pq)² − b (Pq) of a model with translations, whose baseline acts on the projected position."""
-    V, names, sums = run.model.potential, run.data.names, {}
-    if V.across is None:
-        return []
-    for row, angle, k, b in zip(V.across.tolist(), V.angles, V.stiffness.tolist(), V.tilt.tolist(), strict=True):
-        size = next((w for w in row if w), 1.0)
-        form = " ".join(
-            f"{'−' if w * size < 0 else '+'} {'' if abs(abs(w / size) - 1) < 1e-9 else f'{abs(w / size):.4g} '}{name}"
-            for w, name in zip(row, names, strict=True)
-            if w
-        ).removeprefix("+ ")
-        x = f"({form})" if " " in form else form
-        named = ((f"cos {x}", k), (f"sin {x}", -b)) if angle else ((f"{x}²", -k * size**2 / 2), (x, -b * size))
-        for what, value in named if form else ():
+    V, sums = run.model.potential, {}
+    forms = [] if V.across is None else across_in_words(V.across, run.data.names)
+    for (x, w), angle, k, b in zip(forms, V.angles, V.stiffness.tolist(), V.tilt.tolist(), strict=False):
+        both = ((f"cos {x}", k), (f"sin {x}", -b)) if angle else ((f"{x}²", -k * w**2 / 2), (x, -b * w))
+        for what, value in both if x else ():
             sums[what] = sums.get(what, 0.0) + value
     return [Term("L", what, value, None, "") for what, value in sums.items() if value]
 
