@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import check_output_folder, print_json, say
+from herglotz.cli.common import check_output_folder, exit_code, print_json, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.training import FitConfig, Run
 
-NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
@@ -72,7 +71,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(result.metrics)
     else:
         report(result, out, drawn)
-    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
+    return exit_code(result)
 
 
 def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argparse.Namespace) -> None:
@@ -99,7 +98,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     from herglotz.training import Plan
 
     print("Plan (what was decided, and why):")
-    print(Plan.from_dict(result.metrics["plan"]).table())
+    print(Plan.from_dict(result.metrics["plan"]).table(unit=result.data.unit))
     print("Result:")
     print(result.summary())
     if drawn:

@@ -144,7 +144,7 @@ def test_fit_says_what_it_found(tmp_path, capsys):
     made = ["simulate", "chain", "--param", "masses=2", "--trajectories", "4", "--steps", "24", "--h", "0.1"]
     assert main([*made, "--out", str(csv)]) == 0
     assert main(["fit", str(csv), "--out", str(folder), "--no-plots"]) == 0
-    assert "(q1 - q2)^2" in next(x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("features"))
+    assert "(q1 - q2)^2" in next(x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("named terms"))
     told = ["--level", "forced", "--diagonal", "--feature", "(q1 - q2)^2", "--out", str(tmp_path / "told")]
     assert main(["fit", str(csv), *told, "--no-plots", "--order", "4", "--iterations", "2"]) in (0, 3)
     assert "kinetic.off_diagonal" not in dict(load_run(tmp_path / "told").model.named_parameters())
