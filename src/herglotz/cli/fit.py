@@ -38,7 +38,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_progress_flags(parser)
     parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
     parser.add_argument(
-        "--tensorboard", type=Path, metavar="FOLDER", help="log for TensorBoard too (the log in RUN is history.csv)"
+        "--tensorboard",
+        type=Path,
+        metavar="FOLDER",
+        help="log for TensorBoard, as the fit runs (RUN holds history.csv too)",
     )
     add_machine_flags(parser)
     add_model_flags(parser.add_argument_group("model"))
@@ -54,18 +57,14 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import load
     from herglotz.training import load_run
-    from herglotz.training.tensorboard import summary_writer, write_tensorboard
 
     config = settings_of(arguments)
     if arguments.tensorboard is not None:
         check_output_folder(arguments.tensorboard)
-        summary_writer()  # missing, it is found before training
     data = load(arguments.data, **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     _fit_into(out, data, config, arguments)
     result = load_run(out)  # what later commands will see, and on the cpu
-    if arguments.tensorboard is not None:
-        write_tensorboard(result, arguments.tensorboard)
     drawn = _draw(result, out) if not arguments.no_plots else []
     if arguments.json:
         print_json(result.metrics)
@@ -82,7 +81,8 @@ def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argpa
     made = _make(out)
     try:
         with locked(out):
-            save_run(fit(data, config, out=out, resume=arguments.resume, progress=progress(arguments)), out)
+            shown = {"progress": progress(arguments), "tensorboard": arguments.tensorboard}
+            save_run(fit(data, config, out=out, resume=arguments.resume, **shown), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():
             raise KeyboardInterrupt("; the same command with --resume goes on") from None

@@ -89,7 +89,7 @@ class Plan:
         """The decisions, those of one reason together, and the reason below them, for people."""
         lines = []
         for decisions, reason in self.by_reason(unit):
-            lines.append(textwrap.fill("; ".join(decisions), width, initial_indent="  ", subsequent_indent="  "))
+            lines += [textwrap.fill(x, width, initial_indent="  ", subsequent_indent="    ") for x in decisions]
             lines.append(textwrap.fill(reason, width, initial_indent="      ", subsequent_indent="      "))
         return "\n".join(filter(None, lines))
 

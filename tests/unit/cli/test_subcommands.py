@@ -291,6 +291,8 @@ def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  
     monkeypatch.setattr(herglotz.training, "fit", interrupted)
     assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 130
     assert "--resume" in capsys.readouterr().err
+    assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 2  # fails if the work done is overwritten
+    assert "holds a fit that was interrupted; add --resume" in capsys.readouterr().err
 
 
 def test_select(capsys, tiny_csv, tmp_path):  # fails if run, table or figure is missing, or --dtype does not arrive
