@@ -134,6 +134,7 @@ MUTANTS = [
     ("theory/caustics.py", 'if k == 0 and point:', 'if k == 0:'),
     ("theory/caustics.py", 'bend = P.c[..., k, None, None] * slope', 'bend = slope'),
     ("theory/caustics.py", 'torch.where(regular, kinetic[..., k], first)', '0'),
+    ("theory/caustics.py", 'first = count if len(margins) == 1 else first', 'first = torch.ones_like(count)'),
     ("theory/caustics.py", 'crossed = torch.where(passed & (crossed < 0), k, crossed)', 'crossed = torch.where(passed, k, crossed)'),
     ("theory/caustics.py", 'J[..., k, :, :].mT @ torch.linalg', 'J[..., k, :, :] @ torch.linalg'),
     ("theory/caustics.py", 'return P.D11 + cross + cross.mT', 'return P.D11'),
