@@ -165,7 +165,7 @@ def _with_friction(
     c = user_settings
     plain = (c.level, c.objective, c.supervision, c.optimiser) == ("auto", "auto", "q", "lm") and not c.coulomb
     if plan is not None or settings.sticking is not None:
-        return settings, "as set"
+        return settings, "as set, or by default"
     if kept.u is None or not plain:
         return replace(
             settings, sticking=False
@@ -195,7 +195,7 @@ def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
 
 def _probe(task: Task) -> Probe:
     model = task.build("correction")
-    problem = one_step_problem(task, model, task.exact)
+    problem = one_step_problem(task, model, task.exact, short=True)
     _, rms = fit_one_step(task, problem, "one-step probe", PROBE)
     residuals = len(task.data.triples(task.base.max_step)) * task.data.dof
     return Probe(model, rms, residuals, len(problem.start()))
