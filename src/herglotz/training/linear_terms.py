@@ -33,10 +33,10 @@ class LinearStart(NamedTuple):
 def linear_starts(
     data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials
 ) -> list[LinearStart]:
-    """The start with fewest terms whose error the best one does not undercut by more than a twentieth, and simpler ones.
+    """The start with fewest terms whose error the best one does not undercut by more than a 20th, and simpler ones.
 
-    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind the
-    first have fewer terms than it, the fewest first: their errors may be noise, which whole trajectories tell.
+    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind
+    the first have fewer terms than it, the fewest first: their errors may be noise, which whole trajectories tell.
     """
     tried = [start for terms in families if (start := LinearTerms(data, base, terms).start(local)) is not None]
     tried.sort(key=lambda start: len(start.terms.names))
