@@ -23,7 +23,7 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.found_terms import Found
-from herglotz.training.linear_terms import best_start
+from herglotz.training.linear_terms import linear_starts
 from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
@@ -108,10 +108,27 @@ class DictionarySearch:
         if local is None:
             return None
         start = smoothed(self.data, local)
-        linear = best_start(self.data, self.base, (self.all, *chains(self.data)), local)
-        found = None if linear is None else self._grown(linear.terms, linear.values, 1, start)
+        linear = linear_starts(self.data, self.base, (self.all, *chains(self.data)), local)
+        found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         found = found or self._grown(*self._bare(), 1, start)
-        return None if found is None else self._finer(self._held(self._simpler(found)))
+        if found is None:
+            return None
+        found = self._finer(self._held(self._simpler(found)))
+        for simple in linear[1:]:
+            if found.coloured:
+                break  # of residuals that are no noise likelihoods tell nothing
+            other = self._grown(simple.terms, simple.values, 1, start)
+            other = None if other is None else self._finer(self._held(other))
+            if other is not None and self._as_likely(other, found):
+                return other
+        return found
+
+    def _as_likely(self, less: Found, found: Found) -> bool:
+        """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
+        count, fewer = self.data.q.numel(), len(found.terms.names) - len(less.terms.names)
+        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
+        missed = max(less.rms, self.floor) / max(found.rms, self.floor)
+        return longer and count * math.log(missed) < fewer * math.log(count) / 2
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""
