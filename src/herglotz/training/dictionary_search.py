@@ -289,22 +289,23 @@ class DictionarySearch:
         terms, count = found.terms, self.data.q.numel()
         if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
             return found
-        less = self._refit(found, replace(terms, one_rate=True))
-        if less is None:
+        if (less := self._refit(found, replace(terms, one_rate=True))) is None:
             return found
-        fewer = len(found.fit.theta) - len(less.fit.theta)
-        worth = (1 + fewer * math.log(count) / count) ** 0.5 * max(found.rms, self.floor)
-        return less if less.rms <= worth or (found.coloured and self._as_good(less, found)) else found
+        fewer = (len(found.fit.theta) - len(less.fit.theta)) * math.log(count) / count
+        return (
+            less
+            if less.rms <= (1 + fewer) ** 0.5 * max(found.rms, self.floor)
+            or (found.coloured and self._as_good(less, found))
+            else found
+        )
 
     def _as_good(self, less: Found, found: Found) -> bool:
         """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
         return less.rms <= 2**0.5 * max(found.rms, self.floor) and not self._beaten(less, found)
 
     def _beaten(self, found: Found, other: Found) -> bool:
-        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding.
-
-        Their spread has no say: it is wide where errors grow with time, as on an axis without a spring.
-        """
+        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding."""
+        # their spread has no say: it is wide where errors grow with time, as on an axis without a spring
         own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
         return not own <= MARGIN * its
 
