@@ -56,16 +56,9 @@ SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of o
 
 
 class DictionarySearch:
-    """See the head of this module.
+    """See the head of this module: `data` to train on, the first look `base` at them, and the settings of the fit.
 
-    Parameters
-    ----------
-    data
-        What is trained on, without single spikes.
-    base, config
-        The first look at it, and the settings of the fit.
-    outliers
-        Whether Student's t is the loss.
+    With `outliers` Student's t is the loss.
     """
 
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False):
