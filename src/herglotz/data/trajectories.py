@@ -27,10 +27,38 @@ IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectories:
-    """B trajectories of n coordinates, stored one after the other.
+    """B trajectories of n coordinates, stored one after the other; N samples in all.
 
     Checked on construction: finite values, time strictly increasing inside each trajectory, at least three samples
-    each, consistent shapes, one floating dtype. Two sets are equal when their `digest()` is.
+    each, consistent shapes, one floating dtype. Two sets are equal when their `digest()` is. `Trajectories.of` builds a
+    set from arrays and fills in what is left out.
+
+    Parameters
+    ----------
+    t
+        (N,) time, in `time_unit`.
+    q
+        (N, n) position, in `units`.
+    lengths
+        Samples of each trajectory, adding up to N.
+    names, units
+        Of the n coordinates; units are "rad", "m", "pixel", "1", ...
+    angles
+        Which coordinates are 2π-periodic; their unit is "rad".
+    s
+        (N,) action variable, where it is known.
+    p
+        (N, n) momentum, where it is known.
+    u
+        (N, m) control input, such as a motor's torque, where it was measured.
+    time_unit
+        Of t.
+    source
+        File or scene of origin, for messages.
+    hold
+        What u does between samples: zero, first or smooth; "" where nobody said.
+    columns
+        Name, role and unit of each column of a table, as it was read.
 
     Raises
     ------
