@@ -55,8 +55,8 @@ def _callables() -> list[tuple[str, Any]]:
     return [(name, value) for name, value in own if not has_no_signature(value)]
 
 
-@pytest.mark.parametrize(("name", "value"), _callables())
-def test_a_public_docstring_is_whole(name, value):
+@pytest.mark.parametrize("value", [pytest.param(value, id=name) for name, value in _callables()])
+def test_a_public_docstring_is_whole(value):
     # fails if a parameter has no words, or a function does not say what it returns and when it raises
     text = inspect.getdoc(value) or ""
     parameters = {str(p).split(":")[0].split("=")[0].strip() for p in inspect.signature(value).parameters.values()}

@@ -117,7 +117,11 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
     path = tmp_path / "motion.csv"
     path.write_text("clock,a,b\n0,1,2\n1,2,3\n")
     flags = ["--time", "clock", "--coordinates", "a", "--inputs", "none", "--drop", "b", "--group", "lap"]
-    for command in (["fit", str(path), "--out", str(tmp_path / "run")], ["select", str(path), "--out", str(tmp_path)]):
+    for command in (
+        ["fit", str(path), "--out", str(tmp_path / "run")],
+        ["select", str(path), "--out", str(tmp_path)],
+        ["plot", str(path), "--out", str(tmp_path)],
+    ):
         assert main([*command, *flags]) == 2
         assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
 
