@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from herglotz.cli import main
+from herglotz.cli.flags import columns_of
+from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, load, save
 from herglotz.data.table import from_frame
 from herglotz.data.units import in_degrees, size
@@ -124,6 +126,9 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
     ):
         assert main([*command, *flags]) == 2
         assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
+        taken = columns_of(build_parser().parse_args([*command, *flags, "--angles", "a"]))
+        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"]}
+        assert taken == {"time": "clock", "group": "lap", **names}
 
 
 def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning
