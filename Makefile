@@ -40,7 +40,7 @@ tutorials: .venv/runtime
 
 lint: .venv/installed
 	$(PY) -m ruff check .
-	$(PY) -m pyright
+	$(PY) -m pyright --threads $(WORKERS)
 
 # Before a commit: under two minutes on two cores. Processor time, measured on an AMD EPYC: pyright 46 s, then QUICK
 # 86 s (1507 tests) over two workers. Folders left out: theory 48 s, plots 38 s, cli 83 s, export 194 s, and longer ones.

@@ -6,6 +6,7 @@ decided by the seed and the data. An assertion on a trained quantity that holds 
 is found so on one machine (`make test-anywhere`).
 """
 
+import gc
 import os
 import sys
 from dataclasses import replace
@@ -27,6 +28,13 @@ def shaken(data, seed):
         return None if x is None else x * (1 + RELATIVE * torch.randn(x.shape, generator=make, dtype=x.dtype))
 
     return replace(data, q=disturbed(data.q), u=disturbed(data.u))
+
+
+def pytest_collection_finish():
+    """Torch and the tests are not looked through again for garbage: that took 9 % of the tests of export."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 20)
 
 
 def pytest_configure():

@@ -36,7 +36,8 @@ def exact_data():
 
 @pytest.fixture(scope="module")
 def exact_run(exact_data):
-    return fit(exact_data, FitConfig(train_fraction=1.0))
+    # 100 of the default 500 iterations: RMS 7e-6 rad, 5e-7 after all of them, in a fifth of the time
+    return fit(exact_data, FitConfig(train_fraction=1.0, iterations=100))
 
 
 @pytest.fixture(scope="module")

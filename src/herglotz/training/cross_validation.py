@@ -52,15 +52,28 @@ def held_out_errors(
     white noise, would both be fooled by their neighbours.
     """
     r, J = problem.data_rows(path, theta)
-    inverse = torch.linalg.pinv(A.double(), hermitian=True)
-    J = J.double()
-    return left_out_errors(r.double(), problem.data, lambda rows: J[rows] @ inverse @ J[rows].T) * problem.sigma
+    values, vectors = torch.linalg.eigh(A.double())
+    known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
+    r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
+    return left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows])) * problem.sigma
+
+
+def _left_out(G: Tensor, r: Tensor) -> Tensor:
+    """(I − G Gᵀ)⁻¹ r, by the smaller of the two matrices: it is r + G (I − Gᵀ G)⁻¹ Gᵀ r as well."""
+    if G.shape[0] <= G.shape[1]:
+        return without_rows(G @ G.T, r)
+    return r + G @ without_rows(G.T @ G, G.T @ r)
+
+
+def without_rows(H: Tensor, r: Tensor) -> Tensor:
+    """(I − H)⁻¹ r."""
+    return torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r)[0]
 
 
 def left_out_errors(
     r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
     data: Trajectories,
-    hat: Callable[[Tensor], Tensor],  # J_B A⁻¹ J_Bᵀ of some of their rows, given as bool (N·n,)
+    left_out: Callable[[Tensor], Tensor],  # residuals of some of their rows, given as bool (N·n,), without them
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).
 
@@ -71,12 +84,8 @@ def left_out_errors(
         for part in parts:
             part[: min(STAY, len(part) // (2 * FOLDS))] = -1
     fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
-    errors = []
-    for k in range(FOLDS):
-        H = hat(fold == k)
-        left_out = torch.linalg.solve_ex(torch.eye(len(H), dtype=H.dtype, device=H.device) - H, r[fold == k])[0]
-        errors.append(left_out.square().mean().sqrt())
-    return torch.stack(errors).nan_to_num(nan=torch.inf)
+    errors = torch.stack([left_out(fold == k).square().mean().sqrt() for k in range(FOLDS)])
+    return errors.nan_to_num(nan=torch.inf)
 
 
 def beaten(errors: Tensor, best: Tensor) -> bool:

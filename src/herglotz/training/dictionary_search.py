@@ -18,6 +18,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.oversampling import sparsest
 from herglotz.data.roughness import precision
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
@@ -115,8 +116,13 @@ class DictionarySearch:
 
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
-        part = self.data.liveliest(PART)
-        found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
+        every = sparsest(self.data)
+        found = None if every == 1 else self._from_sparse(self.data.thinned(every), every)
+        if found is not None and found.coloured:
+            return found  # more samples do not tell what a term is missing that this many do not show
+        if found is None:
+            part = self.data.liveliest(PART)
+            found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
         for _ in range(ADDED):
@@ -155,6 +161,16 @@ class DictionarySearch:
             first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=begin)
             fit = None if first is None else stages.grow(first, sigma)
         return None if fit is None else self._found(found.terms, stages, fit)
+
+    def _from_sparse(self, sparse: Trajectories, every: int) -> Found | None:
+        """What every m-th sample asks for, fitted to all of them."""
+        base = replace(self.base, max_step=every * self.base.max_step, model_step=every * self.base.model_step)
+        found = DictionarySearch(sparse, base, self.config, outliers=self.freedom is not None).run()
+        if found is None:
+            return None
+        self.order = found.config.order
+        dense = self._refit(found, found.terms, max(1, found.config.substeps // every), every)
+        return None if dense is None else self._longer(dense)
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
@@ -204,11 +220,13 @@ class DictionarySearch:
         stages.lengths = [0, *(length for length in stages.lengths if length > done)]
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
-    def _problem(self, found: Found, terms: NamedTerms, substeps: int) -> tuple[SegmentStages, ShootingProblem]:
-        """The problem with other terms over the same segments."""
+    def _problem(
+        self, found: Found, terms: NamedTerms, substeps: int, every: int = 1
+    ) -> tuple[SegmentStages, ShootingProblem]:
+        """The problem with other terms over the same segments; `found` may be of every m-th sample."""
         stages = self._stages(terms, found.values, substeps, found.config.sticking)
         old, base = found.fit.problem, stages.task.base
-        grid = segment_grid(self.data, old.grid.length, base.model_step)
+        grid = segment_grid(self.data, every * old.grid.length, base.model_step)
         model = stages.model
         problem = ShootingProblem(
             model, self.data, grid, sigma=max(found.rms, self.floor), prior=prior_of(model, base, None),
@@ -218,10 +236,11 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None) -> Found | None:
-        """The fit with other terms or steps, from this one."""
-        stages, problem = self._problem(found, terms, substeps or found.config.substeps)
-        states = found.fit.path.x[:, 0, : problem.d]
+    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1) -> Found | None:
+        """The fit with other terms, steps or samples, from this one."""
+        stages, problem = self._problem(found, terms, substeps or found.config.substeps, every)
+        assert problem.path is not None
+        states = problem.path.x[:, 0, : problem.d]
         fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 

@@ -20,8 +20,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Stepper
 from herglotz.training.baseline import Baseline
+from herglotz.training.free_run import continued
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
 from herglotz.training.named_terms import DRY, NamedTerms, candidates, places, settings_of, started, values_of
@@ -144,7 +144,7 @@ class _Ahead:
 
         They are the fitted model's own, which steps quicker than one with all terms.
         """
-        n, known, parts = self.data.dof, states[self.rows], []
+        known, parts = states[self.rows], []
         for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
             last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
             if last < length - 1:
@@ -156,11 +156,11 @@ class _Ahead:
         rest = replace(self.data, t=self.data.t[at], q=self.data.q[at], u=u, lengths=tuple(map(len, parts)))
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
-        with torch.no_grad():
-            start, u = (x[:, :n], x[:, n : 2 * n], x[:, 2 * n]), grid_inputs(model, rest, grid)
-            out = Stepper(model).rollout(*start, h=grid.h, inputs=u)
-        known[at[grid.sample]] = torch.cat([out.q, out.p, out.s[..., None]], -1).flatten(0, 1)[grid.node]
-        return known if bool(torch.isfinite(known).all()) else None
+        out = continued(model, x, grid.h, grid_inputs(model, rest, grid))
+        if out is None:
+            return None
+        known[at[grid.sample]] = out.flatten(0, 1)[grid.node]
+        return known
 
 
 def _turn(data: Trajectories, states: Tensor) -> float:

@@ -13,6 +13,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.inputs import step_inputs
 from herglotz.training.objectives import Fitted
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, substeps
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import solve_path
@@ -71,6 +72,38 @@ def near_data(
         tol = 64 * torch.finfo(start.dtype).eps
         path = solve_path(problem.parameters, problem.parameters.get(), start, grid.h, problem.path.x, tol, u=u)
     return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
+
+
+def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
+    """The free runs from `start`, (S, 2n+1), (S, K+1, 2n+1); None where a step fails.
+
+    Blocks of steps are solved at once from straight lines: a block that converges doubles the next one, and after one
+    that does not a single step is taken. A few batched evaluations stand for each step's own.
+    """
+    parameters, n, tol = ParameterVector(model), (start.shape[-1] - 1) // 2, 64 * torch.finfo(start.dtype).eps
+    theta, x, k, block = parameters.get(), start[:, None], 0, 1
+
+    def at_once(part: slice) -> Tensor | None:
+        guess = x[:, -1:].repeat(1, h[:, part].shape[1] + 1, 1)
+        v = (x[:, -1, :n] - x[:, -2, :n]) / h[:, k - 1 : k]
+        guess[:, 1:, :n] += v[:, None] * h[:, part].cumsum(1)[..., None]
+        path = solve_path(parameters, theta, x[:, -1], h[:, part], guess, tol, u=None if u is None else u[:, part])
+        return None if path is None else path.x
+
+    def stepped(part: slice) -> Tensor:
+        here, inputs = x[:, -1], None if u is None else u[:, part]
+        out = Stepper(model).rollout(here[:, :n], here[:, n : 2 * n], here[:, 2 * n], h=h[:, part], inputs=inputs)
+        return torch.cat([out.q, out.p, out.s[..., None]], -1)
+
+    with torch.no_grad():
+        while k < h.shape[1]:
+            new = at_once(slice(k, k + block)) if block > 1 else None
+            block = max(2, block // 4) if new is None else 2 * block
+            new = stepped(slice(k, k + 1)) if new is None else new
+            if not bool(torch.isfinite(new).all()):
+                return None
+            x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
+    return x
 
 
 def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> tuple[Tensor, str]:

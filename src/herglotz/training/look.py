@@ -195,7 +195,7 @@ def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
 
 def _probe(task: Task) -> Probe:
     model = task.build("correction")
-    problem = one_step_problem(task, model, task.exact)
+    problem = one_step_problem(task, model, task.exact, short=True)
     _, rms = fit_one_step(task, problem, "one-step probe", PROBE)
     residuals = len(task.data.triples(task.base.max_step)) * task.data.dof
     return Probe(model, rms, residuals, len(problem.start()))

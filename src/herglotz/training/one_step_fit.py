@@ -21,6 +21,7 @@ NOISE_OF_R = 6**0.5  # standard deviation of q2 − 2 q1 + q0, hence of r, over 
 ITERATIONS_BEFORE_SELECTION = 30  # of each restart, at most a third of all iterations together; only the best goes on
 SEED_STRIDE = 7919  # between the seeds of restarts: no seed below 7919 shares a draw with another
 ADAM_STEPS = 20  # steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps
+SHORT_ROWS = 10  # triples for each coefficient in a short fit
 ROWS = 50  # residuals for each coefficient in a one-step fit of found features: more only cost time
 
 
@@ -32,14 +33,19 @@ def one_step_problem(
     metric: str = "position",
     freedom: float | None = None,
     expected: tuple[Triples, float] | None = None,
+    short: bool = False,
 ) -> OneStep:
-    """The one-step objective that the settings ask for: of positions, or of s (and p) beside them."""
+    """The one-step objective that the settings ask for: of positions, or of s (and p) beside them.
+
+    `short`: it measures the noise or starts another fit; the triples of a long recording are not all needed.
+    """
     config, base = task.config, task.base
     prior = prior_of(model, base, config.departures[-1])
     shared = {"max_step": base.max_step, "sigma": sigma, "prior": prior, "freedom": freedom}
     if config.supervision != "q":
         return SupervisedProblem(model, task.data, momenta=config.supervision == "qps", **shared)
-    most = ROWS * prior.start.numel() if config.coupled and base.start else None
+    rows = SHORT_ROWS if short else ROWS if config.coupled and base.start else None
+    most = None if rows is None else rows * prior.start.numel()
     return ResidualProblem(model, task.data, metric=metric, expected=expected, most=most, **shared)
 
 

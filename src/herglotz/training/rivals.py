@@ -2,7 +2,8 @@
 
 Free runs on held-out time decide what no residual can. It costs one fit of each: named terms start from the values that
 their search found on all training data, and are alone where they meet the held-out time at the noise already; networks,
-the richer model, have to err less by a twentieth, and keep what they learn: the last fit goes on from there.
+the richer model, have to err less by a twentieth, and keep what they learn: the last fit goes on from there. They are
+tried on as few samples as tell the motion.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import replace
 from typing import Any
 
 from herglotz.data import Trajectories
+from herglotz.data.oversampling import sparsest
 from herglotz.data.roughness import precision
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
@@ -36,7 +38,8 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         )
     other = look(data, config, stages, named=False)
     networks = choose(other, config)
-    second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks))
+    every = sparsest(seen.kept)
+    second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
     why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with named terms, "
     why += f"{second['rms']:.2g} with networks ({networks.objective})"
     if first["rms"] <= MARGIN * second["rms"]:
@@ -55,10 +58,10 @@ def _reasoned(plan: Plan, why: str) -> Plan:
     return replace(plan, reasons={**plan.reasons, "objective": why, "network": why})
 
 
-def _held_out(seen: Look, config: FitConfig, plan: Plan) -> dict[str, Any]:
+def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict[str, Any]:
     """Error of the free run over the rest of the training part, and the fit to its first part, in plain values."""
     inner, silent = replace(config, train_fraction=INNER), Stages(False, None, "", resume=False)
-    inside = look(seen.train, inner, silent, plan)
+    inside = look(seen.train.thinned(every), inner, silent, plan)
     task = Task(inside.kept, inside.base, inside.settings, silent)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)
     found: dict[str, Any] = {"rms": free_run_rms(task, inside, fitted), "sigma": fitted.sigma}

@@ -17,7 +17,7 @@ from torch import Tensor
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
-from herglotz.training.cross_validation import Chosen, left_out_errors, strongest_not_beaten
+from herglotz.training.cross_validation import Chosen, left_out_errors, strongest_not_beaten, without_rows
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM, heavy_tailed
@@ -66,10 +66,12 @@ class SmoothingFit:
         by = problem.root_weights(r)
         rows = (problem.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
 
-        def hat(own: Tensor) -> Tensor:
-            return _hat(matrix, rows[own], by.flatten()[own] / problem.sigma)
+        weighted = (by * r).flatten()
 
-        return left_out_errors((by * r).flatten(), problem.data, hat) * problem.sigma
+        def left_out(own: Tensor) -> Tensor:
+            return without_rows(_hat(matrix, rows[own], by.flatten()[own] / problem.sigma), weighted[own])
+
+        return left_out_errors(weighted, problem.data, left_out) * problem.sigma
 
 
 def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[SmoothingFit] | None:

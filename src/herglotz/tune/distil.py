@@ -54,11 +54,11 @@ class FlowProblem:
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
         cost, A, b = self.prior.normal_equations(x)
-        slopes = vmap(jacrev(self._local), (None, *(0,) * 6))
+        slopes = vmap(jacrev(lambda *x: (r := self._local(*x), r), has_aux=True), (None, *(0,) * 6))
         for part in torch.arange(len(self.before.s)).split(self.chunk):
             pair = [y[part] for y in (*self.before, *self.after)]
-            r = self._local(x, *pair).reshape(-1) / self.sigma
-            J = slopes(x, *pair).reshape(-1, len(x)) / self.sigma
+            J, r = slopes(x, *pair)
+            J, r = J.reshape(-1, len(x)) / self.sigma, r.reshape(-1) / self.sigma
             cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
         return cost, A, b
 

@@ -33,7 +33,7 @@ def held(monkeypatch):
         looks.append(named)
         return SimpleNamespace(name="networks")
 
-    def held_out(seen, config, plan):  # noqa: ARG001
+    def held_out(seen, config, plan, every=1):  # noqa: ARG001
         return errors[plan.network]
 
     monkeypatch.setattr(rivals, "look", look)

@@ -59,7 +59,8 @@ class OneStep(LeastSquares, ABC):
         """Residuals (T, k) of some triples and their Jacobian (T, k, unknowns)."""
         rows = self._rows(part, carried)
         axes = tuple(None if y is None else 0 for y in rows)
-        return self._local(x, *rows), vmap(jacrev(self._local), (None, *axes))(x, *rows)
+        J, r = vmap(jacrev(lambda *y: (r := self._local(*y), r), has_aux=True), (None, *axes))(x, *rows)
+        return r, J
 
     @property
     def deviation(self) -> Tensor:

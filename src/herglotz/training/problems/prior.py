@@ -82,7 +82,7 @@ class Prior:
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(½|r|², JᵀJ, Jᵀr) of the prior alone."""
-        r, J = self.residuals(theta), jacrev(self.residuals)(theta)
+        J, r = jacrev(lambda x: (r := self.residuals(x), r), has_aux=True)(theta)
         return r.square().sum() / 2, J.T @ J, J.T @ r
 
     def _index(self, *prefixes: str) -> Tensor:

@@ -63,6 +63,7 @@ class ShootingProblem(StatesProblem):
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
+        self._slopes: Tensor | None = None  # (S, K+1, d, P + d or d) of `path`, by the unknowns or the states alone
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
 
@@ -102,11 +103,21 @@ class ShootingProblem(StatesProblem):
         with torch.no_grad():
             path = None
             if self.path is not None:
-                path = solve_path(self.parameters, theta, start, self.grid.h, self.path.x, tol, u=self.u)
+                path = solve_path(self.parameters, theta, start, self.grid.h, self._guess(x, self.path), tol, u=self.u)
             if path is None and (self.path is None or self.patient):
                 path = self._step_through(theta, start, tol)
         self._solved = x.clone(), path
         return path
+
+    def _guess(self, x: Tensor, path: Path) -> Tensor:
+        """The states (S, K+1, 2n+1) at x, by the derivatives where the last normal equations were made."""
+        if self._at is None or self._slopes is None:
+            return path.x
+        theta, states = self.unpack(x - self._at)
+        moved = torch.cat([theta.expand(len(states), -1), states], -1)[:, -self._slopes.shape[-1] :]
+        guess = path.x.clone()
+        guess[..., : self.d] += (self._slopes @ moved[:, None, :, None])[..., 0]
+        return guess
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|²; infinite where a step fails."""
@@ -126,7 +137,7 @@ class ShootingProblem(StatesProblem):
             return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
         self.path, self._at = path, x.clone()
         grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
-        Z = self.sensitivities(theta, path, held=held)  # (S, K+1, d, P + d)
+        Z = self._slopes = self.sensitivities(theta, path, held=held)
         fit, joints = self._residuals(path.x)
         cost = self.loss(fit, joints)
         by_fit, by_joint = self.weight * self.root_weights(fit), self.root_weights(joints)
@@ -168,13 +179,13 @@ class ShootingProblem(StatesProblem):
         return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
 
     def guess_from(self, other: ShootingProblem, path: Path) -> None:
-        """Start the next solve from a path over other segments or with other model steps, linear between its nodes.
+        """Start the next solve from a path over other segments, samples or model steps, linear between its nodes.
 
         Without one the next solve steps through the trajectories, one small step after the other.
         """
-        old, new = other.grid.times(self.data), self.grid.times(self.data)
+        old, new = other.grid.times(other.data), self.grid.times(self.data)
         values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])
-        trajectories = [grid.start_trajectory(self.data) for grid in (other.grid, self.grid)]
+        trajectories = [problem.grid.start_trajectory(problem.data) for problem in (other, self)]
         for b in range(len(self.data)):
             rows, own = (trajectories[0] == b).nonzero()[:, 0], (trajectories[1] == b).nonzero()[:, 0]
             inside = torch.arange(old.shape[1], device=old.device) <= other.grid.end[rows, None]

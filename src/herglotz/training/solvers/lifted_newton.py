@@ -27,6 +27,8 @@ from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.parameter_vector import FixedModel, ParameterVector
 
+NEAR = 1e-7  # defects whose next ones need not be looked at where quadratic convergence makes them rounding
+CURVED = 1e4  # taken for the next defect over the square of the first, which no earlier one tells
 CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
 
 
@@ -73,9 +75,12 @@ def _swept(
         if size <= tol or (size <= 1e3 * tol and size >= previous / 2):
             return Path(torch.cat([start[:, None], y], 1) if size == 0 else x, A)
         x = x + linear_recurrence(A, defect[..., None], torch.zeros_like(start)[..., None])[..., 0]
-        previous = size
         if not bool(torch.isfinite(x).all()):
             return None
+        curvature = size / previous / previous if previous < math.inf else CURVED
+        if size <= NEAR and 10 * curvature * size**2 <= tol:
+            return Path(x, A)
+        previous = size
     return None
 
 
