@@ -37,24 +37,16 @@ class Run:
 
     Parameters
     ----------
-    model
-        The discrete Lagrangian L_d.
-    config
-        Settings of the fit, with what its plan decided.
-    metrics
-        Errors in the units of the coordinates, the verdict, the plan, the equation (`docs/trajectory.md`, section 8).
-    data
-        All samples, of training and test; N in all.
-    train_lengths
-        Leading samples of each of the B trajectories that were trained on.
+    model, config
+        The discrete Lagrangian L_d, and the settings of the fit with what its plan decided.
+    metrics, history
+        Errors in the data's units, verdict, plan and equation (`docs/trajectory.md`, section 8); cost by iteration.
+    data, train_lengths
+        All N samples, and how many leading ones of each trajectory were trained on.
     states
-        q (N, n), p (N, n) and s (N,) at every sample. The first coordinate's mass is 1: its p is close to a velocity.
-    h
-        Typical step of the model, in the data's unit of time.
-    box
-        Lowest and highest q, p, s of the training part: where the model can be trusted.
-    history
-        Stage, iteration and cost of every iteration.
+        q (N, n), p (N, n) and s (N,) at every sample; the first coordinate's mass is 1: its p is close to a velocity.
+    h, box
+        Typical step, in the data's unit of time; lowest and highest q, p, s of the training part.
     """
 
     model: ContactLagrangian
@@ -197,8 +189,6 @@ class Run:
         ----------
         steps
             Number of steps K.
-        **start
-            Any of the following.
         q0, p0, s0
             Start, (..., n), (..., n), (...); left out, the last fitted state of `trajectory` (0). s0 is 0 by default.
         t0
@@ -267,18 +257,7 @@ class Run:
         return _front().plot(self, name)
 
     def save(self, folder: str | Path) -> None:
-        """Write the run into a folder, as `herglotz fit` does; `herglotz.load_run` reads it.
-
-        Parameters
-        ----------
-        folder
-            Where to write; made if missing.
-
-        Raises
-        ------
-        OSError
-            If the folder cannot be written.
-        """
+        """Write the run into a folder, made if missing, as `save_run` does; `herglotz.load_run` reads it."""
         import_module("herglotz.training.run_folder").save_run(self, folder)  # which knows runs
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
@@ -306,44 +285,13 @@ class Run:
         return _front().export(self, path, kind, **settings)
 
     def verify(self, **settings: Any) -> Any:
-        """Measure every identity; `print(run.verify().table())` shows them (`herglotz.verify.verify`).
-
-        Parameters
-        ----------
-        **settings
-            `h`, `samples`, `steps` and `seed`.
-
-        Returns
-        -------
-        Report
-            Claims with value and bound; `passed` where all hold.
-
-        Raises
-        ------
-        InputError
-            If a setting is out of range.
-        """
+        """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
         return _front().verify(self, **settings)
 
     def symmetries(self, **settings: Any) -> Any:
-        """Find translations, rotations and other affine symmetries, and what they keep; `print` shows them.
+        """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
 
-        A symmetry is one within the error of the run's own free run.
-
-        Parameters
-        ----------
-        **settings
-            Of `herglotz.verify.symmetries`.
-
-        Returns
-        -------
-        Symmetries
-            Each with its generator and its momentum J.
-
-        Raises
-        ------
-        InputError
-            If a setting is out of range.
+        A symmetry is one within the error of the run's own free run (`herglotz.verify.symmetries`).
         """
         return _front().symmetries(self, **settings)
 
