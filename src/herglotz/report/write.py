@@ -141,7 +141,10 @@ def _data(run: Run) -> tuple[Block, ...]:
     rows = [
         ("recording", data.summary()),
         ("steps", f"{float(h.min()):.4g} to {float(h.max()):.4g} {data.time_unit}, median {data.typical_step:.4g}"),
-        ("precision, found in the data", "not found" if precision is None else f"{precision:.3g}"),
+        (
+            "precision, found in the data",
+            "not found" if precision is None else f"{precision:.3g} {common_unit(data.units)}".rstrip(),
+        ),
         ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),
         ("sha256", data.digest()),
     ]
