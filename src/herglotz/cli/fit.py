@@ -95,10 +95,11 @@ def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argpa
 
 def report(result: Run, out: Path, drawn: list[Path]) -> None:
     """Print what was reached, for people, and what to do next."""
+    from herglotz.data.units import common_unit
     from herglotz.training import Plan
 
     print("Plan (what was decided, and why):")
-    print(Plan.from_dict(result.metrics["plan"]).table(unit=result.data.unit))
+    print(Plan.from_dict(result.metrics["plan"]).table(unit=common_unit(result.data.units)))
     print("Result:")
     print(result.summary())
     if drawn:

@@ -60,6 +60,19 @@ def load(
 ) -> Trajectories:
     """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
 
+    Parameters
+    ----------
+    path
+        .csv, .npz, .txt of Schmidt & Lipson, or with the extra `tables` .parquet, .h5 or .mat.
+    angles
+        Coordinates that are angles; left out: those in rad or deg; () for none.
+    unwrap
+        Make angles continuous.
+    show
+        Print the table of columns on stderr, where a table was read.
+    **columns
+        Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`.
+
     Returns
     -------
     Trajectories
@@ -79,7 +92,14 @@ def load(
 
 
 def save(path: PathLike, trajectories: Trajectories) -> None:
-    """Write trajectories as .csv or .npz, by the file's extension, atomically.
+    """Write trajectories as .csv or .npz, by the file's extension, whole or not at all.
+
+    Parameters
+    ----------
+    path
+        The file; one that is there is overwritten.
+    trajectories
+        What is written: times, positions, and s, p, u where there are any, with their units.
 
     Raises
     ------

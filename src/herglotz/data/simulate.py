@@ -71,6 +71,34 @@ def simulate(
 
     All numbers are drawn and computed in float64 from one `torch.Generator`; `dtype` only converts the result.
 
+    Parameters
+    ----------
+    scene
+        What moves (`herglotz.scene`).
+    trajectories
+        Number of motions B.
+    steps
+        Of each trajectory: steps + 1 samples before gaps.
+    h
+        Time between samples, in the scene's unit of time.
+    noise
+        Standard deviation of Gaussian noise on q, in its units.
+    gaps
+        Runs of 1 to 3 consecutive interior samples deleted from each trajectory.
+    seed
+        Of starts, noise and gaps; the same seed gives the same numbers.
+    q_range, v_range
+        (lowest, highest) initial position and velocity, a number or one a coordinate; left out: the scene's.
+    keep_state
+        Also store s and p, without noise.
+    dtype
+        Of the result, torch.float64 or torch.float32.
+
+    Returns
+    -------
+    Trajectories
+        q (N, n) in the scene's units, and u (N, m) of a driven scene.
+
     Raises
     ------
     InputError

@@ -27,10 +27,18 @@ IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Trajectories:
-    """B trajectories of n coordinates, stored one after the other.
+    """B trajectories of n coordinates, stored one after the other; N samples in all. `of` fills in what is left out.
 
-    Checked on construction: finite values, time strictly increasing inside each trajectory, at least three samples
-    each, consistent shapes, one floating dtype. Two sets are equal when their `digest()` is.
+    Construction checks: finite values, increasing time, three samples each, shapes, one floating dtype.
+
+    Parameters
+    ----------
+    t, q, lengths, names, units, angles
+        (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
+    s, p, u
+        (N,) action, (N, n) momentum and (N, m) control input, where they are known.
+    time_unit, source, hold, columns
+        Of t; origin, for messages; what u does between samples; name, role and unit of each column that was read.
 
     Raises
     ------
@@ -102,11 +110,6 @@ class Trajectories:
             hold=hold,
             columns=columns,
         )
-
-    @property
-    def unit(self) -> str:
-        """The unit that all coordinates have; "" where there are several, or none."""
-        return self.units[0] if len(set(self.units)) == 1 and self.units[0] != "1" else ""
 
     def __repr__(self) -> str:
         return f"Trajectories({self.summary()})"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from herglotz.data.trajectories import DEGREES, Trajectories
@@ -41,6 +41,11 @@ def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
         units=tuple("deg" if x else unit for x, unit in zip(turned, data.units, strict=True)),
         angles=tuple(angle and not x for x, angle in zip(turned, data.angles, strict=True)),
     )
+
+
+def common_unit(units: Sequence[str]) -> str:
+    """The unit that all coordinates have; "" where there are several, or none."""
+    return units[0] if len(set(units)) == 1 and units[0] != "1" else ""
 
 
 def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str:

@@ -65,6 +65,11 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
     trust_code
         Open a file that was not written by this user on this machine: that runs what stands in it.
 
+    Returns
+    -------
+    ExportedStepper
+        Steps like `Stepper`; its `h`, `box` and `units` are those of the model.
+
     Raises
     ------
     InputError

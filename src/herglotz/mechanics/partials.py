@@ -115,15 +115,28 @@ def partials(
     h: Tensor | float,  # () or (...) time step
     order: int = 1,
 ) -> Partials:
-    """Value, gradient and (order 2) Hessian blocks of L_d.
+    """Value, gradient (D1, D2, D3 L_d) and, at order 2, Hessian blocks of L_d.
 
     Uses the closed form of L_d where it has one and autograd where it has not; both are differentiable again with
     respect to the arguments and the parameters.
 
+    Parameters
+    ----------
+    L_d
+        The discrete Lagrangian L_d(q0, q1, s0, h), which returns (...) numbers in units of action.
+    q0, q1
+        (..., n) position and next position.
+    s0
+        (...) action variable.
+    h
+        () or (...) time step.
+    order
+        1, or 2 for second derivatives too.
+
     Returns
     -------
     Partials
-        Second derivatives are None at order 1.
+        D1 and D2 (..., n), D3 (...), and blocks such as D12 (..., n, n); second derivatives are None at order 1.
 
     Raises
     ------

@@ -20,22 +20,56 @@ LEVELS = ("conservative", "linear", "affine", "full", "forced")
 class ModelConfig:
     """Everything that is needed to build a model; plain numbers, so that it can be stored as JSON.
 
-    `scale` and `speed` are typical sizes of q and v (data units); `stiffness`, `tilt` and `rate` start the
-    baseline.
-    A width of 0 leaves that network out; `mass_width` > 0 makes the mass depend on position, `action_width` counts the
-    units of the full level, `coulomb` adds dry friction to the forced level's viscous one, set-valued with `sticking`
-    (a joint can stand still), and its `inputs` act through a learned matrix or through `input_map` (n · m numbers, row
-    by row), measured from 0 or, with `input_zero`, from a learned zero of each.
-    `features` are what a user guesses of L, `known` what he knows, as text (`herglotz.models.features`); `alike`: all
-    coordinates have one mass, and their potential is made of features alone; `diagonal`: each coordinate has a mass of
-    its own, and none is between two; `coupled` friction (forced level) may brake differences of speeds, and `drag`
-    names friction forces such as "|v1| v1" (`herglotz.models.drag`). `order` 4 adds what the rule lacks of the exact
-    L_d, from the features (`herglotz.models.order4`); forces stay of order 2.
-    `terms` are further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
-    `translations` are symmetries of L_d, named by what moves together ("q1 + q2"): no part of it depends on where these
-    coordinates are, and what is left of the baseline is not learned (`herglotz.models.translations`).
-    Without a `baseline` the correction is the whole of A: no kinetic term, no potential; it is there to show why a
-    baseline is needed (trap 2).
+    Parameters
+    ----------
+    angles
+        Which of the n coordinates are angles in rad.
+    level
+        Of the ladder: conservative, linear, affine, full or forced.
+    scale, speed
+        (n,) typical sizes of q and v, in the units of the data.
+    stiffness, tilt, rate
+        Start of the baseline: kᵢ and bᵢ (n,) of V, and the damping rate γ in 1/time (`docs/trajectory.md`, section 4).
+    potential_width, potential_depth
+        Units and layers of the network in V; a width of 0 leaves a network out.
+    damping_width
+        Units of the network in the damping, at the levels affine and full.
+    correction_width, correction_depth
+        Units and layers of the correction N of a step.
+    baseline
+        Without it the correction is all of L_d: it is there to show why a baseline is needed (trap 2).
+    seed, activation
+        Of the networks' first weights; one of `herglotz.models.network.ACTIVATIONS`.
+    mass_width, mass_depth
+        Units and layers of the network in a mass that depends on position; 0: a constant mass.
+    action_width
+        Units of the network in s, at the level full.
+    coulomb, sticking
+        Dry friction of each joint beside the viscous one (forced); set-valued: a joint can stand still.
+    inputs, input_map, input_zero
+        Number m of inputs; the map to forces, n · m numbers row by row, left out: learned; whether each input has a
+        learned zero.
+    features, known
+        What a user guesses of L, with learned coefficients, and what is known of it, as text
+        (`herglotz.models.features`).
+    alike, diagonal
+        One mass for all, and a potential of features alone; or a mass for each, and none between two.
+    coupled, drag
+        Friction of differences of speeds; further friction forces such as "|v1| v1" (`herglotz.models.drag`); both of
+        the forced level.
+    order
+        Of the rule, 2 or 4; 4 adds what the rule lacks of the exact L_d, from the features (`herglotz.models.order4`).
+        Forces stay of order 2.
+    terms
+        Further parts of V and of the forces, by their names in `herglotz.models.TERMS`.
+    translations
+        Symmetries of L_d, named by what moves together ("q1 + q2"): no part of it depends on where these coordinates
+        are, and what is left of the baseline is not learned (`herglotz.models.translations`).
+
+    Raises
+    ------
+    InputError
+        If a value is out of range, lengths differ, or settings exclude one another.
     """
 
     angles: tuple[bool, ...] = (True,)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch
 
+from herglotz.data.units import common_unit
 from herglotz.errors import InputError
 from herglotz.plots.style import INK, MODEL, MUTED, SUPPORT, new_figure, styled
 from herglotz.training.plan import Plan
@@ -32,7 +33,7 @@ def plot_plan(run: Run) -> Figure:
     plan = Plan.from_dict(run.metrics["plan"])
     rows = [
         ("\n".join(fill(words, DECISION) for words in decisions), fill(reason, REASON))
-        for decisions, reason in plan.by_reason(run.data.unit)
+        for decisions, reason in plan.by_reason(common_unit(run.data.units))
         if reason
     ]
     heights = [LINE * max(left.count("\n") + 1, right.count("\n") + 1) + 0.1 for left, right in rows]

@@ -11,6 +11,7 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.files import write_atomically
+from herglotz.data.units import common_unit
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
@@ -140,7 +141,10 @@ def _data(run: Run) -> tuple[Block, ...]:
     rows = [
         ("recording", data.summary()),
         ("steps", f"{float(h.min()):.4g} to {float(h.max()):.4g} {data.time_unit}, median {data.typical_step:.4g}"),
-        ("precision, found in the data", "not found" if precision is None else f"{precision:.3g}"),
+        (
+            "precision, found in the data",
+            "not found" if precision is None else f"{precision:.3g} {common_unit(data.units)}".rstrip(),
+        ),
         ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),
         ("sha256", data.digest()),
     ]
@@ -154,7 +158,7 @@ def _plan(run: Run) -> tuple[Block, ...]:
     if "plan" not in run.metrics:
         return ("The run holds no plan.",)
     plan = Plan.from_dict(run.metrics["plan"])
-    rows = tuple(plan.decisions(run.data.unit))
+    rows = tuple(plan.decisions(common_unit(run.data.units)))
     blocks: list[Block] = [Table(("decision", "taken", "because"), rows)]
     if run.history:
         blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))

@@ -56,6 +56,18 @@ def scene_names() -> tuple[str, ...]:
 def scene(name: str, **parameters: float) -> Scene:
     """The scene called `name`, with its default parameters overridden by `parameters`.
 
+    Parameters
+    ----------
+    name
+        One of `scene_names()`.
+    **parameters
+        Numbers in the scene's units, such as gamma=0.2; `help(herglotz.scenes.NAME)` lists them.
+
+    Returns
+    -------
+    Scene
+        L, H, the flow and the exact or reference L_d as functions of batched tensors.
+
     Raises
     ------
     InputError

@@ -31,7 +31,17 @@ class StepError(RuntimeError):
 
 
 class State(NamedTuple):
-    """A point of T*Q × R."""
+    """A point (q, p, s) of T*Q × R.
+
+    Parameters
+    ----------
+    q
+        (..., n) position, in the units of the data.
+    p
+        (..., n) momentum, in units of mass times q per time; learned models have mass 1 in the first coordinate.
+    s
+        (...) action variable, in units of p times q.
+    """
 
     q: Tensor  # (..., n) position
     p: Tensor  # (..., n) momentum

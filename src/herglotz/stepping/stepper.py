@@ -63,9 +63,23 @@ class Stepper(OneStepMethod):
     def init(
         self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
     ) -> State:
-        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions; s0 defaults to 0 (a choice of gauge).
+        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions.
 
-        `u`, (..., m), is the input of the step from q0 to q1 where L_d takes inputs.
+        Parameters
+        ----------
+        q0, q1
+            (..., n) positions h apart.
+        s0
+            (...) action; left out: 0 (a choice of gauge).
+        h
+            () or (...) step between them.
+        u
+            (..., m) input of this step, where L_d takes inputs.
+
+        Returns
+        -------
+        State
+            At q1.
 
         Raises
         ------
@@ -137,7 +151,27 @@ class Stepper(OneStepMethod):
     def step_pair(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h0: Tensor | float, h1: Tensor | float | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Φ: (q_k, q_{k+1}, s_k) → (q_{k+1}, q_{k+2}, s_{k+1}); h1 defaults to h0."""
+        """Φ: (q_k, q_{k+1}, s_k) → (q_{k+1}, q_{k+2}, s_{k+1}).
+
+        Parameters
+        ----------
+        q0, q1
+            (..., n) positions h0 apart.
+        s0
+            (...) action at q0.
+        h0, h1
+            () or (...) steps before and after q1; h1 is h0 by default.
+
+        Returns
+        -------
+        tuple of Tensor
+            Shapes as q0, q1, s0; NaN where the step fails.
+
+        Raises
+        ------
+        InputError
+            As `init` and `step`.
+        """
         state = self.init(q0, q1, s0, h0)
         step = self.step(state, h0 if h1 is None else h1, 2 * q1 - q0)
         return q1, step.state.q, state.s

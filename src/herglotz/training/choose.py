@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
-from herglotz.data.units import size
+from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look
 from herglotz.training.one_step_fit import NOISE_OF_R
@@ -42,7 +42,8 @@ def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 def _terms(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
     if seen.found is None or seen.found.sigma is None:
         return None
-    return f"a model of named terms follows whole trajectories to {size(seen.found.sigma, seen.data.unit, digits=2)}"
+    miss = size(seen.found.sigma, common_unit(seen.data.units), digits=2)
+    return f"a model of named terms follows whole trajectories to {miss}"
 
 
 def _structured(seen: Look, config: FitConfig) -> str | None:
@@ -196,7 +197,7 @@ def _outlier_reason(seen: Look) -> str:
 
 
 def _sigma_reason(seen: Look, one_step: bool, sigma: float | None) -> str:
-    noise = size(seen.noise, seen.data.unit, digits=2)
+    noise = size(seen.noise, common_unit(seen.data.units), digits=2)
     rough = f"polynomials through nine samples miss them by {noise}" if math.isfinite(seen.noise) else "few samples"
     if one_step:
         return f"one-step fits need none; {rough}"

@@ -34,6 +34,19 @@ class Run:
     `prediction` is the model's free run at every sample: on the training part from the fitted states, and from the last
     training sample on without another look at the data. `rollout`, `predict`, `plot`, `export` and `verify` take and
     return plain numbers, arrays and files; `stepper` is the differentiable stepper behind them.
+
+    Parameters
+    ----------
+    model, config
+        The discrete Lagrangian L_d, and the settings of the fit with what its plan decided.
+    metrics, history
+        Errors in the data's units, verdict, plan and equation (`docs/trajectory.md`, section 8); cost by iteration.
+    data, train_lengths
+        All N samples, and how many leading ones of each trajectory were trained on.
+    states
+        q (N, n), p (N, n) and s (N,) at every sample; the first coordinate's mass is 1: its p is close to a velocity.
+    h, box
+        Typical step, in the data's unit of time; lowest and highest q, p, s of the training part.
     """
 
     model: ContactLagrangian
@@ -92,6 +105,16 @@ class Run:
         Inside `h_range` it is `stepper`. Elsewhere a step is whole steps of the typical step and a part of one
         (`theory.FractionalStepper`), with status UNRESOLVED where the recorded step is too long for the motion.
 
+        Parameters
+        ----------
+        h
+            The step, in the data's unit of time.
+
+        Returns
+        -------
+        OneStepMethod
+            `step(state, h)` and `rollout(q, p, s, h=h, steps=K)`.
+
         Raises
         ------
         InputError
@@ -106,9 +129,19 @@ class Run:
         return FractionalStepper(self.continuous, tolerance=1e-3 if single else 1e-6)
 
     def energy(self, state: State) -> Tensor:
-        """The energy H̃(q, p, s) of the model at states, (...), in units of p q̇ ("mass 1"); dH̃/dt = −(∂H̃/∂s) H̃.
+        """The energy H̃(q, p, s) of the model at states; dH̃/dt = −(∂H̃/∂s) H̃.
 
         With friction or other forces H̃ changes by their power, too.
+
+        Parameters
+        ----------
+        state
+            q, p (..., n) and s (...).
+
+        Returns
+        -------
+        Tensor
+            (...), in units of p q̇: the first coordinate's mass is 1.
 
         Raises
         ------
@@ -127,7 +160,17 @@ class Run:
         return Equation.from_dict(stored) if stored else equation_of(self)
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
-        """State, with shapes (n,), (n,), (), and time at the last training sample of a trajectory.
+        """State and time at the last training sample of a trajectory.
+
+        Parameters
+        ----------
+        trajectory
+            Its number, from 0.
+
+        Returns
+        -------
+        State, float
+            With shapes (n,), (n,), (); the time is the data's.
 
         Raises
         ------
@@ -170,23 +213,75 @@ class Run:
         return free_motion(self, steps, **start)
 
     def predict(self, data: Any, **settings: Any) -> Prediction:
-        """Score the model on another recording: anything that `fit` takes.
+        """Score the model on another recording.
 
-        The settings are those of `herglotz.data.as_trajectories` and of `herglotz.training.predict`.
+        Parameters
+        ----------
+        data
+            Anything that `fit` takes: a path, a DataFrame, arrays, trajectories.
+        **settings
+            How to read it (`herglotz.data.as_trajectories`), and `warmup`, `windows`, `horizon`
+            (`herglotz.training.predict`).
+
+        Returns
+        -------
+        Prediction
+            `rms` in the data's units, `failed_steps`, and the predicted motion.
+
+        Raises
+        ------
+        InputError
+            If the recording is not of the same coordinates, units and inputs, or is too short.
         """
         reading, others = split_options(settings)
         return predict(self, as_trajectories(data, **reading), **others)
 
     def plot(self, name: str = "trajectory") -> Any:
-        """A matplotlib `Figure`; the names are those of the files that `herglotz plot` writes."""
+        """A matplotlib `Figure`; `savefig` writes it.
+
+        Parameters
+        ----------
+        name
+            trajectory, phase_portrait, learned, training, plan, momentum_vs_dS or hj_residual.
+
+        Returns
+        -------
+        Figure
+            Axes carry the units of the data.
+
+        Raises
+        ------
+        InputError
+            If there is no figure of that name.
+        """
         return _front().plot(self, name)
 
     def save(self, folder: str | Path) -> None:
-        """Write the run into a folder, as `herglotz fit` does; `herglotz.load_run` reads it."""
+        """Write the run into a folder, made if missing, as `save_run` does; `herglotz.load_run` reads it."""
         import_module("herglotz.training.run_folder").save_run(self, folder)  # which knows runs
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
-        """Write one file that steps without this package: .pt2, .onnx or .h (`herglotz.export.export_run`)."""
+        """Write one file that steps without this package (`herglotz.export.export_run`).
+
+        Parameters
+        ----------
+        path
+            The file; .pt2, .onnx and .h say what is written.
+        kind
+            pt2, onnx, aoti or c, where the name of the file does not say it.
+        **settings
+            Of the writer of that kind, such as `name` in C.
+
+        Returns
+        -------
+        Path
+            The file.
+
+        Raises
+        ------
+        InputError
+            If the kind is not known, or the extra that writes it is missing.
+        """
         return _front().export(self, path, kind, **settings)
 
     def verify(self, **settings: Any) -> Any:
@@ -201,7 +296,25 @@ class Run:
         return _front().symmetries(self, **settings)
 
     def report(self, folder: str | Path, against: Any = None) -> list[Path]:
-        """Write report.html, which fetches nothing, and report.md; `against` is another recording to be scored."""
+        """Write report.html, which fetches nothing, and its twin report.md.
+
+        Parameters
+        ----------
+        folder
+            Where to write; made if missing.
+        against
+            Another recording to score the model on: anything that `fit` takes.
+
+        Returns
+        -------
+        list of Path
+            Both files.
+
+        Raises
+        ------
+        InputError
+            If the recording cannot be read, or is not of the same coordinates.
+        """
         return _front().report(self, folder, against)
 
     def summary(self) -> str:

@@ -76,6 +76,18 @@ def save_run(run: Run, folder: str | Path) -> None:
     """Write model.pt, config.json, metrics.json, fit.npz, manifest.json with the sha256 of these, and history.csv.
 
     Each file appears whole or not at all; a folder whose writing was interrupted does not fit its manifest.
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    folder
+        Where to write; made if missing.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
@@ -107,6 +119,16 @@ def save_run(run: Run, folder: str | Path) -> None:
 
 def load_run(folder: str | Path) -> Run:
     """Read what `save_run` wrote.
+
+    Parameters
+    ----------
+    folder
+        The folder of a run.
+
+    Returns
+    -------
+    Run
+        On the cpu.
 
     Raises
     ------

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
+from herglotz.data.units import common_unit
 from herglotz.errors import InputError, refuse
 from herglotz.models import LEVELS
 from herglotz.threads import one_thread
@@ -92,7 +93,7 @@ class Selection:
 
     def table(self) -> str:
         """Level × held-out error × spread × parameters × cost, for people, in 80 columns; → marks the chosen level."""
-        unit = self.run.data.unit
+        unit = common_unit(self.run.data.units)
         lines = [f"Free runs over the held-out time{unit and f', in {unit}'}; the arrow marks the chosen level:"]
         lines += [f"  {'level':<13}{'held-out RMS':>12}{'min … max':>20}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"]
         for c in self.candidates:

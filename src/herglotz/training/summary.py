@@ -7,7 +7,7 @@ from textwrap import fill
 from typing import Any, Protocol
 
 from herglotz.data import Trajectories
-from herglotz.data.units import size
+from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
 
 MOST_FEATURES, COLUMNS = 5, 80
@@ -31,7 +31,7 @@ class Judged(Protocol):
 def rows(run: Judged) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
-    unit, degrees = data.unit, bool(data.degrees)  # as the file had them
+    unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", data.summary()),

@@ -24,7 +24,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
 from herglotz.data.spikes import without
-from herglotz.data.units import size
+from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper
 from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.inputs import grid_inputs
@@ -126,7 +126,7 @@ def judged(
         unseen = free  # the free run's states are better than those that were found for the windows
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
-    named = kept.unit if kept.dof == 1 else None
+    named = common_unit(kept.units) if kept.dof == 1 else None
     errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named)
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}

@@ -83,6 +83,24 @@ def test_an_old_run_is_not_overwritten(tmp_path, capsys):  # fails if a finished
 
 
 @pytest.mark.parametrize(
+    ("command", "name"),
+    [
+        (["simulate", "damped_pendulum"], "a.csv"),
+        (["export", "RUN"], "a.h"),
+        (["rollout", "RUN", "--steps", "5"], "a.csv"),
+        (["predict", "RUN", "DATA"], "a.csv"),
+    ],
+)
+def test_a_file_is_not_overwritten(tmp_path, capsys, tiny_run, tiny_csv, command, name):
+    # fails if what a user has made goes without a word
+    (tmp_path / name).write_text("mine")
+    words = [{"RUN": tiny_run, "DATA": tiny_csv}.get(word, word) for word in command]
+    said = mistake(capsys, tmp_path, *words, "--out", tmp_path / name)
+    assert "exists already; choose another name, or overwrite it with --force" in said
+    assert (tmp_path / name).read_text() == "mine"
+
+
+@pytest.mark.parametrize(
     "out", ["no_folder/a.csv", "a.txt", ".", "/proc/a.csv"], ids=["no folder", "extension", "a folder", "unwritable"]
 )
 @pytest.mark.parametrize("command", [["simulate", "damped_pendulum"], ["rollout", "nothing", "--steps", "9"]])

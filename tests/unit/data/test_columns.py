@@ -7,6 +7,8 @@ import pytest
 import torch
 
 from herglotz.cli import main
+from herglotz.cli.flags import columns_of
+from herglotz.cli.parser import build_parser
 from herglotz.data import Trajectories, load, save
 from herglotz.data.table import from_frame
 from herglotz.data.units import in_degrees, size
@@ -117,9 +119,16 @@ def test_flags_reach_the_reader(tmp_path, capsys):  # fails if a flag of the com
     path = tmp_path / "motion.csv"
     path.write_text("clock,a,b\n0,1,2\n1,2,3\n")
     flags = ["--time", "clock", "--coordinates", "a", "--inputs", "none", "--drop", "b", "--group", "lap"]
-    for command in (["fit", str(path), "--out", str(tmp_path / "run")], ["select", str(path), "--out", str(tmp_path)]):
+    for command in (
+        ["fit", str(path), "--out", str(tmp_path / "run")],
+        ["select", str(path), "--out", str(tmp_path)],
+        ["plot", str(path), "--out", str(tmp_path)],
+    ):
         assert main([*command, *flags]) == 2
         assert "there is no column 'lap'; the columns are clock, a, b" in capsys.readouterr().err
+        taken = columns_of(build_parser().parse_args([*command, *flags, "--angles", "a"]))
+        names = {"coordinates": ["a"], "inputs": [], "drop": ["b"], "angles": ["a"]}
+        assert taken == {"time": "clock", "group": "lap", **names}
 
 
 def test_columns_are_of_tables(tmp_path):  # fails if a flag is ignored where it has no meaning
