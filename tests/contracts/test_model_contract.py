@@ -402,7 +402,7 @@ def test_inputs_act_through_their_map():
     torch.testing.assert_close(parts.force.plus, P.force.plus, rtol=1e-12, atol=1e-13)
     with pytest.raises(InputError, match=r"u needs shape \(\.\.\., 3\), got \(6, 2\)"):
         partials(model.at(u[:, :2]), q0, q1, s0, h)
-    with pytest.raises(InputError, match="has no inputs; build it with level='forced'"):
+    with pytest.raises(InputError, match="has no inputs: fit a recording that has input columns"):
         random_model(MODELS["linear"]).at(u)
 
 

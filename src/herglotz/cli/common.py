@@ -9,12 +9,21 @@ import tempfile
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from herglotz.errors import InputError
 
+if TYPE_CHECKING:
+    from herglotz.training import Run
+
+NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 COLUMNS = 80  # of a terminal as it opens
 KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kicks were chosen
+
+
+def exit_code(run: Run) -> int:
+    """0, or 3 where the run does not fit its data: it is written, and what comes after should know."""
+    return NO_FIT if run.metrics["verdict"].startswith("does not fit") else 0
 
 
 def positive(text: str) -> float:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from herglotz.cli.common import check_output_folder, print_json, say
+from herglotz.cli.common import check_output_folder, exit_code, print_json, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.training import FitConfig, Run
 
-NO_FIT = 3  # exit code of a fit that does not follow its data; the run is written
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
@@ -39,7 +38,10 @@ def add(commands: argparse._SubParsersAction) -> None:
     add_progress_flags(parser)
     parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
     parser.add_argument(
-        "--tensorboard", type=Path, metavar="FOLDER", help="log for TensorBoard too (the log in RUN is history.csv)"
+        "--tensorboard",
+        type=Path,
+        metavar="FOLDER",
+        help="log for TensorBoard, as the fit runs (RUN holds history.csv too)",
     )
     add_machine_flags(parser)
     add_model_flags(parser.add_argument_group("model"))
@@ -55,24 +57,20 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import load
     from herglotz.training import load_run
-    from herglotz.training.tensorboard import summary_writer, write_tensorboard
 
     config = settings_of(arguments)
     if arguments.tensorboard is not None:
         check_output_folder(arguments.tensorboard)
-        summary_writer()  # missing, it is found before training
     data = load(arguments.data, **columns_of(arguments))
     data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
     _fit_into(out, data, config, arguments)
     result = load_run(out)  # what later commands will see, and on the cpu
-    if arguments.tensorboard is not None:
-        write_tensorboard(result, arguments.tensorboard)
     drawn = _draw(result, out) if not arguments.no_plots else []
     if arguments.json:
         print_json(result.metrics)
     else:
         report(result, out, drawn)
-    return NO_FIT if result.metrics["verdict"].startswith("does not fit") else 0
+    return exit_code(result)
 
 
 def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argparse.Namespace) -> None:
@@ -83,7 +81,8 @@ def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argpa
     made = _make(out)
     try:
         with locked(out):
-            save_run(fit(data, config, out=out, resume=arguments.resume, progress=progress(arguments)), out)
+            shown = {"progress": progress(arguments), "tensorboard": arguments.tensorboard}
+            save_run(fit(data, config, out=out, resume=arguments.resume, **shown), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():
             raise KeyboardInterrupt("; the same command with --resume goes on") from None
@@ -99,7 +98,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     from herglotz.training import Plan
 
     print("Plan (what was decided, and why):")
-    print(Plan.from_dict(result.metrics["plan"]).table())
+    print(Plan.from_dict(result.metrics["plan"]).table(unit=result.data.unit))
     print("Result:")
     print(result.summary())
     if drawn:

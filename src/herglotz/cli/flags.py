@@ -70,10 +70,12 @@ def add_trust_flag(parser: argparse.ArgumentParser) -> None:
 
 
 def check_run_folder(out: Path, resume: bool) -> None:
-    """Raise unless a run can be written there: nothing in the way, and no finished run that would be lost."""
+    """Raise unless a run can be written there: nothing in the way, and no fit that would be lost."""
     check_output_folder(out)
     if (out / "model.pt").exists() and not resume:
         raise InputError(f"--out {out}: already holds a run; choose another folder, delete it, or add --resume")
+    if (out / "checkpoint.pt").exists() and not resume:
+        raise InputError(f"--out {out}: holds a fit that was interrupted; add --resume to go on, or delete the folder")
 
 
 def names(text: str) -> list[str]:

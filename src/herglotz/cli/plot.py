@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import check_output_folder
+from herglotz.cli.flags import add_column_flags, columns_of
 from herglotz.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
@@ -34,6 +35,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument("--format", choices=FORMATS, default="png", help="kind of file (default %(default)s)")
     parser.add_argument("--animate", action="store_true", help="of a run: animation.gif, of its first trajectory")
+    add_column_flags(parser)
     parser.set_defaults(run=run)
 
 
@@ -42,6 +44,9 @@ def run(arguments: argparse.Namespace) -> int:
     source: Path = arguments.source
     folder = arguments.out or (source if source.is_dir() else Path())
     check_output_folder(folder)
+    if columns_of(arguments) and (arguments.theory or source.is_dir()):
+        flags = ", ".join(f"--{name}" for name in columns_of(arguments))
+        raise InputError(f"columns are chosen in a data file, and {source} is none: leave out {flags}")
     if arguments.animate and (arguments.theory or not source.is_dir()):
         raise InputError(f"--animate draws a run; {source} is none: fit it first, and leave out --theory")
     if arguments.theory:
@@ -64,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         from herglotz.data import load
 
-        data = load(source)
+        data = load(source, **columns_of(arguments))
 
         from herglotz.plots import plot_data, save_figure
 

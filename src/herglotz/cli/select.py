@@ -6,14 +6,15 @@ import argparse
 import json
 from pathlib import Path
 
-from herglotz.cli.common import count, print_json
+from herglotz.cli.common import count, exit_code, print_json
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, add_machine_flags, settings_of
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
 and keep the simplest level that is not beaten beyond its spread. RUN receives the chosen run (as from `herglotz fit`),
-selection.json and selection.png.
+selection.json and selection.png. The last line is the verdict on the chosen run; the exit code is 3 where it does not
+fit.
 
 examples:
   herglotz select pendulum.csv --out runs/selected
@@ -63,6 +64,8 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(json.loads(found.to_json()))
     else:
         print(found.table())
+        print("The chosen run:")
+        print(found.run.summary())
         print(f"Figure: {out / 'selection.png'}")
         print(f"Next: herglotz verify {out}")
-    return 0
+    return exit_code(found.run)

@@ -1,8 +1,9 @@
-"""Recordings in the form in which the user has them: files, DataFrames, Series, arrays, lists of these."""
+"""Recordings in the form in which the user has them: files, DataFrames, dicts, Series, arrays, lists of these."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Mapping, Sequence
 from numbers import Number
 from pathlib import Path
 from types import FunctionType
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.extra_formats import Table
 from herglotz.data.readers import load
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
@@ -36,8 +38,10 @@ def as_trajectories(
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
 
+    A dict of columns is read like a DataFrame, and what each column was taken for is printed on stderr, as by `load`.
     A list holds one recording an entry, unless its entries are numbers: that is one recording of one coordinate.
-    Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time` gives them.
+    Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time` gives them; the
+    index of a DataFrame is a column, unless it merely counts the rows.
 
     Raises
     ------
@@ -52,9 +56,10 @@ def as_trajectories(
         found = data
     elif isinstance(data, (str, Path)):
         found = load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())})
-    elif hasattr(data, "columns"):
-        found = from_frame(data, Wanted(time, **names)) if h is None else _array(np.asarray(data), h, time, names)
-        found = in_radians_and_seconds(found)
+    elif hasattr(data, "columns") and h is not None:
+        found = in_radians_and_seconds(_array(np.asarray(data), h, time, names))
+    elif hasattr(data, "columns") or isinstance(data, Mapping):
+        return _table(data, Wanted(time, **names), angles)
     elif _is_list_of_recordings(data):
         return _of_each(data, {"h": h, "time": time, **names, "angles": angles})
     else:
@@ -86,6 +91,16 @@ def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
         raise InputError("time and inputs of several arrays: give h, or Trajectories.of(...) for each of them")
     rows = [_floats("positions", one) if isinstance(one, (list, tuple)) else one for one in data]
     return Trajectories.cat([as_trajectories(one, **options) for one in rows])
+
+
+def _table(data: Any, wanted: Wanted, angles: Any) -> Trajectories:
+    """The recordings of a DataFrame or a dict of columns; what each column was taken for is printed."""
+    is_frame = hasattr(data, "columns")
+    where = Path("DataFrame" if is_frame else "dict")
+    frame = data if is_frame else Table(where, {str(name): np.asarray(x) for name, x in data.items()})
+    found = _marked(in_radians_and_seconds(from_frame(frame, wanted, where)), angles)
+    print(found.table(), file=sys.stderr)
+    return found
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -16,6 +17,7 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 INSTALL = "pip install 'herglotz[tables]'"
+COUNTER = re.compile(r"__index_level_\d+__")  # a column that pandas adds: an index without a name
 HDF5 = b"\x89HDF\r\n\x1a\n"  # the first bytes of such a file, also of MATLAB's version 7.3
 
 
@@ -50,7 +52,8 @@ def read_parquet(path: PathLike, **columns: Any) -> Trajectories:
     """
     parquet = _package("pyarrow.parquet", path)
     table = _opened(path, lambda: parquet.read_table(str(path)))
-    arrays = {name: table.column(name).to_numpy() for name in table.column_names}
+    names = [name for name in table.column_names if not COUNTER.fullmatch(name)]
+    arrays = {name: table.column(name).to_numpy() for name in names}
     return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
 
 

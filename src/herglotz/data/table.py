@@ -90,19 +90,31 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
 def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:
     """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
 
-    `where` begins messages.
+    `where` begins messages. The index of a DataFrame joins the columns, unless it merely counts the rows.
 
     Raises
     ------
     InputError
         Naming column, row (counted from 0), value and remedy.
     """
+    frame = _with_index(frame)
     heads = [str(name) for name in frame.columns]
     columns = assign(heads, str(where), wanted)
     raw = [np.asarray(frame[name]) for name in frame.columns]
     numbers = np.stack([_numbers(where, columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
     labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     return from_table(where, columns, range(len(numbers)), labels, numbers)
+
+
+def _with_index(frame: Any) -> Any:
+    """A DataFrame with its index as columns: a named one by its name, an unnamed one of dates or floats as the time."""
+    index = getattr(frame, "index", None)
+    if index is None or not hasattr(frame, "reset_index"):
+        return frame
+    if any(name is not None for name in index.names):
+        return frame.reset_index()
+    is_clock = np.asarray(index).dtype.kind in "Mf" and not {"t", "time"} & set(map(str, frame.columns))
+    return frame.rename_axis("time").reset_index() if is_clock else frame
 
 
 def moment(text: str) -> datetime | None:

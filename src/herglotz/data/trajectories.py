@@ -103,6 +103,11 @@ class Trajectories:
             columns=columns,
         )
 
+    @property
+    def unit(self) -> str:
+        """The unit that all coordinates have; "" where there are several, or none."""
+        return self.units[0] if len(set(self.units)) == 1 and self.units[0] != "1" else ""
+
     def __repr__(self) -> str:
         return f"Trajectories({self.summary()})"
 

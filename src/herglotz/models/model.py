@@ -178,7 +178,9 @@ class ContactLagrangian(nn.Module):
     def at(self, u: Tensor) -> DrivenLagrangian:
         """The discrete Lagrangian of a step whose inputs are u, (..., m)."""
         if not self.config.inputs:
-            raise InputError("this model has no inputs; build it with level='forced' and inputs=m in its ModelConfig")
+            raise InputError(
+                "this model has no inputs: fit a recording that has input columns, or leave the inputs out"
+            )
         return DrivenLagrangian(self, u)
 
     def typical_increment(self, h: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ def plot_plan(run: Run) -> Figure:
     plan = Plan.from_dict(run.metrics["plan"])
     rows = [
         ("\n".join(fill(words, DECISION) for words in decisions), fill(reason, REASON))
-        for decisions, reason in plan.by_reason()
+        for decisions, reason in plan.by_reason(run.data.unit)
         if reason
     ]
     heights = [LINE * max(left.count("\n") + 1, right.count("\n") + 1) + 0.1 for left, right in rows]

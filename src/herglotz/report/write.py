@@ -20,7 +20,6 @@ from herglotz.report.sections import Block, Code, Document, Picture, Section, Sl
 from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
-from herglotz.training.plan import DECISIONS, show
 from herglotz.training.quantities import held_out_rms, quantities
 from herglotz.training.summary import rows as summary_rows
 from herglotz.verify import verify
@@ -155,7 +154,7 @@ def _plan(run: Run) -> tuple[Block, ...]:
     if "plan" not in run.metrics:
         return ("The run holds no plan.",)
     plan = Plan.from_dict(run.metrics["plan"])
-    rows = tuple((name, show(getattr(plan, name)), plan.reasons.get(name, "")) for name in DECISIONS)
+    rows = tuple(plan.decisions(run.data.unit))
     blocks: list[Block] = [Table(("decision", "taken", "because"), rows)]
     if run.history:
         blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import NamedTuple
 
+from herglotz.data.units import size
 from herglotz.training.config import FitConfig
 from herglotz.training.look import Look
 from herglotz.training.one_step_fit import NOISE_OF_R
@@ -13,6 +14,7 @@ from herglotz.training.plan import Plan
 from herglotz.training.task import NOISY
 
 RESTARTS = 4  # random initialisations of a single layer: some stall at a hundred times the error of others
+AS_SET = "as set, or by default"
 AS_FOUND = ("order", "features", "drag")  # what the search for terms sets, where the user does not
 
 
@@ -30,7 +32,7 @@ def _supervised(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 
 
 def _named(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
-    return None if config.objective == "auto" else "the user named it"
+    return None if config.objective == "auto" else AS_SET
 
 
 def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
@@ -40,7 +42,7 @@ def _sticking(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
 def _terms(seen: Look, config: FitConfig) -> str | None:  # noqa: ARG001
     if seen.found is None or seen.found.sigma is None:
         return None
-    return f"whole trajectories were fitted with named terms, to {seen.found.sigma:.2g}"
+    return f"a model of named terms follows whole trajectories to {size(seen.found.sigma, seen.data.unit, digits=2)}"
 
 
 def _structured(seen: Look, config: FitConfig) -> str | None:
@@ -109,7 +111,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
             "objective": why,
             "network": why_network,
             "continues_probe": "the probe has the same model" if continues else "another model, or no probe",
-            "sigma": "what the search for terms left" if named else _sigma_reason(seen, one_step, sigma),
+            "sigma": "error of the fit that named the terms" if named else _sigma_reason(seen, one_step, sigma),
             "restarts": _restart_reason(user_settings, covered),
         },
     )  # fmt: skip
@@ -121,13 +123,13 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
-        "substeps": "halved steps change the motion less than the data miss it" if named else "as set",
+        "substeps": "the fit needed shorter steps: halved ones met the data better" if named else AS_SET,
         "hold": seen.hold,
         "forces": _forces_reason(seen),
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),
         "fitted_before": "the search for terms fitted whole trajectories" if named else "a first fit",
-        "departures": "without a network there is no prior of it" if named else prior,
+        "departures": "there is no network" if named else prior,
     }
 
 
@@ -154,7 +156,7 @@ def drawing() -> str:
 
 def _network(objective: str, covered: bool, named: bool) -> tuple[str, str]:
     if named:
-        return "none", "named terms are the whole model"
+        return "none", "the named terms are the whole model"
     if objective == "raw":
         return "plain", "a network alone, to show the collapse of the raw residual"
     if objective != "residual":
@@ -166,7 +168,7 @@ def _network(objective: str, covered: bool, named: bool) -> tuple[str, str]:
 
 def _level_reason(seen: Look, config: FitConfig) -> str:
     if config.level != "auto":
-        return "the user named it"
+        return AS_SET
     if seen.structure is not None and seen.settings.features:
         return seen.structure
     if seen.data.u is not None:
@@ -175,9 +177,7 @@ def _level_reason(seen: Look, config: FitConfig) -> str:
 
 
 def _structure_reason(seen: Look, as_set: bool) -> str:
-    if as_set or seen.structure is None:
-        return "as set" if seen.structure is None else f"as set; {seen.structure}"
-    return seen.structure
+    return AS_SET if as_set or seen.structure is None else seen.structure
 
 
 def _forces_reason(seen: Look) -> str:
@@ -192,17 +192,18 @@ def _outlier_reason(seen: Look) -> str:
         return f"robust '{seen.settings.robust}' was set"
     if lone:
         return f"{lone} single spikes left out; there may be more"
-    return "they pull the least-squares start" if seen.outliers else "no spikes, and least squares are not pulled"
+    return "some samples pull the least-squares start" if seen.outliers else "no single samples stand out"
 
 
 def _sigma_reason(seen: Look, one_step: bool, sigma: float | None) -> str:
-    rough = f"polynomials through nine samples leave {seen.noise:.2g}" if math.isfinite(seen.noise) else "few samples"
+    noise = size(seen.noise, seen.data.unit, digits=2)
+    rough = f"polynomials through nine samples miss them by {noise}" if math.isfinite(seen.noise) else "few samples"
     if one_step:
         return f"one-step fits need none; {rough}"
-    return f"{'a one-step fit will measure it' if sigma is None else 'the probe error / √6'}; {rough}"
+    return f"{'a one-step fit will measure it' if sigma is None else 'the error of single steps / √6'}; {rough}"
 
 
 def _restart_reason(config: FitConfig, covered: bool) -> str:
     if config.restarts is not None:
-        return "the user named it"
+        return AS_SET
     return "a single layer stalls from some initialisations" if covered else "two layers, or none, do not stall"

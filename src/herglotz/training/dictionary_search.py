@@ -236,9 +236,7 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(
-        self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1
-    ) -> Found | None:
+    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1) -> Found | None:
         """The fit with other terms, steps or samples, from this one."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps, every)
         assert problem.path is not None

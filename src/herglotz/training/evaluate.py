@@ -118,6 +118,7 @@ def _errors(
         "outliers": int(dropped.sum()),
         "outliers_unseen": int((~training).sum() - beyond.sum()),
         "extrapolation_rms": None if free is None else _rms(free),
+        "gain_over_mean": None if free is None else _gain(free, (data.q - data.q[used].mean(0))[beyond]),
         "spread": _rms(data.q - data.q.mean(0)),
         "objective": fitted.objective,
         "sigma": fitted.sigma,
@@ -126,6 +127,13 @@ def _errors(
         **fitted.notes,
     }
     return numbers, free
+
+
+def _gain(free: Tensor, still: Tensor) -> float:
+    """By how many standard errors the free run meets the unseen samples better than the mean of the training part."""
+    scale = still.square().mean(0).clamp_min(torch.finfo(still.dtype).tiny)
+    gain = ((still.square() - free.square()) / scale).flatten()
+    return float(gain.mean() / (gain.std() / len(gain) ** 0.5).clamp_min(torch.finfo(gain.dtype).tiny))
 
 
 def _rms(x: Tensor) -> float | None:

@@ -27,6 +27,7 @@ from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.task import Task
+from herglotz.training.tensorboard import tensorboard_log
 from herglotz.training.uncertainty import laplace
 
 
@@ -39,6 +40,7 @@ def fit(
     out: str | Path | None = None,
     progress: Progress = None,
     resume: bool = False,
+    tensorboard: str | Path | None = None,
     **settings: Any,
 ) -> Run:
     """Train a discrete contact Lagrangian on positions.
@@ -62,6 +64,8 @@ def fit(
         iteration, too.
     resume
         Go on from the checkpoint in `out`, if there is one.
+    tensorboard
+        Folder for a log that TensorBoard shows while the fit runs (extra `herglotz[tensorboard]`).
     **settings
         Single settings of `FitConfig`, over those of `config` (`level="affine"`), and how data are to be read
         (`h=0.01`, `time="t"`, `angles="theta"`, `group="run"`; see `herglotz.data.as_trajectories`).
@@ -75,7 +79,8 @@ def fit(
     Raises
     ------
     InputError
-        If the data cannot be used, the settings are wrong, or another process is fitting into `out`.
+        If the data cannot be used, the settings are wrong, TensorBoard is missing, or another process is fitting into
+        `out`.
 
     Examples
     --------
@@ -87,21 +92,16 @@ def fit(
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
     check_sizes(data.source or "data", data.q, data.names)
-    with nullcontext() if out is None else locked(out):
-        return _fit(data, config, plan, out, progress, resume)
-
-
-def _fit(
-    data: Trajectories,
-    config: FitConfig,
-    plan: Plan | None,
-    out: str | Path | None,
-    progress: Progress,
-    resume: bool,
-) -> Run:
-    started = time.perf_counter()
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
-    stages = Stages(progress, checkpoint, _key(data, config, plan), resume)
+    with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
+        run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
+        if log is not None:
+            log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
+        return run
+
+
+def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stages) -> Run:
+    started = time.perf_counter()
     with stages.bar:
         seen = look(data, config, stages, plan)
         if plan is None and seen.found is not None and seen.found.doubt:

@@ -82,26 +82,27 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
     """
     parameters, n, tol = ParameterVector(model), (start.shape[-1] - 1) // 2, 64 * torch.finfo(start.dtype).eps
     theta, x, k, block = parameters.get(), start[:, None], 0, 1
-    while k < h.shape[1]:
-        part = slice(k, min(k + block, h.shape[1]))
-        inputs, path = None if u is None else u[:, part], None
-        with torch.no_grad():
-            if block > 1:
-                guess = x[:, -1:].repeat(1, part.stop - k + 1, 1)
-                v = (x[:, -1, :n] - x[:, -2, :n]) / h[:, k - 1 : k]
-                guess[:, 1:, :n] += v[:, None] * h[:, part].cumsum(1)[..., None]
-                path = solve_path(parameters, theta, x[:, -1], h[:, part], guess, tol, u=inputs)
-            if path is None:
-                one, here = slice(k, k + 1), x[:, -1]
-                inputs = None if u is None else u[:, one]
-                out = Stepper(model).rollout(here[:, :n], here[:, n : 2 * n], here[:, 2 * n], h=h[:, one], inputs=inputs)
-                new = torch.cat([out.q, out.p, out.s[..., None]], -1)
-            else:
-                new = path.x
-        if not bool(torch.isfinite(new).all()):
-            return None
-        x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
-        block = max(2, block // 4) if path is None else 2 * block
+
+    def at_once(part: slice) -> Tensor | None:
+        guess = x[:, -1:].repeat(1, h[:, part].shape[1] + 1, 1)
+        v = (x[:, -1, :n] - x[:, -2, :n]) / h[:, k - 1 : k]
+        guess[:, 1:, :n] += v[:, None] * h[:, part].cumsum(1)[..., None]
+        path = solve_path(parameters, theta, x[:, -1], h[:, part], guess, tol, u=None if u is None else u[:, part])
+        return None if path is None else path.x
+
+    def stepped(part: slice) -> Tensor:
+        here, inputs = x[:, -1], None if u is None else u[:, part]
+        out = Stepper(model).rollout(here[:, :n], here[:, n : 2 * n], here[:, 2 * n], h=h[:, part], inputs=inputs)
+        return torch.cat([out.q, out.p, out.s[..., None]], -1)
+
+    with torch.no_grad():
+        while k < h.shape[1]:
+            new = at_once(slice(k, k + block)) if block > 1 else None
+            block = max(2, block // 4) if new is None else 2 * block
+            new = stepped(slice(k, k + 1)) if new is None else new
+            if not bool(torch.isfinite(new).all()):
+                return None
+            x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
     return x
 
 

@@ -165,7 +165,7 @@ def _with_friction(
     c = user_settings
     plain = (c.level, c.objective, c.supervision, c.optimiser) == ("auto", "auto", "q", "lm") and not c.coulomb
     if plan is not None or settings.sticking is not None:
-        return settings, "as set"
+        return settings, "as set, or by default"
     if kept.u is None or not plain:
         return replace(
             settings, sticking=False

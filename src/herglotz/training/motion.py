@@ -16,6 +16,7 @@ from herglotz.data.driving import driven, even_times, recorded
 from herglotz.data.waves import waves
 from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
+from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 
 Numbers = float | Sequence | np.ndarray | Tensor
@@ -62,6 +63,7 @@ class Motion:
         return f"Motion(t {self.t[0]:g} to {self.t[-1]:g} {self.time_unit}, q {shape} of {names}{failed})"
 
 
+@one_thread()
 def free_motion(
     run: Steppable,
     steps: int,

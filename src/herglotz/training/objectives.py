@@ -117,9 +117,7 @@ OBJECTIVES: dict[str, Callable[[Task, Look, Plan], Fitted]] = {
 def _one_step_start(task: Task, plan: Plan) -> tuple[ContactLagrangian, float]:
     """A model without correction from a short one-step fit, and the noise of q that the plan or this fit gives."""
     model = task.build(plan.network)
-    problem = one_step_problem(
-        task, model, LOOSE * task.size, freedom=FREEDOM if plan.outliers else None, short=True
-    )
+    problem = one_step_problem(task, model, LOOSE * task.size, freedom=FREEDOM if plan.outliers else None, short=True)
     _, rms = fit_one_step(task, problem, "one-step start", PROBE)
     return model, plan.sigma or rms / NOISE_OF_R
 

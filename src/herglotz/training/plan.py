@@ -6,6 +6,7 @@ import textwrap
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+from herglotz.data.units import size
 from herglotz.errors import InputError
 from herglotz.settings import from_plain
 from herglotz.training.baseline import Baseline
@@ -52,19 +53,43 @@ class Plan:
         rest = {name: values for name, values in self.start.items() if name not in STARTS}
         return replace(base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest)
 
-    def by_reason(self) -> list[tuple[list[str], str]]:
-        """Decisions in words (`order: 2`) with the reason that they share, in the order of `DECISIONS`."""
+    def decisions(self, unit: str = "") -> list[tuple[str, str, str]]:
+        """What was decided, how, and why, in words: of `DECISIONS`, those that have an effect in this fit.
+
+        `unit` is that of the coordinates, where they have one in common.
+        """
+        return [
+            (WORDS[name], in_words(name, getattr(self, name), unit), self.reasons.get(name, ""))
+            for name in DECISIONS
+            if self._has_effect(name)
+        ]
+
+    def _has_effect(self, name: str) -> bool:
+        one_step = self.objective in ("residual", "raw")
+        idle = {
+            "hold": not self.hold,
+            "drag": not self.drag,
+            "substeps": self.substeps == 1,
+            "continues_probe": not self.continues_probe,
+            "fitted_before": not self.fitted_before,
+            "sigma": one_step,
+            "restarts": not one_step,
+            "departures": self.network in ("none", "plain"),
+        }
+        return not idle.get(name, False)
+
+    def by_reason(self, unit: str = "") -> list[tuple[list[str], str]]:
+        """Decisions in words (`order of the time step: 2`) with the reason that they share."""
         found: dict[str, list[str]] = {}
-        for name in DECISIONS:
-            words = f"{name.replace('_', ' ')}: {show(getattr(self, name))}"
-            found.setdefault(self.reasons.get(name, ""), []).append(words)
+        for name, taken, reason in self.decisions(unit):
+            found.setdefault(reason, []).append(f"{name}: {taken}")
         return [(decisions, reason) for reason, decisions in found.items()]
 
-    def table(self, width: int = 80) -> str:
+    def table(self, width: int = 80, unit: str = "") -> str:
         """The decisions, those of one reason together, and the reason below them, for people."""
         lines = []
-        for decisions, reason in self.by_reason():
-            lines.append(textwrap.fill("; ".join(decisions), width, initial_indent="  ", subsequent_indent="  "))
+        for decisions, reason in self.by_reason(unit):
+            lines += [textwrap.fill(x, width, initial_indent="  ", subsequent_indent="    ") for x in decisions]
             lines.append(textwrap.fill(reason, width, initial_indent="      ", subsequent_indent="      "))
         return "\n".join(filter(None, lines))
 
@@ -82,18 +107,66 @@ class Plan:
             raise InputError(f"the plan is incomplete ({error}); take one that `fit` wrote") from None
 
 
-# The decisions that `table` prints; the starting values are too many.
-DECISIONS = tuple(f.name for f in fields(Plan) if f.name not in ("start", "reasons"))
+WORDS = {  # what a decision is called; the starting values are too many to be told
+    "level": "level",
+    "objective": "fitted to",
+    "network": "network",
+    "order": "order of the time step",
+    "features": "terms that were named",
+    "hold": "inputs between samples",
+    "drag": "friction beside the viscous one",
+    "substeps": "model steps in a recorded step",
+    "forces": "masses and friction",
+    "outliers": "outliers expected",
+    "continues_probe": "starts from the fit that measured the noise",
+    "sigma": "noise assumed",
+    "fitted_before": "starts from an earlier fit",
+    "restarts": "random initialisations",
+    "departures": "strengths of the prior that are compared",
+}
+DECISIONS = tuple(WORDS)
+MEANINGS = {
+    "level": {
+        "conservative": "no damping",
+        "linear": "one damping rate",
+        "affine": "damping depends on position and velocity",
+        "full": "damping depends on s too",
+        "forced": "friction and inputs are forces",
+    },
+    "objective": {
+        "residual": "single steps",
+        "trajectory": "whole trajectories",
+        "smoothing": "every state, with a little noise in every step",
+        "raw": "the bare residual",
+    },
+    "network": {
+        "potential": "a part of the potential",
+        "correction": "a correction of the step",
+        "covered": "a wide correction of the step",
+        "plain": "the whole model",
+    },
+    "hold": {"zero": "constant", "first": "straight lines", "smooth": "polynomials"},
+}
+FORCES = {  # of `Plan.forces`
+    "coulomb": "dry friction",
+    "sticking": "dry friction that can hold a joint still",
+    "coupled": "friction between coordinates",
+    "diagonal": "a mass for each coordinate, none between two",
+    "alike": "one mass, and a potential of the named terms alone",
+}
 
 
-def show(value: Any) -> str:
+def in_words(name: str, value: Any, unit: str = "") -> str:
     """One decision in words."""
-    if isinstance(value, dict):
-        return ", ".join(name for name, on in value.items() if on) or "none"
+    if name in MEANINGS:
+        meaning = MEANINGS[name].get(value)
+        return f"{meaning} ({value})" if meaning else str(value) or "none"
+    if name == "forces":
+        return ", ".join(FORCES[force] for force, on in value.items() if on) or "masses and viscous friction alone"
     if isinstance(value, tuple):
         return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
     if value is None:
         return "to be measured"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return f"{value:.3g}" if isinstance(value, float) else str(value) or "none"
+    return size(value, unit) if name == "sigma" else str(value)

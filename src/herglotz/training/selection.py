@@ -8,7 +8,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import torch
@@ -24,7 +23,6 @@ from herglotz.training.fit import fit
 from herglotz.training.run import Run
 from herglotz.training.stages import Progress
 from herglotz.training.structure import structure_is_free
-from herglotz.training.summary import COLUMNS
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
@@ -94,7 +92,9 @@ class Selection:
 
     def table(self) -> str:
         """Level × held-out error × spread × parameters × cost, for people, in 80 columns; → marks the chosen level."""
-        lines = [f"  {'level':<13}{'held-out RMS':>12}{'min … max':>20}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"]
+        unit = self.run.data.unit
+        lines = [f"Free runs over the held-out time{unit and f', in {unit}'}; the arrow marks the chosen level:"]
+        lines += [f"  {'level':<13}{'held-out RMS':>12}{'min … max':>20}{'parameters':>12}{'µs/step':>9}{'fit, s':>8}"]
         for c in self.candidates:
             low, high = float(c.of_seeds.min()), float(c.of_seeds.max())
             seconds = sum(run.metrics["seconds"] for run in c.runs) / len(c.runs)
@@ -102,9 +102,6 @@ class Selection:
             lines.append(
                 f"{mark} {c.level:<13}{c.error:>12.3g}{spread:>20}{c.parameters:>12}{c.step_us:>9.0f}{seconds:>8.1f}"
             )
-        verdict = self.run.metrics.get("verdict", "")
-        if verdict.startswith("does not fit"):
-            lines.append(fill(f"Warning: the chosen level {verdict}", COLUMNS))
         return "\n".join(lines)
 
     def to_json(self) -> str:

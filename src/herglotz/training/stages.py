@@ -19,6 +19,7 @@ from herglotz.errors import InputError
 from herglotz.schema import check_entries
 from herglotz.training.distributed import is_first
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
+from herglotz.training.tensorboard import TensorboardLog
 
 FORMAT = 2  # 2 holds all that a search goes on from
 REMEDY = "delete it and fit from the start"
@@ -44,8 +45,9 @@ class Callback:
         store: Callable[[dict[str, Any]], None],
         resumed: dict[str, Any] | None,
         named: str = "",  # begins a line on stderr for every iteration; "": no lines
+        log: Callable[[int, float], None] | None = None,  # is told every iteration and its cost
     ):
-        self.bar, self.store, self.resumed, self.named = bar, store, resumed, named
+        self.bar, self.store, self.resumed, self.named, self.log = bar, store, resumed, named, log
         self.start: float | None = None  # the first cost
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
@@ -56,6 +58,8 @@ class Callback:
         self.bar.set_postfix_str(share, refresh=False)
         if self.named:
             print(f"{self.named}, iteration {iteration}: {share}", file=sys.stderr, flush=True)
+        if self.log is not None:
+            self.log(iteration, cost)
         if iteration % EVERY == 0:
             self.store(search())
 
@@ -64,8 +68,8 @@ class Stages:
     """Run optimisations one after the other, and record them.
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
-    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives what one
-    that was not interrupted gives: to rounding, for matrix products depend on where their memory lies.
+    and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
+    bits as one that was not interrupted.
 
     Parameters
     ----------
@@ -78,9 +82,14 @@ class Stages:
         Identifies data and settings; a checkpoint of another fit is refused.
     resume
         Read the checkpoint if there is one.
+    log
+        Is told the cost of every iteration, as it is reached.
     """
 
-    def __init__(self, progress: Progress, checkpoint: Path | None, key: str, resume: bool):
+    def __init__(
+        self, progress: Progress, checkpoint: Path | None, key: str, resume: bool, log: TensorboardLog | None = None
+    ):
+        self.log = log if is_first() else None
         self.lines = progress in ("lines", "iterations") and is_first()
         self.verbose = progress == "iterations" and is_first()
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
@@ -130,8 +139,10 @@ class Stages:
                 self.done[name] = {"done": False, "search": search}
                 self._write()
 
+            start, log = len(self.history), self.log
+            told = None if log is None else lambda k, cost: log.cost(name, start + k, cost)
             began = time.monotonic()
-            result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else ""))
+            result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", told))
             if self.lines:
                 took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
                 print(f"{name}: {took}", file=sys.stderr, flush=True)

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, roughness
+from herglotz.data.units import size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
 from herglotz.models.jet import pairs
@@ -117,8 +118,9 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
     noise = precision(data)
     limit = max(noise if math.isfinite(noise) else 0.0, EXACT_ENOUGH * found.spread)
     named = ", ".join(("mass, stiffness, viscous friction", *found.terms.names))
-    words = f"{named} miss {found.rms:.2g}"
-    words += f" (precision {limit:.2g})" + ("" if found.whole else "; whole trajectories are not followed")
+    miss, least = (size(x, data.unit, digits=2) for x in (found.rms, limit))
+    words = f"{named} miss the data by {miss}, whose precision is {least}"
+    words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
     return Structure(found.config, found.base, words, found.rms, doubt)
 

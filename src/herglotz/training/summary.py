@@ -31,14 +31,16 @@ class Judged(Protocol):
 def rows(run: Judged) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
-    unit = data.units[0] if len(set(data.units)) == 1 and data.units[0] != "1" else ""
-    degrees = bool(data.degrees)  # as the file had them
+    unit, degrees = data.unit, bool(data.degrees)  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", data.summary()),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
-        ("features", features_in_words(run.config.features)),
-        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
+        ("named terms", features_in_words(run.config.features)),
+        (
+            "extrapolation RMS",
+            _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
+        ),
         ("training RMS", _error(m.get("train_rms"), unit, degrees)),
         ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
         ("damping rate", show(m.get("rate"), f"per {per}")),

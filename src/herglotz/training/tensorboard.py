@@ -3,50 +3,50 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from herglotz.errors import InputError
 
-if TYPE_CHECKING:
-    from herglotz.training.run import Run
+SECONDS = 5  # after which TensorBoard can read what was logged
 
 
-def summary_writer() -> Any:
-    """PyTorch's `SummaryWriter`.
+class TensorboardLog:
+    """The cost of every iteration as it is reached, a curve a stage; at the end metrics, summary and equation."""
+
+    def __init__(self, writer: Any):
+        self.writer = writer
+
+    def cost(self, stage: str, iteration: int, cost: float) -> None:
+        """One iteration of a stage, counted over all stages."""
+        self.writer.add_scalar(f"cost/{stage}", cost, iteration)
+
+    def finish(self, metrics: dict[str, Any], words: dict[str, str]) -> None:
+        """What the fit reached: its numbers, and texts by name."""
+        for name, value in metrics.items():
+            if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+                self.writer.add_scalar(f"metrics/{name}", value, 0)
+        for name, text in words.items():
+            self.writer.add_text(name, f"```\n{text}\n```")
+
+
+@contextmanager
+def tensorboard_log(folder: str | Path | None) -> Iterator[TensorboardLog | None]:
+    """A log into this folder, which `tensorboard --logdir FOLDER` shows while the fit runs; None without a folder.
 
     Raises
     ------
     InputError
         If TensorBoard is not installed.
     """
+    if folder is None:
+        yield None
+        return
     try:
         from torch.utils.tensorboard import SummaryWriter  # pyright: ignore[reportPrivateImportUsage]
     except ImportError:
         raise InputError("a log for TensorBoard needs it: pip install 'herglotz[tensorboard]'") from None
-    return SummaryWriter
-
-
-def write_tensorboard(run: Run, folder: str | Path) -> None:
-    """Write the cost of every iteration (a curve a stage), the metrics, and summary and equation as text.
-
-    Parameters
-    ----------
-    run
-        What `fit` returned.
-    folder
-        Where the event file is written; `tensorboard --logdir FOLDER` shows it.
-
-    Raises
-    ------
-    InputError
-        If TensorBoard is not installed.
-    """
-    with summary_writer()(str(folder)) as log:
-        for row in run.history:
-            log.add_scalar(f"cost/{row['stage']}", row["cost"], row["iteration"])
-        for name, value in run.metrics.items():
-            if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-                log.add_scalar(f"metrics/{name}", value, 0)
-        log.add_text("summary", f"```\n{run.summary()}\n```")
-        log.add_text("equation", f"```\n{run.equation()}\n```")
+    with SummaryWriter(str(folder), flush_secs=SECONDS) as writer:
+        yield TensorboardLog(writer)

@@ -24,6 +24,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import precision
 from herglotz.data.spikes import without
+from herglotz.data.units import size
 from herglotz.stepping import Stepper
 from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.inputs import grid_inputs
@@ -39,6 +40,8 @@ FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does no
 AT_THE_NOISE = 1.5  # times the precision: fitted states, and the noise's own estimate, leave 10 to 30 %
 EXACT_ENOUGH = 1e-4  # of the spread: exact data have no noise to be compared with
 LOST = 0.1  # of the spread: what `herglotz verify` bounds windows of 20 steps by; a model with nothing in it has 1
+HALF = 0.5  # of the spread: windows of noise alone, whose starts are fitted, leave 0.9 to 0.95 of it
+CLEARLY = 2.0  # standard errors by which a free run is better than the mean of the data
 BURIED = 3.0  # times the precision: windows that miss no more follow the data, however large the noise is
 STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a window from 20 samples need fewer
 
@@ -67,13 +70,14 @@ def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tens
 
 @dataclass(frozen=True)
 class Errors:
-    """What a verdict rests on: RMS errors and sizes, all in one unit."""
+    """What a verdict rests on: RMS errors and sizes, all in one unit, or over the spread of each coordinate."""
 
     windows: float
     unseen: float | None  # None: nothing was held out
     free: float | None
     noise: float  # precision of the data; inf: not known
     spread: float
+    unit: str | None = ""  # None: all are over the spread of each coordinate, which is 1
 
     @property
     def limit(self) -> float:
@@ -86,9 +90,14 @@ class Errors:
         return max(LOST * self.spread, BURIED * self.limit)
 
     def __str__(self) -> str:
-        held_out = "" if self.unseen is None else f", unseen ones {self.unseen:.2g}, the free run {self.free:.2g}"
-        sizes = f"the data's precision is {self.limit:.2g}, their spread {self.spread:.2g}"
-        return f"windows of {FIRST_SEGMENT} steps miss {self.windows:.2g}{held_out}; {sizes}"
+        windows, unseen, free, limit, spread = (
+            "" if x is None else size(x, self.unit or "", digits=2)
+            for x in (self.windows, self.unseen, self.free, self.limit, self.spread)
+        )
+        held_out = f", unseen data by {unseen}, all unseen time in one run by {free}" if unseen else ""
+        spread = f"their spread is {spread}" if self.unit is not None else "all over the spread of each coordinate"
+        missed = f"free runs over {FIRST_SEGMENT} steps miss the training data by {windows}{held_out}"
+        return f"{missed}; the data's precision is {limit}, {spread}"
 
 
 def judged(
@@ -116,7 +125,9 @@ def judged(
     if unseen is not None and free is not None and _rms(unseen / unit) > _rms(free / unit):
         unseen = free  # the free run's states are better than those that were found for the windows
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
-    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), _rms(scaled.q - scaled.q.mean(0)))
+    spread = _rms(scaled.q - scaled.q.mean(0))
+    named = kept.unit if kept.dof == 1 else None
+    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named)
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
@@ -130,6 +141,8 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
     follows = metrics.get("follows_data", True) and worst <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. Try {_remedy(metrics, errors.windows > errors.lost)}"
+    if errors.windows > HALF * errors.spread and not metrics.get("gain_over_mean", 0.0) > CLEARLY:
+        return f"{FAILS}: no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
     chance = 0.0 if ahead is None else BURIED * ahead.start * errors.spread
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
@@ -146,11 +159,11 @@ def _left_open(ahead: Foresight) -> str:
     over = f"over the next {ahead.horizon:.3g} units of time"
     if not ahead.reached:
         return f"The model's own motion breaks off {over}. Try a longer recording"
-    what, size = f"a force too small to be seen ({ahead.name})", ahead.hidden
+    what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
-        what, size = "the uncertainty of the parameters", ahead.parameters
+        what, share = "the uncertainty of the parameters", ahead.parameters
     return (
-        f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * size:.2g} % of its spread. Try a longer "
+        f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread. Try a longer "
         + ("recording, or several from other starts")
     )
 

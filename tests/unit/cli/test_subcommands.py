@@ -144,7 +144,7 @@ def test_fit_says_what_it_found(tmp_path, capsys):
     made = ["simulate", "chain", "--param", "masses=2", "--trajectories", "4", "--steps", "24", "--h", "0.1"]
     assert main([*made, "--out", str(csv)]) == 0
     assert main(["fit", str(csv), "--out", str(folder), "--no-plots"]) == 0
-    assert "(q1 - q2)^2" in next(x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("features"))
+    assert "(q1 - q2)^2" in next(x for x in capsys.readouterr().out.splitlines() if x.strip().startswith("named terms"))
     told = ["--level", "forced", "--diagonal", "--feature", "(q1 - q2)^2", "--out", str(tmp_path / "told")]
     assert main(["fit", str(csv), *told, "--no-plots", "--order", "4", "--iterations", "2"]) in (0, 3)
     assert "kinetic.off_diagonal" not in dict(load_run(tmp_path / "told").model.named_parameters())
@@ -291,6 +291,8 @@ def test_interrupt_with_a_checkpoint(monkeypatch, tiny_csv, tmp_path, capsys):  
     monkeypatch.setattr(herglotz.training, "fit", interrupted)
     assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 130
     assert "--resume" in capsys.readouterr().err
+    assert main(["fit", str(tiny_csv), "--out", str(tmp_path / "run")]) == 2  # fails if the work done is overwritten
+    assert "holds a fit that was interrupted; add --resume" in capsys.readouterr().err
 
 
 def test_select(capsys, tiny_csv, tmp_path):  # fails if run, table or figure is missing, or --dtype does not arrive

@@ -57,6 +57,7 @@ def test_a_list_is_several_recordings(
 def test_tables():  # fails if a Series' index is not its time, or a DataFrame's options are dropped
     found = as_trajectories(Series([1, 2, 3, 4], T, "theta"), angles=True)
     assert (found.names, found.t.tolist(), found.angles) == (("theta",), T.tolist(), (True,))
+    assert as_trajectories({"t": T.tolist(), "x": Q[:, 0]}).q[:, 0].tolist() == Q[:, 0].tolist()  # a dict of columns
     frame = Frame({"clock": T, "theta[deg]": Q[:, 0], "tau": Q[:, 1]})
     found = as_trajectories(frame, time="clock")
     assert (found.names, found.units) == (("theta",), ("rad",))
@@ -80,3 +81,28 @@ def test_tables():  # fails if a Series' index is not its time, or a DataFrame's
 def test_mistakes(data, options, message):  # fails if a mistake is a traceback, or an option is ignored
     with pytest.raises(InputError, match=message):
         as_trajectories(data, **options)
+
+
+def test_what_a_frame_is_taken_for_is_printed(capsys):  # fails if the columns of a DataFrame are guessed silently
+    as_trajectories(Frame({"t": T, "load": Q[:, 0], "F": Q[:, 1]}))
+    lines = [line.split() for line in capsys.readouterr().err.splitlines()]
+    assert lines[2:] == [["t", "time", "-"], ["load", "coordinate", "-"], ["F", "input", "-"]]
+
+
+@pytest.mark.parametrize("name", ["t", None])
+@pytest.mark.parametrize("clock", ["floats", "dates"])
+def test_the_index_of_a_frame_is_its_time(name, clock):  # fails if a DataFrame's index of times is dropped
+    pandas = pytest.importorskip("pandas")
+    dates = pandas.to_datetime("2024-05-01") + pandas.to_timedelta(T, unit="s")
+    index = pandas.Index(T) if clock == "floats" else dates
+    found = as_trajectories(pandas.DataFrame({"x": Q[:, 0]}, index=index.rename(name)))
+    assert (found.names, found.t.tolist()) == (("x",), pytest.approx(T.tolist()))
+
+
+def test_an_index_that_counts_is_no_coordinate(tmp_path):  # fails if the index of joined frames becomes a coordinate
+    pandas, _ = pytest.importorskip("pandas"), pytest.importorskip("pyarrow")
+    one = pandas.DataFrame({"t": T, "x": Q[:, 0], "run": "a"})
+    both = pandas.concat([one, one.assign(run="b")])
+    both.to_parquet(tmp_path / "both.parquet")
+    for found in (as_trajectories(both, group="run"), as_trajectories(tmp_path / "both.parquet", group="run")):
+        assert (found.names, found.lengths) == (("x",), (4, 4))

@@ -13,7 +13,7 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 import torch
-from fake_run import TERMS, TRIED, fake_run
+from fake_run import TERMS, fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 from PIL import Image
@@ -107,8 +107,8 @@ def test_the_plan_has_a_box_for_every_reason():
     figure = plot_plan(fake_run(steps=12))
     texts = [text.get_text() for text in figure.axes[0].texts if text.get_text()]
     assert texts == [
-        "level: linear\nfeatures: cos(q1)", TERMS, "objective: trajectory", "the data are noisy",
-        "departures: 0.0002,\n0.0006, 0.002, 0.006", TRIED,
+        "level: one damping rate\n(linear)\nterms that were named:\ncos(q1)", TERMS,
+        "fitted to: whole\ntrajectories (trajectory)", "the data are noisy",
     ]  # fmt: skip
     with pytest.raises(InputError, match="holds no plan"):
         plot_plan(replace(fake_run(steps=12), metrics={}))

@@ -14,6 +14,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
 from herglotz.training import fit
+from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
@@ -32,6 +33,19 @@ def test_duffing_is_found_from_one_noisy_recording(duffing):
     assert plan["network"] == "none"
     assert duffing.metrics["train_rms"] < 1.2 * 0.003
     assert duffing.metrics["extrapolation_rms"] < 1.5 * 0.003
+
+
+def test_a_search_begins_with_as_few_samples_as_tell_the_motion(monkeypatch):
+    # fails if a search works on all samples of a recording that is finer than its motion, or the fit on some of them
+    data, begun = simulate(scene("duffing"), trajectories=1, steps=1500, h=0.02, noise=1e-5, seed=0), []
+    begin = DictionarySearch._begun
+    monkeypatch.setattr(DictionarySearch, "_begun", lambda self: begun.append(self.data.samples) or begin(self))
+    run = fit(data, train_fraction=1.0, progress=False)
+    assert begun
+    assert max(begun) < 600
+    assert set(run.metrics["plan"]["features"]) == {"q1^2", "q1^4"}
+    assert run.metrics["train_rms"] == pytest.approx(1e-5, rel=0.1)
+    assert run.h == pytest.approx(0.02)
 
 
 def test_the_equation_is_printed_with_deviations(duffing):

@@ -13,7 +13,7 @@ from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
 from herglotz.training.choose import RULES, choose_objective, drawing
-from herglotz.training.plan import DECISIONS
+from herglotz.training.plan import DECISIONS, WORDS
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
@@ -66,7 +66,9 @@ def test_every_decision_has_a_reason(noise):
     assert set(plan.reasons) == {*DECISIONS, "start"}
     assert all(plan.reasons.values())
     table = plan.table()
-    assert all(f"{name.replace('_', ' ')}: " in table for name in DECISIONS)
+    told = [WORDS[name] for name in ("level", "objective", "network", "order", "features", "forces", "outliers")]
+    assert all(f"{words}: " in " ".join(table.split()) for words in told)
+    assert (WORDS["departures"] in table) == (WORDS["network"] + ": none" not in table)
     assert max(map(len, table.splitlines())) <= 80
 
 
@@ -100,3 +102,13 @@ def test_a_wrong_plan_is_refused_in_words():
         Plan.from_dict({**plan, "colour": "red"})
     with pytest.raises(InputError, match="the plan is incomplete"):
         Plan.from_dict({"level": "linear"})
+
+
+def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or of decisions that have no effect
+    plan = replace(choose(*seen(0.01)), network="none", sigma=0.0123, fitted_before=True)
+    words = {name: taken for name, taken, _ in plan.decisions("rad")}
+    assert words["fitted to"] == "whole trajectories (trajectory)"
+    assert words["noise assumed"] == "0.0123 rad"
+    assert words["masses and friction"] == "one mass, and a potential of the named terms alone"
+    idle = ("hold", "drag", "substeps", "restarts", "departures", "continues_probe")
+    assert not {WORDS[name] for name in idle} & set(words)

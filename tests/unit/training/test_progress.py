@@ -10,7 +10,7 @@ from herglotz.errors import InputError
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 from herglotz.training.stages import Progress, Stages
-from herglotz.training.tensorboard import write_tensorboard
+from herglotz.training.tensorboard import tensorboard_log
 
 
 def optimise(x, callback):
@@ -48,12 +48,13 @@ def test_the_log_has_every_iteration():  # fails if a stage's name is lost or cu
 
 
 def test_the_log_for_tensorboard(monkeypatch, tmp_path):
-    # fails if costs, metrics or words do not reach the writer, or a missing TensorBoard is a traceback
+    # fails if costs come only after the fit, metrics or words do not reach the writer, or a missing TensorBoard is a
+    # traceback
     rows = []
 
     class Writer:
-        def __init__(self, folder):
-            rows.append(folder)
+        def __init__(self, folder, flush_secs):
+            rows.append((folder, flush_secs))
 
         def __enter__(self):
             return self
@@ -67,14 +68,22 @@ def test_the_log_for_tensorboard(monkeypatch, tmp_path):
         def add_text(self, name, text):
             rows.append((name, text))
 
-    history = [{"stage": "noise", "iteration": 0, "cost": 8.0}, {"stage": "noise", "iteration": 1, "cost": 2.0}]
     metrics = {"train_rms": 0.01, "verdict": "fits", "follows_data": True, "rate": float("nan")}
-    run = SimpleNamespace(history=history, metrics=metrics, summary=lambda: "S", equation=lambda: "E")
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
-    write_tensorboard(run, tmp_path)  # pyright: ignore
-    costs = [("cost/noise", 8.0, 0), ("cost/noise", 2.0, 1), ("metrics/train_rms", 0.01, 0)]
+    with tensorboard_log(tmp_path) as log:
+        stages = Stages(False, None, "", resume=False, log=log)
+        for stage in ("noise", "rest"):
+            stages.run(stage, torch.zeros(1), 9, optimise)
+        assert rows[1:] == [
+            ("cost/noise", 8.0, 1),
+            ("cost/noise", 2.0, 2),
+            ("cost/rest", 8.0, 3),
+            ("cost/rest", 2.0, 4),
+        ]
+        assert log is not None
+        log.finish(metrics, {"summary": "S", "equation": "E"})
     words = [("summary", "```\nS\n```"), ("equation", "```\nE\n```")]
-    assert rows == [str(tmp_path), *costs, *words, "closed"]
+    assert (rows[0][0], rows[5:]) == (str(tmp_path), [("metrics/train_rms", 0.01, 0), *words, "closed"])
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InputError, match=r"pip install 'herglotz\[tensorboard\]'"):
-        write_tensorboard(run, tmp_path)  # pyright: ignore
+    with pytest.raises(InputError, match=r"pip install 'herglotz\[tensorboard\]'"), tensorboard_log(tmp_path):
+        pass

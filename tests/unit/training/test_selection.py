@@ -20,7 +20,7 @@ from herglotz.training.selection import Candidate, Selection, _simplest, block_e
 
 def candidate(level, *seeds):
     """Held-out errors a seed and block, and nothing else of a run."""
-    run = SimpleNamespace(metrics={"parameters": 7, "seconds": 1.0}, data=SimpleNamespace(units=("rad",)))
+    run = SimpleNamespace(metrics={"parameters": 7, "seconds": 1.0}, data=SimpleNamespace(units=("rad",), unit="rad"))
     return Candidate(level, cast(Any, (run,) * len(seeds)), torch.tensor(seeds, dtype=torch.float64), 10.0)
 
 

@@ -89,6 +89,19 @@ def test_a_model_that_lacks_a_force_is_told():
     assert not run.metrics["verdict"].startswith("fits to the noise"), run.metrics["verdict"]
 
 
+def test_noise_alone_is_no_motion():
+    # fails if white noise, which every model meets to its size, is said to be fitted (exit code 0, "believe it")
+    noise = torch.randn(60, 1, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    run = fit(Trajectories.of(torch.arange(60).double() * 0.1, noise), FitConfig(departures=(2e-3,)), progress=False)
+    assert run.metrics["verdict"].startswith("does not fit: no motion"), run.metrics["verdict"]
+
+
+def test_motion_under_much_noise_is_seen():  # fails if noise of half the motion's size hides a fit that follows it
+    buried = Errors(0.7, 0.7, 0.7, noise=0.7, spread=1.0)
+    assert in_words(buried, KNOWN, {**GOOD, "gain_over_mean": 5.0}).startswith("fits to the noise")
+    assert in_words(buried, KNOWN, {**GOOD, "gain_over_mean": 1.0}).startswith("does not fit: no motion")
+
+
 def test_short_data_have_no_precision():
     # fails if fewer than nine samples raise, or are taken for exact
     t = torch.arange(6, dtype=torch.float64) * 0.1

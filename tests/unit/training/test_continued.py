@@ -1,0 +1,89 @@
+"""Free runs solved block by block, and paths that start from the last one's derivatives."""
+
+import pytest
+import torch
+
+from herglotz.data import simulate
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
+from herglotz.stepping import Stepper
+from herglotz.training.cross_validation import _left_out
+from herglotz.training.free_run import continued
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers import lifted_newton
+
+
+@pytest.mark.parametrize("name", ["damped_pendulum", "servo_axis"])
+def test_runs_continued_in_blocks_are_those_of_single_steps(name):
+    # fails if a block starts from the wrong state, takes the wrong inputs, or is taken where it did not converge
+    held = name == "servo_axis"
+    config = ModelConfig(
+        (name == "damped_pendulum",), "forced", (1.0,), (1.0,), (1.0,), (0.1,), potential_width=0, rate=0.1,
+        coulomb=held, sticking=held, inputs=1 if held else 0, order=2,
+    )  # fmt: skip
+    model, start = ContactLagrangian(config), torch.tensor([[0.8, 0.3, 0.0]], dtype=torch.float64)
+    h = torch.full((1, 120), 0.05, dtype=torch.float64)
+    u = 0.5 * torch.sin(torch.arange(120, dtype=torch.float64) / 9)[None, :, None] if held else None
+    with torch.no_grad():
+        if held:
+            model.get_parameter("friction.coulomb").fill_(0.3)
+            model.get_parameter("friction.input_map").fill_(1.0)
+        x = continued(model, start, h, u)
+        out = Stepper(model).rollout(start[:, :1], start[:, 1:2], start[:, 2], h=h, inputs=u)
+    assert x is not None
+    still = (out.q[:, 1:] == out.q[:, :-1]).any()
+    assert bool(still) == held  # friction holds for a while
+    torch.testing.assert_close(x[..., :1], out.q, rtol=0, atol=1e-11)
+    torch.testing.assert_close(x[..., 1:2], out.p, rtol=0, atol=1e-11)
+
+
+def test_a_run_that_fails_is_none():  # fails if NaN is handed on
+    model = ContactLagrangian(ModelConfig(potential_width=0, rate=0.1))
+    start, h = torch.full((1, 3), 1e200, dtype=torch.float64), torch.full((1, 9), 1e200, dtype=torch.float64)
+    assert continued(model, start, h, None) is None
+
+
+@pytest.fixture
+def pendulum():
+    """A pendulum's problem over whole trajectories, solved at the model's parameters, and its unknowns."""
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.1, noise=0.0, seed=0)
+    model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0, scale=(2.5,), speed=(2.0,)))
+    problem = ShootingProblem(model, data, segment_grid(data, 60, 0.2), sigma=0.01)
+    start = problem.grid.start_sample
+    v = (data.q[start + 1] - data.q[start]) / 0.1
+    x = problem.pack(problem.parameters.get(), problem.states(data.q[start], v))
+    problem.normal_equations(x)
+    return problem, x
+
+
+def test_the_next_path_starts_from_derivatives(pendulum):
+    # fails if a column of the derivatives goes with another unknown: the error of the start falls as the step's square
+    problem, x = pendulum
+    errors = []
+    for size in (1e-2, 1e-3):
+        moved = x + size * torch.linspace(-1, 1, len(x), dtype=x.dtype)
+        guess, path = problem._guess(moved, problem.path), problem.solve(moved)
+        errors.append(float((guess - path.x)[..., : problem.d].abs().max()))
+    assert 50 < errors[0] / errors[1] < 200
+
+
+def test_a_path_that_is_not_looked_at_again_is_solved(pendulum):
+    # fails if sweeps end where the next defect would not be rounding
+    problem, x = pendulum
+    tol = 1e3 * torch.finfo(x.dtype).eps
+    for size in (1e-1, 1e-3, 1e-6, 1e-9):
+        moved = x + size * torch.linspace(-1, 1, len(x), dtype=x.dtype)
+        path, theta = problem.solve(moved), moved[: problem.P]
+        stepped = lifted_newton.all_steps(problem.parameters.at(theta), path.x, problem.grid.h)
+        assert stepped is not None
+        y = stepped[0]
+        assert float((y - path.x[:, 1:]).abs().max()) < 2 * tol * float(path.x.abs().max())
+
+
+@pytest.mark.parametrize("columns", [3, 12])
+def test_left_out_rows_by_either_matrix(columns):  # fails if one of the two forms is wrong
+    make = torch.Generator().manual_seed(0)
+    G, r = (0.2 * torch.randn(*shape, generator=make, dtype=torch.float64) for shape in ((6, columns), (6,)))
+    expected = torch.linalg.inv(torch.eye(6, dtype=torch.float64) - G @ G.T) @ r
+    torch.testing.assert_close(_left_out(G, r), expected)
