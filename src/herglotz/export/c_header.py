@@ -18,7 +18,7 @@ from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
-from herglotz.export.lower.c import StepInC, model_source
+from herglotz.export.lower.c import StepInC, as_lanes, as_scalars, model_source
 from herglotz.export.metadata import check_metadata, describe
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
@@ -96,7 +96,8 @@ static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is re
 static const hz_real hz_near = {near}; /* moves below this, relative, keep the last J */
 enum {{ hz_max_iterations = {max_iterations} }};
 {box}"""
-RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "step.h", "batch.h", "api.h")
+# `step.h` and `run.h` are texts of `REAL` and `FN_`, as the emitted functions are.
+RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "checks.h", "step.h", "run.h", "api.h")
 
 
 def export_c(
@@ -173,14 +174,14 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
     step = StepInC(equations, model.capabilities.explicit)
-    emitted = model_source(step, equations, entries["dof"] <= MAX_WIDE, derivatives)
-    types, number_tests, functions, products, run, batch, api = map(runtime, RUNTIME)
+    emitted = model_source(step, equations, derivatives)
+    types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]
     parts = [_top(entries, step, derivatives), types, _constants(model, entries), number_tests, functions, products]
-    parts += [emitted.tables, _inputs(model, dtype), emitted.scalars, run]
-    if emitted.lanes:
-        parts += ["#ifdef hz_LANE_BYTES\n#define hz_BATCHED", emitted.lanes, batch, "#endif\n"]
-    parts += [emitted.slopes, api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
+    parts += [emitted.tables, _inputs(model, dtype), checks, as_scalars(emitted.step + one_step + run)]
+    if entries["dof"] <= MAX_WIDE:
+        parts += ["#ifdef hz_BATCHED", as_lanes(emitted.step + one_step + run), "#endif"]
+    parts += [as_scalars(emitted.slopes), api, "#undef hz_RESTRICT\n#undef hz_HIDDEN\n#endif\n"]
     text = re.sub(r"\bhz_", f"{entries['name']}_", written("\n".join(parts), dtype))
     comment = json.dumps(entries, allow_nan=False).replace("*", "\\u002a").replace("?", "\\u003f")
     last = {

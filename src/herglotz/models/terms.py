@@ -17,7 +17,7 @@ from herglotz.models.jet import Jet, coordinates, pairs
 from herglotz.models.network import Network, feature_count, position_features
 from herglotz.models.phase import Phase
 from herglotz.models.term import Term
-from herglotz.models.translations import blind, unmoved
+from herglotz.models.translations import blind, projection
 
 
 class Kinetic(nn.Module):
@@ -74,7 +74,8 @@ class Potential(nn.Module):
 
     The tilt b moves the equilibrium: a sensor's zero is seldom there (and for a falling body it is the weight). The
     network is multiplied by the energy scale Σ speed², so that its weights are of order one. `features` joins V as it
-    is. A model's `alike`, `order` 4 and `translations` fix k and b: there the features say what V is.
+    is. A model's `alike` and `order` 4 fix k and b: there the features say what V is. `translations` fix them too, at
+    the springs of what they leave alone (0 beside features): their sizes are the units in which masses are learned.
     """
 
     def __init__(self, config: ModelConfig, generator: torch.Generator):
@@ -83,11 +84,14 @@ class Potential(nn.Module):
         self.energy = sum(v * v for v in config.speed)
         fixed = config.alike or config.order == 4 or bool(config.translations)
         for name, numbers in (("stiffness", config.stiffness), ("tilt", config.tilt)):
-            start = (0.0,) * config.dof if config.order == 4 else unmoved(config, numbers)
+            named = config.order == 4 or (config.translations and (config.features or config.known))
+            start = (0.0,) * config.dof if named else numbers
             value = torch.tensor(start, dtype=torch.float64)
             setattr(self, name, nn.Parameter(value)) if not fixed else self.register_buffer(name, value)
         self.stiffness: Tensor
         self.tilt: Tensor
+        self.register_buffer("across", projection(config.translations, config.angles), persistent=False)
+        self.across: Tensor | None
         self.features = named_potential(config)
         self.more: tuple[Term, ...] = ()  # the model's terms by name, which it holds itself
         self.network: Network | None = None
@@ -98,7 +102,7 @@ class Potential(nn.Module):
 
     def baseline(self, q: Jet) -> Jet:
         """The part of V that no network is needed for."""
-        columns = []
+        columns, q = [], q if self.across is None else q.linear(self.across)
         for i, angle in enumerate(self.angles):
             x = q.select(i)
             columns.append((1.0 - x.cos() if angle else x * x * 0.5) * self.stiffness[i])

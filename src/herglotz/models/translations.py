@@ -2,8 +2,8 @@
 
 A translation is named by what moves together, "q1 + q2" or "q1 - 0.5 q2": q ↦ q + ε d, with d the numbers of that form.
 Networks read their features through the projection on the complement of d, features must be functions of what d leaves
-alone, and the baseline has no spring on what moves. L_d is then invariant, so that J = p·d obeys J_{k+1} = c_k J_k to
-rounding at every step (`herglotz.theory.symmetries` finds what to ask for).
+alone, and the baseline's springs act on the projected position. L_d is then invariant, so that J = p·d obeys
+J_{k+1} = c_k J_k to rounding at every step (`herglotz.theory.symmetries` finds what to ask for).
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from herglotz.errors import InputError
 from herglotz.models.feature_grammar import parse
 from herglotz.models.features import expand
 
+SAME = 1e-9  # of 1: what the pseudo-inverse rounds
 HOW = "name what moves together, as 'q1 + q2'"
 
 
@@ -66,10 +67,28 @@ def check_translations(config: Any) -> None:
                 raise InputError(f"feature '{text}': changes under the translation; name one of differences")
 
 
-def unmoved(config: Any, values: tuple[float, ...]) -> tuple[float, ...]:
-    """Stiffness or tilt, zero where a coordinate is moved."""
-    moved = directions(config.translations, config.angles)
-    return tuple(0.0 if any(d[i] for d in moved) else x for i, x in enumerate(values))
+def projection(translations: Sequence[str], angles: Sequence[bool]) -> Tensor | None:
+    """(n, n) P with P d = 0 for every translation d and P x = x across them; None without translations."""
+    moved = directions(translations, angles)
+    return _across(torch.tensor(moved, dtype=torch.float64)) if moved else None
+
+
+def across_in_words(P: Tensor, names: Sequence[str]) -> list[tuple[str, float]]:
+    """The rows of a projection as "(x − y)" with the factor before it, "" for an empty one."""
+    found = []
+    for row in P.tolist():
+        size = next((w for w in row if w), 1.0)
+        parts = [(w / size, name) for w, name in zip(row, names, strict=True) if w]
+        texts = [
+            f"{'−' if w < 0 else '+'} {'' if abs(abs(w) - 1) < SAME else f'{abs(w):.4g} '}{name}" for w, name in parts
+        ]
+        form = " ".join(texts).removeprefix("+ ")
+        found.append((f"({form})" if len(parts) > 1 else form, size))
+    return found
+
+
+def _across(seen: Tensor) -> Tensor:
+    return torch.eye(seen.shape[1], dtype=torch.float64) - torch.linalg.pinv(seen) @ seen
 
 
 def blind(config: Any, velocities: int) -> Tensor | None:
@@ -88,4 +107,4 @@ def blind(config: Any, velocities: int) -> Tensor | None:
         rows += [[float(i == j) for j in range(len(column))] for i in at] if lone else [column]
     seen = torch.tensor(rows, dtype=torch.float64)
     seen = torch.cat([seen, seen.new_zeros(len(seen), velocities)], 1)
-    return torch.eye(seen.shape[1], dtype=torch.float64) - torch.linalg.pinv(seen) @ seen
+    return _across(seen)

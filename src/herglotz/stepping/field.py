@@ -28,7 +28,7 @@ class FieldOf:
     def __init__(self, potential: Potential):
         self.stiffness, self.tilt = potential.stiffness, potential.tilt
         self.angles, self.all_angles = potential.angles, all(potential.angles)
-        network = potential.network
+        network, self.across = potential.network, potential.across
         self.features, self.more = potential.features, potential.more
         self.sweep = None
         if network is not None:
@@ -36,6 +36,18 @@ class FieldOf:
 
     def __call__(self, q: Tensor) -> Field:
         """At q, (..., n)."""
+        V, slope = self._own(q) if self.across is None else self._own(q @ self.across)  # nothing sees more of q
+        slope = slope if self.across is None else slope @ self.across
+        if self.features is not None:
+            more, bend = self.features.value_and_slope(q)
+            V, slope = V + more, slope + bend
+        if self.more:
+            more, bend = value_and_slope(self.more, q)
+            V, slope = V + more, slope + bend
+        return Field(V, slope)
+
+    def _own(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Springs and network."""
         k, b = self.stiffness, self.tilt
         x = trigonometry(q, self.angles)
         rise = numbers(q.dtype, q.device)[1] - x.c  # 1 − cos q, or q²/2
@@ -43,14 +55,8 @@ class FieldOf:
             rise = torch.where(torch.tensor(self.angles, device=q.device), rise, q * q / 2)
         V = rise @ k + x.s @ b
         slope = torch.addcmul(x.s * k, x.ds, b)
-        if self.features is not None:
-            more, bend = self.features.value_and_slope(q)
-            V, slope = V + more, slope + bend
-        if self.more:
-            more, bend = value_and_slope(self.more, q)
-            V, slope = V + more, slope + bend
         if self.sweep is None:
-            return Field(V, slope)
+            return V, slope
         value, g, _ = self.sweep(torch.cat([x.s, x.c], -1))
         n = q.shape[-1]
-        return Field(V + value, torch.addcmul(torch.addcmul(slope, g[..., :n], x.ds), g[..., n:], x.minus_sin))
+        return V + value, torch.addcmul(torch.addcmul(slope, g[..., :n], x.ds), g[..., n:], x.minus_sin)

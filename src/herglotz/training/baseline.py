@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -14,6 +14,7 @@ from herglotz.data.trajectories import GAP
 from herglotz.data.windows import Triples
 from herglotz.errors import InputError
 from herglotz.least_squares import least_squares
+from herglotz.models.translations import projection
 from herglotz.training.problems.robust import FREEDOM, root_weights, scale_of
 
 ROUNDS = 10  # iterations of re-weighting for Student's t
@@ -103,6 +104,16 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
         input_map=tuple(x[2 * n + 1 : 2 * n + 1 + n * m]),
         start=start,
     )
+
+
+def across_translations(base: Baseline, data: Trajectories, translations: Sequence[str], **how: bool) -> Baseline:
+    """The springs and the rate of what translations leave alone: a drift along them would hide both."""
+    P = projection(translations, data.angles)
+    if P is None:
+        return base
+    P = P + torch.diag((P == 0).all(1).to(P.dtype))  # an angle that is translated has no spring whatever its start
+    own = estimate_baseline(replace(data, q=data.q @ P.to(data.q)), **how)
+    return replace(base, stiffness=own.stiffness, tilt=own.tilt, rate=own.rate)
 
 
 def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:

@@ -11,11 +11,9 @@ steps are halved while that changes the motion by as much as the data miss it.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from functools import cached_property
+from dataclasses import replace
 
 import torch
-from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
@@ -24,7 +22,8 @@ from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.linear_terms import best_start
+from herglotz.training.found_terms import Found
+from herglotz.training.linear_terms import linear_starts
 from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
@@ -46,7 +45,6 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
-COLOURED = 3.0  # standard deviations of white noise's autocorrelation
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
@@ -55,38 +53,6 @@ FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
-
-
-@dataclass(frozen=True)
-class Found:
-    """A model of named terms with its fit."""
-
-    terms: NamedTerms
-    config: FitConfig
-    values: dict
-    base: Baseline
-    fit: TrajectoryFit
-    whole: bool  # every trajectory is one segment
-    spread: float  # of q, RMS
-
-    @property
-    def rms(self) -> float:
-        """Misfit of the data, in units of q."""
-        return self.fit.noise
-
-    @cached_property
-    def held_out(self) -> Tensor:
-        """RMS over held-out blocks of time, (FOLDS,)."""
-        return self.fit.held_out_errors()
-
-    @property
-    def coloured(self) -> bool:
-        """Whether the misfit goes on from sample to sample, by its autocorrelation: white noise has 0 ± 1/√N."""
-        problem = self.fit.problem
-        r = problem.misfit(self.fit.path)[problem.grid.sample.argsort()]
-        together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
-        with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
-        return float(with_next) > COLOURED / r.numel() ** 0.5
 
 
 class DictionarySearch:
@@ -134,7 +100,7 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._last_terms(self._pruned(found))
+        return self._one_rate(self._last_terms(self._pruned(found)))
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
@@ -142,10 +108,27 @@ class DictionarySearch:
         if local is None:
             return None
         start = smoothed(self.data, local)
-        linear = best_start(self.data, self.base, (self.all, *chains(self.data)), local)
-        found = None if linear is None else self._grown(linear.terms, linear.values, 1, start)
+        linear = linear_starts(self.data, self.base, (self.all, *chains(self.data)), local)
+        found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         found = found or self._grown(*self._bare(), 1, start)
-        return None if found is None else self._finer(self._held(self._simpler(found)))
+        if found is None:
+            return None
+        found = self._finer(self._held(self._simpler(found)))
+        for simple in linear[1:]:
+            if found.coloured:
+                break  # of residuals that are no noise likelihoods tell nothing
+            other = self._grown(simple.terms, simple.values, 1, start)
+            other = None if other is None else self._finer(self._held(other))
+            if other is not None and self._as_likely(other, found):
+                return other
+        return found
+
+    def _as_likely(self, less: Found, found: Found) -> bool:
+        """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
+        count, fewer = self.data.q.numel(), len(found.terms.names) - len(less.terms.names)
+        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
+        missed = max(less.rms, self.floor) / max(found.rms, self.floor)
+        return longer and count * math.log(missed) < fewer * math.log(count) / 2
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""
@@ -300,6 +283,18 @@ class DictionarySearch:
                 break
             found = less
         return found
+
+    def _one_rate(self, found: Found) -> Found:
+        """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""
+        terms, count = found.terms, self.data.q.numel()
+        if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
+            return found
+        less = self._refit(found, replace(terms, one_rate=True))
+        if less is None:
+            return found
+        fewer = len(found.fit.theta) - len(less.fit.theta)
+        worth = (1 + fewer * math.log(count) / count) ** 0.5 * max(found.rms, self.floor)
+        return less if less.rms <= worth or (found.coloured and self._as_good(less, found)) else found
 
     def _as_good(self, less: Found, found: Found) -> bool:
         """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""

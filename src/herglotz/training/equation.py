@@ -22,6 +22,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
+from herglotz.models.translations import across_in_words
 
 
 class Run(Protocol):
@@ -125,7 +126,7 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
             deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
-    terms[:0] = _kinetic(run)
+    terms[:0] = [*_kinetic(run), *_relative_springs(run)]
     data = run.data
     labels = (*zip(data.names, data.units, strict=True), *(data.input_labels if run.model.inputs else ()))
     units = [f"{name} in {unit}" for name, unit in labels if unit not in ("", "1")]
@@ -158,6 +159,17 @@ def _kinetic(run: Run) -> list[Term]:
         for j in n[i:]
         if (value := float(mass[i, j]) * (0.5 if i == j else 1.0)) != 0.0
     ]
+
+
+def _relative_springs(run: Run) -> list[Term]:
+    """−½ k (Pq)² − b (Pq) of a model with translations, whose baseline acts on the projected position."""
+    V, sums = run.model.potential, {}
+    forms = [] if V.across is None else across_in_words(V.across, run.data.names)
+    for (x, w), angle, k, b in zip(forms, V.angles, V.stiffness.tolist(), V.tilt.tolist(), strict=False):
+        both = ((f"cos {x}", k), (f"sin {x}", -b)) if angle else ((f"{x}²", -k * w**2 / 2), (x, -b * w))
+        for what, value in both if x else ():
+            sums[what] = sums.get(what, 0.0) + value
+    return [Term("L", what, value, None, "") for what, value in sums.items() if value]
 
 
 def _newtonian(model: ContactLagrangian) -> bool:

@@ -30,17 +30,19 @@ class LinearStart(NamedTuple):
     error: float  # J⁻¹R, RMS over the triples, in units of q
 
 
-def best_start(
+def linear_starts(
     data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials
-) -> LinearStart | None:
-    """The start with fewest terms whose error the best one does not undercut by more than a twentieth.
+) -> list[LinearStart]:
+    """The start with fewest terms whose error the best one does not undercut by more than a 20th, and simpler ones.
 
-    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing.
+    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind
+    the first have fewer terms than it, the fewest first: their errors may be noise, which whole trajectories tell.
     """
     tried = [start for terms in families if (start := LinearTerms(data, base, terms).start(local)) is not None]
+    tried.sort(key=lambda start: len(start.terms.names))
     least = min((start.error for start in tried), default=math.inf)
-    fair = [start for start in tried if start.error <= MARGIN * least]
-    return min(fair, key=lambda start: len(start.terms.names), default=None)
+    fair = next((i for i, start in enumerate(tried) if start.error <= MARGIN * least), 0)
+    return [*tried[fair : fair + 1], *tried[:fair]]
 
 
 class LinearTerms:

@@ -12,7 +12,7 @@ from herglotz.data.roughness import roughness
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
 from herglotz.models import ContactLagrangian
-from herglotz.training.baseline import Baseline, estimate_baseline, outliers_pull
+from herglotz.training.baseline import Baseline, across_translations, estimate_baseline, outliers_pull
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.dry_friction import friction_holds
@@ -35,6 +35,7 @@ from herglotz.training.trajectory_fit import check_size
 
 PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
 FINE = 0.1  # rad
+SURE = 1e-6  # of the spread: exact data are left to named terms that miss whole trajectories by less
 EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
 
 
@@ -95,6 +96,7 @@ def look(
     settings = settings if plan is None else plan.applied(settings)
     settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
+    base = across_translations(base, kept, settings.translations, outliers=outliers)
     task = Task(kept, base, settings, stages)
     terms = _Terms(settings, plan.started(base)) if plan is not None else _terms(task, user_settings, outliers, named)
     task = replace(task, base=terms.base, config=terms.settings)
@@ -139,21 +141,24 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
 def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) -> _Terms:
     """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
     kept, base, settings, stages = task.data, task.base, task.config, task.stages
-    terms = _Terms(settings, base)
+    terms, larger = _Terms(settings, base), False
     if structure_is_free(kept, user_settings):
         of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)
-        terms = _Terms(of.config, of.base, of.reason)
+        terms, larger = _Terms(of.config, of.base, of.reason), of.larger
     elif settings.features:
         terms = _Terms(settings, start_of_features(kept, base, settings))
     terms = replace(terms, motion=_baseline_motion(replace(task, base=terms.base, config=terms.settings)))
     exact = bool(terms.settings.features) and terms.settings.objective == "residual"
-    told = not named or exact or not terms_are_free(kept, user_settings)
-    at_one_step = not (_fine(terms.base) or kept.irregular)  # a network may learn what the rule misses at this step
-    if told or (terms.motion is not None and at_one_step):
+    if not named or (exact and larger) or not terms_are_free(kept, user_settings):
         return terms
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
     first, plain = base, replace(settings, sticking=settings.sticking or user_settings.sticking)
     found = kept_structure("terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages)
+    at_one_step = not (_fine(terms.base) or kept.irregular)  # a network may learn what the rule misses at this step
+    if exact or (terms.motion is not None and at_one_step):
+        spread = float((kept.q - kept.q.mean(0)).square().mean().sqrt())
+        if found.sigma is None or found.sigma > SURE * spread:
+            return terms
     terms = replace(terms, structure=found.reason, found=found)
     return terms if found.sigma is None else replace(terms, settings=found.config, base=found.base, motion=None)
 

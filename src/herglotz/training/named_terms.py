@@ -27,6 +27,7 @@ class NamedTerms:
     features: tuple[str, ...] = ()
     drag: tuple[str, ...] = ()
     dry: bool = False
+    one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -37,7 +38,7 @@ class NamedTerms:
         """Those of them that are among `names`."""
         return NamedTerms(
             tuple(x for x in self.features if x in names), tuple(x for x in self.drag if x in names),
-            self.dry and DRY in names,
+            self.dry and DRY in names, self.one_rate,
         )  # fmt: skip
 
 
@@ -97,12 +98,13 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
     """The settings of a model that is made of these terms."""
     driven = data.u is not None and config.use_inputs
-    forced = bool(terms.drag) or terms.dry or driven or data.dof > 1
+    forced = bool(terms.drag) or terms.dry or driven or (data.dof > 1 and not terms.one_rate)
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
     order = order if still or data.dof > 1 else 2  # of a potential: without one it would add a spring
+    joints = data.dof > 1 and not lengths
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
-        diagonal=lengths and data.dof > 1, coupled=not lengths and data.dof > 1, order=order, substeps=substeps,
+        diagonal=lengths and data.dof > 1, coupled=forced and joints, order=order, substeps=substeps,
         objective="trajectory", alike=data.dof == 1,  # the potential holds features alone
     )  # fmt: skip
 
@@ -115,7 +117,7 @@ def started(
         name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")
     }
     rate = float(rest.pop("damping.rate", (0.0,))[0])
-    if data.dof == 1:  # its viscous friction is the rate, which the rule of order 4 knows
+    if data.dof == 1 or of.level == "linear":  # viscous friction of the first mass, 1, is the rate
         rate += float(rest.pop("friction.viscous", (0.0,))[0])
     moving = [name for name in of.features if "v" in name]
     still = [name for name in of.features if "v" not in name]

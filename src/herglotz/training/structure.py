@@ -63,6 +63,7 @@ class Structure(NamedTuple):
     reason: str  # in words and numbers
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     doubt: bool = False  # another model may fit better: held-out free runs decide
+    larger: bool = False  # features that the search for terms does not try are needed
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
@@ -102,12 +103,12 @@ def kept_structure(
     def search() -> dict[str, Any]:
         found = find()
         start = {name: getattr(found.base, name) for name in numbers}
-        rest = {"reason": found.reason, "sigma": found.sigma, "doubt": found.doubt}
+        rest = {"reason": found.reason, "sigma": found.sigma, "doubt": found.doubt, "larger": found.larger}
         return {"config": found.config.to_dict(), "base": start, **rest}
 
     kept = stages.keep(name, search)
     found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
-    return Structure(found, replace(base, **kept["base"]), kept["reason"], kept["sigma"], kept["doubt"])
+    return Structure(found, replace(base, **kept["base"]), kept["reason"], kept["sigma"], kept["doubt"], kept["larger"])
 
 
 def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
@@ -166,7 +167,17 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
     if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * size):
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
-    return Structure(replace(rich, objective=objective), found, f"{words}: exact")
+    larger = joints or _needs_distances(fit, x, names)
+    return Structure(replace(rich, objective=objective), found, f"{words}: exact", larger=larger)
+
+
+def _needs_distances(fit: LinearFit, x: Tensor, names: tuple[str, ...]) -> bool:
+    """Whether bodies without angles are missed without powers of r, which the search for terms does not try."""
+    still = iter([name for name in names if "v" not in name])
+    columns = _columns(fit, [False] * fit.R.shape[1])
+    columns &= torch.tensor([name != POTENTIAL or not next(still).startswith("r") for name in fit.names])
+    with_r, without = (float(fit.errors(y).square().mean().sqrt()) for y in (x, fit.solve(columns)))
+    return without > MISSED * with_r
 
 
 def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:

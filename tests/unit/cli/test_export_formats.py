@@ -41,6 +41,20 @@ def test_verify_and_compare_with_the_run(tiny_onnx, tiny_run, monkeypatch, capsy
     assert "is no file" in capsys.readouterr().err
 
 
+def test_other_weights_do_not_agree_however_close_the_motion(tiny_run, monkeypatch):
+    # fails if motions alone are compared: a weight that is off by less than their bound is another model
+    close = {**dict.fromkeys("qpsc", 0.0), "status": 0, "failed": 0, "per_batch": {}}
+    run = load_run(tiny_run)
+    said = {"dtype": "float64", "level": run.model.config.level, "dof": 1, "model": run.model.config.to_dict()}
+    file = SimpleNamespace(dtype=torch.float64, metadata=said)
+    for same in (True, False, None):  # None: the file says nothing of its weights
+        monkeypatch.setattr("herglotz.export.compare", lambda *_, same=same, **__: {**close, "same_weights": same})
+        agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
+        assert agreement["passed"] is (same is not False)
+    said["level"] = "forced"
+    assert _agreement(file, Namespace(against=tiny_run, h=None, seed=0))["passed"] is False  # rows would be left out
+
+
 @pytest.mark.parametrize("differing", [0, 1])
 def test_a_step_that_fails_in_one_of_both_is_no_agreement(differing, tiny_run, monkeypatch):
     # fails if a file agrees with its run whose steps fail where those of the run do not: failed ones have no numbers

@@ -39,6 +39,7 @@ CASES = {  # what is imposed, and what is found in the model: weights are random
     "q1 + q2": ({"level": "linear", "correction_width": 6}, "translation of q1 and q2 together"),
     "q1 - 0.5 q2": ({"level": "linear", "features": ("(2q2 + q1)^2",)}, "translation along (1, -0.5)"),
     "q2": ({"level": "linear", "angles": (False, True)}, "translation along q2"),
+    "q1 - q2": ({"level": "linear", "potential_width": 5}, "translation along (-1, 1)"),  # steps in closed form
 }
 
 
@@ -53,6 +54,19 @@ def test_what_is_imposed_is_found(text):
     assert float(found.drift.max()) < 1e-11
     free = symmetries(model(**{**settings, "features": ()}), states(2), 0.1, steps=25, angles=angles)
     assert len(free) == 0  # the same random weights without it
+
+
+def test_springs_act_on_what_is_left():
+    # fails if the springs of moved coordinates are thrown away (a network would have to make them), or beside features
+    made = ContactLagrangian(config(level="linear", translations=("q1 + q2",), potential_width=0))
+    q = torch.tensor([[1.0, -0.4]], dtype=F64)
+    x = 0.7  # (q1 − q2)/2: k = 0.4 and b = 0.2 act on x and on −x
+    V = made.potential(q, 1)
+    assert float(V.value) == pytest.approx(0.4 * x * x)
+    assert V.gradient[:, 0].tolist() == pytest.approx([0.4 * x, -0.4 * x])
+    assert not [name for name, _ in made.named_parameters() if name.startswith("potential")]  # sizes of the masses
+    named = ContactLagrangian(config(level="linear", translations=("q1 + q2",), features=("(q1 - q2)^2",)))
+    assert float(named.potential.stiffness.abs().max()) == 0.0
 
 
 def test_damping_does_not_see_it_either():

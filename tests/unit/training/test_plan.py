@@ -43,7 +43,8 @@ def test_the_drawing_in_the_docs_is_the_code():
 @pytest.mark.parametrize(
     ("noise", "settings", "number", "objective"),
     [
-        (0.0, {}, 5, "residual"),
+        (0.0, {}, 3, "trajectory"),
+        (0.0, {"level": "linear"}, 5, "residual"),
         (0.01, {}, 3, "trajectory"),
         (0.0, {"sticking": True}, 2, "trajectory"),
         (0.01, {"objective": "smoothing"}, 1, "smoothing"),

@@ -178,12 +178,11 @@ class Emitted(NamedTuple):
     """What of a header depends on the model."""
 
     tables: str
-    scalars: str  # types and functions for one sample
-    lanes: str  # the same for a register of samples
+    step: str  # types and functions of `REAL` and `FN_`
     slopes: str  # the derivative of a step
 
 
-def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: bool) -> Emitted:
+def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emitted:
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program = Program(tables=step.program.tables)
     q = program.given("q", step.n)
@@ -200,8 +199,7 @@ def model_source(step: StepInC, equations: Equations, lanes: bool, derivatives: 
         f"static const hz_real {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
         for row, name in step.program.tables.items()
     )
-    wide = texts.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
-    return Emitted(tables, as_scalars(texts), wide if lanes else "", as_scalars(slopes))
+    return Emitted(tables, texts, slopes)
 
 
 TYPES = """
@@ -225,8 +223,13 @@ typedef struct {{
 
 
 def as_scalars(text: str) -> str:
-    """An emitted text for one sample."""
+    """A text of `REAL` and `FN_` for one sample."""
     return text.replace("SPREAD(", "(").replace("FN_", "hz_").replace("REAL", "hz_real")
+
+
+def as_lanes(text: str) -> str:
+    """The same for a register of samples."""
+    return text.replace("SPREAD(", "hz_spread(").replace("FN_", "hz_wide_").replace("REAL", "hz_lanes")
 
 
 def _slopes_source(equations: Equations, step: StepInC) -> str:

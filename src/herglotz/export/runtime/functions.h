@@ -80,7 +80,11 @@ typedef hz_real hz_lanes __attribute__((vector_size(hz_LANE_BYTES), may_alias));
 typedef hz_real hz_part __attribute__((vector_size(hz_LANE_BYTES), aligned(sizeof(hz_real)), may_alias));
 typedef hz_signed_t hz_masks __attribute__((vector_size(hz_LANE_BYTES)));
 typedef int hz_counts __attribute__((vector_size(hz_LANE_BYTES / sizeof(hz_real) * sizeof(int))));
-enum { hz_LANES = (int)(hz_LANE_BYTES / sizeof(hz_real)) };
+enum { hz_LANES = (int)(hz_LANE_BYTES / sizeof(hz_real)), hz_wide_WIDTH = hz_LANES };
+#define hz_wide_LANE(x, w) (x)[w]
+typedef struct {
+  hz_lanes q[hz_N], p[hz_N], s, sigma;
+} hz_wide_state;
 
 static inline hz_lanes hz_spread(hz_real x) {
   hz_lanes y = {hz_R(0.0)};

@@ -22,81 +22,24 @@ static void store(const hz_state *x, long at, hz_real *q_out, hz_real *p_out, hz
   sigma_out[at] = x->sigma;
 }
 
-#ifdef hz_BATCHED
-/* The samples b .. b + LANES of herglotz_rollouts. */
-static void lanes(long b, long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s,
-    const hz_real *h, long h_sample, long h_step, const hz_real *u, long u_sample, hz_real *q_out, hz_real *p_out,
-    hz_real *s_out, hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
-  hz_wide_state x;
-  hz_wide_track track;
-  hz_state one;
-  hz_real now[hz_LANES], left[hz_LANES];
-  const hz_real *push[hz_LANES];
-  int status[hz_LANES], w, count = batch - b < hz_LANES ? (int)(batch - b) : hz_LANES;
-  long k;
-  for (w = 0; w < hz_LANES; w++) {
-    load(q, p, s, w < count ? b + w : batch - 1, &one);
-    hz_wide_set(&x, w, &one);
-    status[w] = hz_CONVERGED;
-  }
-  hz_wide_track_start(&x, &track);
-  for (k = 0; k <= steps; k++) {
-    int before[hz_LANES];
-    for (w = 0; w < hz_LANES; w++) {
-      const long sample = w < count ? b + w : batch - 1;
-      before[w] = status[w];
-      if (k > 0) now[w] = h[sample * h_sample + (k - 1) * h_step];
-      push[w] = u && k > 0 ? u + sample * u_sample + (k - 1) * hz_M : 0;
-    }
-    (void)push;
-    if (k > 0) hz_wide_advance(&x, &track, now, hz_WITH_U(push) status, left);
-    for (w = 0; w < count; w++) {
-      if (before[w]) continue;
-      if (k > 0) {
-        status_out[(b + w) * steps + k - 1] = (unsigned char)status[w];
-        residual_out[(b + w) * steps + k - 1] = left[w];
-      }
-      if (status[w]) continue;
-      hz_wide_get(&x, w, &one);
-      store(&one, (b + w) * (steps + 1) + k, q_out, p_out, s_out, sigma_out);
-    }
-  }
-}
-#endif
-
-/* Rollouts of `batch` samples; outputs are (batch, steps + 1, ...), statuses and residuals (batch, steps). The outputs
-   arrive full of NaN and the statuses full of hz_DIVERGED: nothing is written after a failure but its own status. */
+/* Rollouts of `batch` samples; outputs are (batch, steps + 1, ...), statuses and residuals (batch, steps). The statuses
+   arrive full of hz_DIVERGED: nothing is written after a failure but its own status. */
 void herglotz_rollouts(long batch, long steps, const hz_real *q, const hz_real *p, const hz_real *s, const hz_real *h,
     long h_sample, long h_step, const hz_real *u, long u_sample, hz_real *q_out, hz_real *p_out, hz_real *s_out,
     hz_real *sigma_out, unsigned char *status_out, hz_real *residual_out) {
-  long b, k;
+  const hz_job job = {steps, 1, h, h_sample, h_step, hz_WITH_U(u) hz_WITH_U(u_sample)
+                      q_out, p_out, s_out, sigma_out, residual_out, status_out};
+  hz_state x[hz_SIDE];
+  int status[hz_SIDE], w;
+  long b;
   (void)u;
   (void)u_sample;
-#ifdef hz_BATCHED
-  if (batch > 1) {
-    for (b = 0; b < batch; b += hz_LANES)
-      lanes(b, batch, steps, q, p, s, h, h_sample, h_step, u, u_sample, q_out, p_out, s_out, sigma_out, status_out,
-          residual_out);
-    return;
-  }
-#endif
-  for (b = 0; b < batch; b++) {
-    hz_state x;
-    hz_track track;
-    load(q, p, s, b, &x);
-    hz_track_start(&x, &track);
-    for (k = 0; k <= steps; k++) {
-      if (k > 0) {
-        const long step = b * steps + k - 1;
-        const hz_real now = h[b * h_sample + (k - 1) * h_step];
-        hz_real left = (hz_real)0.0;
-        const int status = hz_advance(&x, &track, now, hz_WITH_U(u ? u + b * u_sample + (k - 1) * hz_M : 0) &left);
-        status_out[step] = (unsigned char)status;
-        residual_out[step] = left;
-        if (status) break;
-      }
-      store(&x, b * (steps + 1) + k, q_out, p_out, s_out, sigma_out);
+  for (b = 0; b < batch;) {
+    for (w = 0; w < hz_SIDE && b + w < batch; w++) {
+      load(q, p, s, b + w, x + w);
+      status[w] = hz_CONVERGED;
     }
+    b += hz_run_some(x, b, batch, &job, status, 0);
   }
 }
 

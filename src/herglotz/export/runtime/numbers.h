@@ -1,4 +1,4 @@
-/* Numbers: finite or not by their bits, the largest of a few, sums that keep what rounding takes. */
+/* Numbers: finite or not by their bits. */
 
 #if hz_SINGLE
 typedef unsigned int hz_bits_t;
@@ -44,21 +44,6 @@ static inline int hz_all_finite(const hz_real x[hz_N]) {
   return good;
 }
 
-/* The largest |x_i|. */
-static inline hz_real hz_length(const hz_real x[hz_N]) {
-  hz_real size = hz_R(0.0);
-  int i;
-  for (i = 0; i < hz_N; i++) size = hz_fabs(x[i]) > size ? hz_fabs(x[i]) : size;
-  return size;
-}
-
-/* Zero where a number is so small that its square and its products are not normal numbers any more: a motion that has
-   come to rest would otherwise step many times slower. */
-static inline hz_real hz_flush(hz_real x) { return hz_fabs(x) < hz_R(hz_TINY) ? hz_R(0.0) : x; }
-
-/* x + change, with what its rounding loses kept in `low` for the next time. */
-static inline hz_real hz_add(hz_real x, hz_real change, hz_real *low) {
-  const hz_real add = change + *low, sum = x + add, back = sum - x;
-  *low = (x - (sum - back)) + (add - back);
-  return hz_flush(sum);
-}
+/* Functions whose names begin so hold one sample; hz_wide_ ones a register of them. */
+#define hz_LANE(x, w) (x)
+enum { hz_WIDTH = 1 };

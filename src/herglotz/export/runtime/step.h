@@ -1,49 +1,80 @@
-/* One step of one sample: elimination, Newton with backtracking, the guess, and what a run carries along. */
+/* One step of FN_WIDTH samples side by side: elimination, Newton with backtracking, the guess, and what a run carries
+   along. REAL holds a number of each sample, FN_LANE is that of one of them. Samples do not influence one another. This
+   file is in a header twice: for one sample, and for a register of samples. */
 
-#if !hz_EXPLICIT
-/* J and its factors: rows exchanged by partial pivoting. */
+/* What a run of steps carries along: V(q) and what depends on h alone, both in P; what rounding took from q, p, s and
+   sigma in the additions so far; and, for the guess, the last moves. */
 typedef struct {
-  hz_real lu[hz_N][hz_N];
-  int row[hz_N];
-} hz_factors;
+  FN_problem P;
+  REAL low_q[hz_N], low_p[hz_N], low_s, low_sigma;
+#if !hz_EXPLICIT
+  REAL move[3][hz_N];
+  hz_real miss[2][FN_WIDTH];
+  int known[FN_WIDTH];
+#endif
+} FN_track;
 
-/* 0, or hz_SINGULAR where a pivot is zero or not a number. */
-static inline int hz_factorise(const hz_real J[hz_N * hz_N], hz_factors *A) {
-#if hz_N == 1
-  A->lu[0][0] = J[0];
-  return hz_fabs(J[0]) > hz_R(0.0) ? hz_CONVERGED : hz_SINGULAR;
-#else
-  int i, j, k, best;
-  for (i = 0; i < hz_N; i++)
-    for (j = 0; j < hz_N; j++) A->lu[i][j] = J[i * hz_N + j];
-  for (k = 0; k < hz_N; k++) {
-    for (best = k, i = k + 1; i < hz_N; i++)
-      if (hz_fabs(A->lu[i][k]) > hz_fabs(A->lu[best][k])) best = i;
-    A->row[k] = best;
-    for (j = 0; j < hz_N; j++) {
-      const hz_real other = A->lu[best][j];
-      A->lu[best][j] = A->lu[k][j];
-      A->lu[k][j] = other;
-    }
-    if (!(hz_fabs(A->lu[k][k]) > hz_R(0.0))) return hz_SINGULAR;
-    for (i = k + 1; i < hz_N; i++) {
-      A->lu[i][k] /= A->lu[k][k];
-      for (j = k + 1; j < hz_N; j++) A->lu[i][j] -= A->lu[i][k] * A->lu[k][j];
-    }
+static inline void FN_track_start(const FN_state *state, FN_track *track) {
+  const REAL zero = SPREAD(hz_R(0.0));
+  int i;
+  FN_potential(state->q, &track->P.V0);
+  track->P.h = zero;
+  for (i = 0; i < hz_N; i++) track->low_q[i] = track->low_p[i] = zero;
+  track->low_s = track->low_sigma = zero;
+#if !hz_EXPLICIT
+  for (i = 0; i < hz_N; i++) track->move[0][i] = track->move[1][i] = track->move[2][i] = zero;
+  for (i = 0; i < FN_WIDTH; i++) {
+    track->known[i] = 0;
+    track->miss[0][i] = track->miss[1][i] = hz_R(0.0);
   }
-  return hz_CONVERGED;
 #endif
 }
 
+/* x + change, with what its rounding loses kept in `low` for the next time. Zero where the sum is so small that its
+   square and its products are not normal numbers any more: a motion that has come to rest would otherwise step many
+   times slower. */
+static inline REAL FN_add(REAL x, REAL change, REAL *low) {
+  const REAL add = change + *low, sum = x + add, back = sum - x;
+  *low = (x - (sum - back)) + (add - back);
+  return FN_choose(SPREAD(hz_R(hz_TINY)), FN_fabs(sum), SPREAD(hz_R(0.0)), sum);
+}
+
+#if !hz_EXPLICIT
+/* J and its factors. One sample exchanges rows by partial pivoting; several do not, and none converges where that
+   fails. */
+typedef struct {
+  REAL lu[hz_N][hz_N];
+  int row[hz_N];
+} FN_factors;
+
+static inline void FN_factorise(FN_factors *A) {
+  int i, j, k;
+  for (k = 0; k < hz_N; k++) {
+    if (FN_WIDTH == 1 && hz_N > 1) {
+      int best = k;
+      for (i = k + 1; i < hz_N; i++)
+        if (hz_fabs(FN_LANE(A->lu[i][k], 0)) > hz_fabs(FN_LANE(A->lu[best][k], 0))) best = i;
+      A->row[k] = best;
+      for (j = 0; j < hz_N; j++) {
+        const REAL other = A->lu[best][j];
+        A->lu[best][j] = A->lu[k][j];
+        A->lu[k][j] = other;
+      }
+    }
+    A->lu[k][k] = hz_R(1.0) / A->lu[k][k];
+    for (i = k + 1; i < hz_N; i++) {
+      A->lu[i][k] *= A->lu[k][k];
+      for (j = k + 1; j < hz_N; j++) A->lu[i][j] -= A->lu[i][k] * A->lu[k][j];
+    }
+  }
+}
+
 /* x = -J^-1 F. */
-static inline void hz_direction(const hz_factors *A, const hz_real F[hz_N], hz_real x[hz_N]) {
-#if hz_N == 1
-  x[0] = -F[0] / A->lu[0][0];
-#else
+static inline void FN_direction(const FN_factors *A, const REAL F[hz_N], REAL x[hz_N]) {
   int i, j;
   for (i = 0; i < hz_N; i++) x[i] = -F[i];
-  for (i = 0; i < hz_N; i++) {
-    const hz_real other = x[A->row[i]];
+  for (i = 0; FN_WIDTH == 1 && i < hz_N - 1; i++) {
+    const REAL other = x[A->row[i]];
     x[A->row[i]] = x[i];
     x[i] = other;
   }
@@ -51,128 +82,147 @@ static inline void hz_direction(const hz_factors *A, const hz_real F[hz_N], hz_r
     for (j = 0; j < i; j++) x[i] -= A->lu[i][j] * x[j];
   for (i = hz_N - 1; i >= 0; i--) {
     for (j = i + 1; j < hz_N; j++) x[i] -= A->lu[i][j] * x[j];
-    x[i] /= A->lu[i][i];
+    x[i] *= A->lu[i][i];
   }
-#endif
 }
 
-/* Solve F(q1) = 0 from the guess in t->move. A trial point close to the last one keeps J (its contraction is checked),
-   a move that does not lessen |F| is halved, and rounding ends the iteration. */
-static inline int hz_solve(const hz_problem *P, hz_terms *t, hz_real *residual) {
-  hz_factors A;
-  hz_terms trial;
-  hz_real delta[hz_N], next[hz_N], q1[hz_N], scale, merit, length = hz_R(1.0), size;
-  int i, iteration, exact = 1;
-  *residual = hz_R(0.0);
-  for (i = 0; i < hz_N; i++) t->rest[i] = trial.rest[i] = hz_R(0.0);
-  hz_evaluate(P, t);
-  merit = hz_length(t->F);
-  if (!hz_all_finite(t->F)) return hz_DIVERGED;
-  if (hz_factorise(t->J, &A)) return hz_SINGULAR;
-  hz_direction(&A, t->F, delta);
-  for (i = 0; i < hz_N; i++) q1[i] = P->q0[i] + t->move[i];
-  scale = hz_length(P->q0);
-  size = hz_length(q1);
-  scale = size > scale ? size : scale;
-  size = hz_length(delta);
-  scale = size > scale ? size : scale;
-  for (iteration = 0; iteration < hz_max_iterations; iteration++) {
-    hz_real trial_merit;
-    int kept;
-    *residual = size = hz_length(delta);
-    if (!hz_all_finite(delta)) return hz_SINGULAR;
-    if (size <= hz_tolerance * scale) {
-      for (i = 0; i < hz_N; i++) t->rest[i] = delta[i];
-      return hz_CONVERGED;
+/* The largest |x_i|. */
+static inline void FN_length(const REAL x[hz_N], hz_real size[FN_WIDTH]) {
+  int i, w;
+  for (w = 0; w < FN_WIDTH; w++) size[w] = hz_R(0.0);
+  for (i = 0; i < hz_N; i++)
+    for (w = 0; w < FN_WIDTH; w++) {
+      const hz_real one = hz_fabs(FN_LANE(x[i], w));
+      size[w] = one > size[w] ? one : size[w];
     }
-    kept = length == hz_R(1.0) && size <= hz_near * scale;
-    for (i = 0; i < hz_N; i++) trial.move[i] = t->move[i] + length * delta[i];
-    if (kept)
-      hz_evaluate_first(P, &trial);
-    else
-      hz_evaluate(P, &trial);
-    trial_merit = hz_length(trial.F);
-    if (hz_all_finite(trial.F) && trial_merit <= (hz_R(1.0) - hz_R(1e-4) * length) * merit) {
-      if (kept) {
-        hz_real trial_size;
-        hz_direction(&A, trial.F, next);
-        trial_size = hz_length(next);
-        if (trial_size > hz_R(0.1) * size && trial_size > hz_tolerance * scale) {
-          hz_evaluate(P, &trial);
-          kept = 0;
-        }
-      }
-      if (!kept) {
-        if (hz_factorise(trial.J, &A)) return hz_SINGULAR;
-        hz_direction(&A, trial.F, next);
-      }
-      *t = trial;
-      for (i = 0; i < hz_N; i++) delta[i] = next[i];
-      merit = trial_merit;
-      length = hz_R(1.0);
-      exact = !kept;
-    } else if (size <= hz_floor * (scale > P->h * hz_top_speed ? scale : P->h * hz_top_speed)) {
-      return hz_CONVERGED;
-    } else if (!exact) {
-      hz_evaluate(P, t);
-      if (hz_factorise(t->J, &A)) return hz_SINGULAR;
-      hz_direction(&A, t->F, delta);
-      exact = 1;
-    } else {
-      length /= hz_R(2.0);
-    }
-  }
-  *residual = hz_length(delta);
-  return *residual <= hz_tolerance * scale ? hz_CONVERGED : hz_MAX_ITERATIONS;
-}
-#endif
-
-/* What a run of steps carries along: V(q) and what depends on h alone, both in P; what rounding took from q, p, s and
-   sigma in the additions so far; and, for the guess, the last moves. */
-typedef struct {
-  hz_problem P;
-  hz_real low_q[hz_N], low_p[hz_N], low_s, low_sigma;
-#if !hz_EXPLICIT
-  hz_real move[3][hz_N], miss[2];
-  int known;
-#endif
-} hz_track;
-
-static inline void hz_track_start(const hz_state *state, hz_track *track) {
-  int i;
-  hz_potential(state->q, &track->P.V0);
-  track->P.h = hz_R(0.0);
-  for (i = 0; i < hz_N; i++) track->low_q[i] = track->low_p[i] = hz_R(0.0);
-  track->low_s = track->low_sigma = hz_R(0.0);
-#if !hz_EXPLICIT
-  for (i = 0; i < hz_N; i++) track->move[0][i] = track->move[1][i] = track->move[2][i] = hz_R(0.0);
-  track->known = 0;
-  track->miss[0] = track->miss[1] = hz_R(0.0);
-#endif
 }
 
-#if hz_INPUTS
-/* G (u - u0); no inputs where u is null. */
-static inline void hz_push(const hz_real *u, hz_real push[hz_N]) {
-  int i, j;
+/* Solve F(q1) = 0 from the guess in t->move, where the status is 0. A point close to the last one keeps J (its
+   contraction is checked), and rounding ends the iteration. A move that does not lessen |F| is taken back, to get J
+   where it was an old one, and else halved; of several samples side by side, one that needs this is not solved. */
+static inline void FN_solve(const FN_problem *P, FN_terms *t, int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
+  const int most = FN_WIDTH == 1 ? hz_max_iterations : 7;
+  FN_factors A, now;
+  REAL delta[hz_N], base[hz_N], taken[hz_N], q1[hz_N];
+  hz_real scale[FN_WIDTH], size[FN_WIDTH], merit[FN_WIDTH], before[FN_WIDTH], last[FN_WIDTH];
+  hz_real part[FN_WIDTH]; /* of the last move; 0 where any finite F is accepted */
+  int open[FN_WIDTH], renew[FN_WIDTH], old[FN_WIDTH], i, w, iteration, left = 0, second = 1;
   for (i = 0; i < hz_N; i++) {
-    push[i] = u ? hz_input_offset[i] : hz_R(0.0);
-    for (j = 0; u && j < hz_M; j++) push[i] += hz_input_map[i * hz_M + j] * u[j];
+    t->rest[i] = base[i] = taken[i] = SPREAD(hz_R(0.0));
+    A.row[i] = i;
+  }
+  for (i = 0; i < hz_N * hz_N; i++) A.lu[i / hz_N][i % hz_N] = SPREAD(hz_R(0.0));
+  for (w = 0; w < FN_WIDTH; w++) {
+    left += open[w] = status[w] == hz_CONVERGED;
+    scale[w] = last[w] = before[w] = part[w] = hz_R(0.0);
+    renew[w] = 1;
+    old[w] = 0;
+  }
+  FN_evaluate(P, t);
+  for (iteration = 0; left; iteration++) {
+    if (second) {
+      for (i = 0; i < hz_N * hz_N; i++) now.lu[i / hz_N][i % hz_N] = t->J[i];
+      FN_factorise(&now);
+      for (i = 0; i < hz_N * hz_N; i++)
+        for (w = 0; w < FN_WIDTH; w++)
+          if (renew[w]) FN_LANE(A.lu[i / hz_N][i % hz_N], w) = FN_LANE(now.lu[i / hz_N][i % hz_N], w);
+      for (i = 0; FN_WIDTH == 1 && i < hz_N; i++) A.row[i] = now.row[i];
+    }
+    FN_direction(&A, t->F, delta);
+    FN_length(delta, size);
+    FN_length(t->F, merit);
+    if (iteration == 0) {
+      hz_real other[FN_WIDTH];
+      for (i = 0; i < hz_N; i++) q1[i] = P->q0[i] + t->move[i];
+      FN_length(P->q0, scale);
+      FN_length(q1, other);
+      for (w = 0; w < FN_WIDTH; w++) {
+        scale[w] = other[w] > scale[w] ? other[w] : scale[w];
+        scale[w] = size[w] > scale[w] ? size[w] : scale[w];
+      }
+    }
+    for (second = 0, w = 0; w < FN_WIDTH; w++) {
+      const hz_real fastest = FN_LANE(P->h, w) * hz_top_speed;
+      const hz_real rounding = hz_floor * (scale[w] > fastest ? scale[w] : fastest);
+      int finite = 1, better;
+      if (!open[w]) continue;
+      for (i = 0; FN_WIDTH == 1 && i < hz_N; i++) finite &= hz_finite(FN_LANE(t->F[i], w));
+      better = finite && (part[w] == hz_R(0.0) || merit[w] <= (hz_R(1.0) - hz_R(1e-4) * part[w]) * before[w]);
+      if (better) residual[w] = size[w];
+      for (i = 0; better && FN_WIDTH == 1 && i < hz_N; i++) finite &= hz_finite(FN_LANE(delta[i], w));
+      if (!finite && (better || iteration == 0)) {
+        status[w] = better ? hz_SINGULAR : hz_DIVERGED;
+        open[w] = 0;
+      } else if (finite && (size[w] <= hz_tolerance * scale[w] ||
+                               (!better && last[w] <= rounding && size[w] <= rounding))) {
+        for (i = 0; i < hz_N; i++) FN_LANE(t->rest[i], w) = FN_LANE(delta[i], w);
+        open[w] = 0;
+      } else if (better && part[w] == hz_R(0.0) && iteration > 0 && last[w] <= rounding) {
+        open[w] = 0; /* back from a move that rounding decided */
+      } else if (better) {
+        old[w] = !renew[w];
+        renew[w] = size[w] > hz_near * scale[w] || (iteration > 0 && size[w] > hz_R(0.1) * last[w]);
+        part[w] = hz_R(1.0);
+        last[w] = size[w];
+        before[w] = merit[w];
+        for (i = 0; i < hz_N; i++) {
+          if (FN_WIDTH == 1) base[i] = t->move[i];
+          if (FN_WIDTH == 1) taken[i] = delta[i];
+          FN_LANE(t->move[i], w) += FN_LANE(delta[i], w);
+        }
+      } else if (FN_WIDTH > 1) {
+        status[w] = hz_MAX_ITERATIONS;
+        open[w] = 0;
+      } else {
+        part[w] = old[w] || last[w] <= rounding ? hz_R(0.0) : part[w] / hz_R(2.0);
+        for (i = 0; i < hz_N; i++) FN_LANE(t->move[i], w) = FN_LANE(base[i], w) + part[w] * FN_LANE(taken[i], w);
+        renew[w] = 1;
+        old[w] = 0;
+      }
+      if (open[w] && iteration == most) status[w] = hz_MAX_ITERATIONS;
+      left -= !open[w];
+      second |= open[w] && renew[w];
+    }
+    if (iteration == most) return;
+    if (second)
+      FN_evaluate(P, t);
+    else if (left)
+      FN_evaluate_first(P, t);
   }
 }
-#define hz_TAKES_U const hz_real *u,
-#define hz_WITH_U(argument) argument,
-#else
-#define hz_TAKES_U
-#define hz_WITH_U(argument)
+
+/* The solution from the better of two guesses: t->move arrives as the step without what couples q1, and the other is
+   the cubic through the last four positions. */
+static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
+  REAL guess[2][hz_N];
+  int i, w;
+  for (i = 0; i < hz_N; i++) {
+    guess[0][i] = t->move[i];
+    guess[1][i] = hz_R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
+    for (w = 0; w < FN_WIDTH; w++)
+      if (!hz_STICKING && track->known[w] >= 3 && track->miss[1][w] < track->miss[0][w])
+        FN_LANE(t->move[i], w) = FN_LANE(guess[1][i], w);
+  }
+  FN_solve(&track->P, t, status, residual);
+  for (i = 0; i < hz_N; i++) {
+    track->move[2][i] = track->move[1][i];
+    track->move[1][i] = track->move[0][i];
+    track->move[0][i] = t->move[i] + t->rest[i];
+    guess[0][i] -= t->move[i];
+    guess[1][i] -= t->move[i];
+  }
+  FN_length(guess[0], track->miss[0]);
+  FN_length(guess[1], track->miss[1]);
+  for (w = 0; w < FN_WIDTH; w++) track->known[w] = status[w] ? 0 : track->known[w] + (track->known[w] < 3);
+}
 #endif
 
 /* The move of what Newton has solved for: the move itself or, where dry friction can hold a coordinate, a number z of
    which the move is what lies beyond the bound. */
-static inline hz_real hz_moved(const hz_problem *P, int i, hz_real z) {
+static inline REAL FN_moved(const FN_problem *P, int i, REAL z) {
 #if hz_STICKING
-  const hz_real below = z > P->bound[i] ? P->bound[i] : z;
-  return z - (-P->bound[i] > below ? -P->bound[i] : below);
+  const REAL below = FN_choose(z, P->bound[i], P->bound[i], z);
+  return z - FN_choose(-P->bound[i], below, -P->bound[i], below);
 #else
   (void)P;
   (void)i;
@@ -180,87 +230,108 @@ static inline hz_real hz_moved(const hz_problem *P, int i, hz_real z) {
 #endif
 }
 
-#if !hz_EXPLICIT
-/* The solution from the better of two guesses: t->move arrives as the step without what couples q1, and the other is
-   the cubic through the last four positions. */
-static inline int hz_solve_from_guess(hz_track *track, hz_terms *t, hz_real *residual) {
-  hz_real guess[2][hz_N], miss;
-  int i, j, better, status;
+/* Sample w of several, and back. */
+static inline void FN_get(const FN_state *x, int w, hz_state *one) {
+  int i;
+  (void)w;
   for (i = 0; i < hz_N; i++) {
-    guess[0][i] = t->move[i];
-    guess[1][i] = hz_R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
+    one->q[i] = FN_LANE(x->q[i], w);
+    one->p[i] = FN_LANE(x->p[i], w);
   }
-  better = !hz_STICKING && track->known >= 3 && track->miss[1] < track->miss[0];
-  for (i = 0; i < hz_N; i++) t->move[i] = guess[better][i];
-  status = hz_solve(&track->P, t, residual);
-  if (status) return status;
-  for (j = 0; j < 2; j++) {
-    for (track->miss[j] = hz_R(0.0), i = 0; i < hz_N; i++) {
-      miss = hz_fabs(t->move[i] - guess[j][i]);
-      if (miss > track->miss[j]) track->miss[j] = miss;
+  one->s = FN_LANE(x->s, w);
+  one->sigma = FN_LANE(x->sigma, w);
+}
+
+static inline void FN_set(FN_state *x, int w, const hz_state *one) {
+  int i;
+  (void)w;
+  for (i = 0; i < hz_N; i++) {
+    FN_LANE(x->q[i], w) = one->q[i];
+    FN_LANE(x->p[i], w) = one->p[i];
+  }
+  FN_LANE(x->s, w) = one->s;
+  FN_LANE(x->sigma, w) = one->sigma;
+}
+
+/* One step of every sample whose status is 0; one that fails gets its status and keeps its state. What several samples
+   side by side cannot solve is solved alone. */
+static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_WIDTH],
+    hz_WITH_U(const hz_real *const u[FN_WIDTH]) int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
+  FN_problem *P = &track->P;
+  FN_terms t;
+  FN_potential_t V1;
+  const REAL sigma = state->sigma;
+  REAL x[hz_N], q1[hz_N], low[hz_N], dp[hz_N], ds, E, sum = SPREAD(hz_R(0.0));
+  int failed[FN_WIDTH], i, w, again = 0, left = 0, changed = 0;
+  for (w = 0; w < FN_WIDTH; w++) {
+    left += status[w] == hz_CONVERGED;
+    failed[w] = status[w];
+    residual[w] = hz_R(0.0);
+    if (h[w] != FN_LANE(P->h, w)) {
+      FN_LANE(P->h, w) = h[w];
+      changed = 1;
+#if !hz_EXPLICIT
+      track->known[w] = 0;
+#endif
     }
   }
-  for (i = 0; i < hz_N; i++) {
-    track->move[2][i] = track->move[1][i];
-    track->move[1][i] = track->move[0][i];
-    track->move[0][i] = t->move[i] + t->rest[i];
-  }
-  if (track->known < 3) track->known++;
-  return status;
-}
-#endif
-
-/* One step of a run: hz_step without its checks of the input, faster by what `track` carries. Start the track again
-   whenever anything but this function has changed the state. */
-static inline int hz_advance(hz_state *state, hz_track *track, hz_real h, hz_TAKES_U hz_real *residual) {
-  hz_problem *P = &track->P;
-  hz_terms t;
-  hz_potential_t V1;
-  hz_real x[hz_N], q1[hz_N], low[hz_N], dp[hz_N], ds, E, sum = hz_R(0.0);
-  int i;
+  if (!left) return;
+  if (changed) FN_prepare(P);
   for (i = 0; i < hz_N; i++) {
     P->q0[i] = state->q[i];
     P->p0[i] = state->p[i];
   }
   P->s0 = state->s;
 #if hz_INPUTS
-  hz_push(u, P->push);
-#endif
-  *residual = hz_R(0.0);
-  if (h != P->h) {
-    P->h = h;
-    hz_prepare(P);
-#if !hz_EXPLICIT
-    track->known = 0;
-#endif
+  for (w = 0; w < FN_WIDTH; w++) {
+    hz_real push[hz_N];
+    hz_push(u[w], push);
+    for (i = 0; i < hz_N; i++) FN_LANE(P->push[i], w) = push[i];
   }
-  hz_begin(P, t.move);
+#endif
+  FN_begin(P, t.move);
 #if hz_EXPLICIT
   for (i = 0; i < hz_N; i++) x[i] = t.move[i];
 #else
-  {
-    const int status = hz_solve_from_guess(track, &t, residual);
-    if (status) return status;
-  }
+  FN_solve_from_guess(track, &t, failed, residual);
   for (i = 0; i < hz_N; i++) x[i] = track->move[0][i];
 #endif
   for (i = 0; i < hz_N; i++) {
     low[i] = track->low_q[i];
-    q1[i] = hz_add(P->q0[i], hz_moved(P, i, x[i]), &low[i]);
+    q1[i] = FN_add(P->q0[i], FN_moved(P, i, x[i]), &low[i]);
   }
-  hz_potential(q1, &V1);
-  hz_gains(P, &t, x, &V1, dp, &ds, &E);
+  FN_potential(q1, &V1);
+  FN_gains(P, &t, x, &V1, dp, &ds, &E);
   for (i = 0; i < hz_N; i++) sum += (P->p0[i] + dp[i]) + q1[i]; /* what is not finite stays so in a sum */
-  sum += (P->s0 + ds) + (state->sigma + E * state->sigma);
-  if (!hz_finite(sum)) return hz_DIVERGED;
-  if (!(hz_R(1.0) + E > hz_R(0.0))) return hz_SINGULAR;
+  sum += (P->s0 + ds) + (sigma + E * sigma);
   for (i = 0; i < hz_N; i++) {
     state->q[i] = q1[i];
     track->low_q[i] = low[i];
-    state->p[i] = hz_add(P->p0[i], dp[i], &track->low_p[i]);
+    state->p[i] = FN_add(P->p0[i], dp[i], &track->low_p[i]);
   }
-  state->s = hz_add(P->s0, ds, &track->low_s);
-  state->sigma = hz_add(state->sigma, E * state->sigma, &track->low_sigma);
+  state->s = FN_add(P->s0, ds, &track->low_s);
+  state->sigma = FN_add(sigma, E * sigma, &track->low_sigma);
+  for (w = 0; w < FN_WIDTH; w++) {
+    hz_state one;
+    if (!failed[w] && !hz_finite(FN_LANE(sum, w))) failed[w] = hz_DIVERGED;
+    if (!failed[w] && !(hz_R(1.0) + FN_LANE(E, w) > hz_R(0.0))) failed[w] = hz_SINGULAR;
+    if (!failed[w]) continue;
+    again = 1;
+    for (i = 0; i < hz_N; i++) {
+      one.q[i] = FN_LANE(P->q0[i], w);
+      one.p[i] = FN_LANE(P->p0[i], w);
+      FN_LANE(track->low_q[i], w) = FN_LANE(track->low_p[i], w) = hz_R(0.0);
+    }
+    one.s = FN_LANE(P->s0, w);
+    one.sigma = FN_LANE(sigma, w);
+    FN_LANE(track->low_s, w) = FN_LANE(track->low_sigma, w) = hz_R(0.0);
+#if !hz_EXPLICIT
+    track->known[w] = 0;
+#endif
+    if (FN_WIDTH == 1) status[w] = failed[w];
+    else if (status[w] == hz_CONVERGED) status[w] = hz_alone(&one, h[w], hz_WITH_U(u[w]) &residual[w]);
+    FN_set(state, w, &one);
+  }
+  if (again) FN_potential(state->q, &V1);
   P->V0 = V1;
-  return hz_CONVERGED;
 }
