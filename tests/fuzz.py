@@ -8,12 +8,13 @@ data files have none, and what loads of them counts as tried. uncaught: any othe
 from __future__ import annotations
 
 import argparse
+import os
 import random
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -138,9 +139,9 @@ def fuzz(
     counts = {}
     for kind in kinds(folder, only, exports):
         content, make, count = kind.path.read_bytes(), random.Random(f"{seed} {kind.name}"), Count()
-        kind.open(kind.path)  # the good file loads
         end = time.monotonic() + seconds
-        with watched(count):
+        with watched(count), open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
+            kind.open(kind.path)  # the good file loads
             while count.tried < least or time.monotonic() < end:
                 try_one(kind, content, make, count)
         kind.path.write_bytes(content)

@@ -166,7 +166,7 @@ MUTANTS = [
     ("verify/data_checks.py", "FOLLOW = 0.1", "FOLLOW = 10.0"),
     ("cli/verify.py", 'result["status"] == 0 and', ""),
     ("data/spikes.py", "torch.maximum(LOCAL * local, NOISE * noise)", "NOISE * noise"),
-    ("export/runtime/step.h", "if (hz_fabs(A->lu[i][k]) > hz_fabs", "if (hz_fabs(A->lu[i][k]) < hz_fabs"),
+    ("export/runtime/step.h", "if (hz_fabs(FN_LANE(A->lu[i][k], 0)) > hz_fabs", "if (hz_fabs(FN_LANE(A->lu[i][k], 0)) < hz_fabs"),
     ("export/runtime/api.h", "!hz_all_finite(q0) || hz_BAD_U(u)) return", "!hz_all_finite(q0)) return"),
     # issue of theory: symmetries, translations and explicit time
     ("theory/symmetries.py", 'for k in range(1, steps):', 'for k in range(2, steps):'),
@@ -267,4 +267,7 @@ MUTANTS = [
     ("data/waves.py", 'if max(frequencies) > fastest:', 'if max(frequencies) > 0.1 * fastest:'),
     ("data/waves.py", 'for x in frequencies for wave in ("cos", "sin")', 'for x in frequencies for wave in ("sin", "cos")'),
     ("data/waves.py", 'not torch.allclose(data.u, u)', 'False'),
+    ("export/differences.py", 'zip(WEIGHTS, ahead - behind, strict=True)', 'zip(WEIGHTS, ahead, strict=True)'),
+    ("export/differences.py", '(columns / offset[..., None]).mT', 'columns / offset[..., None]'),
+    ("export/differences.py", 'torch.diag_embed(k * offset', 'torch.diag_embed(offset'),
 ]  # fmt: skip

@@ -101,7 +101,7 @@ def process_group() -> Iterator[None]:
     Raises
     ------
     RuntimeError
-        If one of them does not answer for 60 seconds.
+        If one of them ends, or does not answer for 60 seconds.
     """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield
@@ -111,11 +111,14 @@ def process_group() -> Iterator[None]:
     try:
         yield
     except RuntimeError as error:
-        if "timed out" not in str(error).lower():
+        words = str(error).lower()
+        if "timed out" in words:
+            what = f"has not answered for {limit.total_seconds():g} s: it was stopped, or is slower than that "
+            what += "(HERGLOTZ_TIMEOUT sets the seconds)"
+        elif "by peer" in words:  # gloo: the connection was closed or reset
+            what = "has ended: it was killed, or an error of its own ended it"
+        else:
             raise
-        raise RuntimeError(
-            f"a process of torchrun has not answered for {limit.total_seconds():g} s: it was stopped or killed, or is "
-            "slower than that (HERGLOTZ_TIMEOUT sets the seconds); start again with resume"
-        ) from error
+        raise RuntimeError(f"a process of torchrun {what}; start again with resume") from error
     finally:
         dist.destroy_process_group()
