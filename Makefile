@@ -48,8 +48,10 @@ QUICK := tests/unit/*.py tests/unit/data tests/unit/mechanics tests/unit/models 
 check: lint
 	$(ENV) $(PY) -m pytest -q $(SPREAD) $(QUICK)
 
-test: lint
-	$(ENV) $(PY) -m pytest -q $(SPREAD)
+# The types are checked beside the first tests: alone they would leave a core idle for most of a minute.
+test: .venv/installed
+	$(PY) -m ruff check .
+	$(PY) -m pyright & types=$$!; $(ENV) $(PY) -m pytest -q $(SPREAD); tests=$$?; wait $$types && exit $$tests
 
 # Other instructions, threads, versions and roundings: eight times as long as `make test`, folder by folder; it can be
 # stopped and goes on where it was.

@@ -13,7 +13,8 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
-from herglotz.training import fit
+from herglotz.training import FitConfig, fit
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.solvers.lifted_newton import linear_recurrence
@@ -40,12 +41,14 @@ def test_a_search_begins_with_as_few_samples_as_tell_the_motion(monkeypatch):
     data, begun = simulate(scene("duffing"), trajectories=1, steps=1500, h=0.02, noise=1e-5, seed=0), []
     begin = DictionarySearch._begun
     monkeypatch.setattr(DictionarySearch, "_begun", lambda self: begun.append(self.data.samples) or begin(self))
-    run = fit(data, train_fraction=1.0, progress=False)
+    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
+    assert found is not None
     assert begun
     assert max(begun) < 600
-    assert set(run.metrics["plan"]["features"]) == {"q1^2", "q1^4"}
-    assert run.metrics["train_rms"] == pytest.approx(1e-5, rel=0.1)
-    assert run.h == pytest.approx(0.02)
+    assert set(found.terms.names) == {"q1^2", "q1^4"}
+    assert found.rms == pytest.approx(1e-5, rel=0.1)
+    assert len(found.fit.states()) == 1501
+    assert found.config.substeps == 1
 
 
 def test_the_equation_is_printed_with_deviations(duffing):
