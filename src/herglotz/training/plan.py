@@ -164,9 +164,13 @@ def in_words(name: str, value: Any, unit: str = "") -> str:
     if name == "forces":
         return ", ".join(FORCES[force] for force, on in value.items() if on) or "masses and viscous friction alone"
     if isinstance(value, tuple):
-        return ", ".join(f"{x:g}" if isinstance(x, float) else str(x) for x in value) or "none"
-    if value is None:
-        return "to be measured"
+        return ", ".join(_plainly(x) for x in value) or "none"
+    return size(value, unit) if name == "sigma" and value is not None else _plainly(value)
+
+
+def _plainly(value: Any) -> str:
+    if isinstance(value, float):
+        return f"{value:g}"
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return size(value, unit) if name == "sigma" else str(value)
+    return "to be measured" if value is None else str(value)
