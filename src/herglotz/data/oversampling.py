@@ -8,7 +8,7 @@ import torch
 
 from herglotz.data.trajectories import Trajectories
 
-THINNINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)
+THINNINGS = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # tried until one misses too much
 SMOOTH = 1e-3  # of the spread: what samples left out may miss by; a sine then has 14 samples a period
 ENOUGH = 500  # samples that stay
 
