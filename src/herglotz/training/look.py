@@ -151,6 +151,12 @@ def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) ->
     exact = bool(terms.settings.features) and terms.settings.objective == "residual"
     if not named or (exact and larger) or not terms_are_free(kept, user_settings):
         return terms
+    return _searched(task, user_settings, terms, outliers, exact)
+
+
+def _searched(task: Task, user_settings: FitConfig, terms: _Terms, outliers: bool, exact: bool) -> _Terms:
+    """Named terms that follow whole trajectories, or `terms` where these explain exact data and the others miss them."""
+    kept, base, settings, stages = task.data, task.base, task.config, task.stages
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
     first, plain = base, replace(settings, sticking=settings.sticking or user_settings.sticking)
     found = kept_structure("terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages)

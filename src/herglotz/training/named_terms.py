@@ -119,17 +119,21 @@ def started(
     rate = float(rest.pop("damping.rate", (0.0,))[0])
     if data.dof == 1 or of.level == "linear":  # viscous friction of the first mass, 1, is the rate
         rate += float(rest.pop("friction.viscous", (0.0,))[0])
-    moving = [name for name in of.features if "v" in name]
-    still = [name for name in of.features if "v" not in name]
-    for parameter, names in ((STILL, still), (MOVING, moving), (DRAG, of.drag)):
-        rest[parameter] = tuple(float(values.get(name, 0.0)) for name in names)  # type: ignore[arg-type]
-    zero, known = (0.0,) * data.dof, _parameters(of, bool(moving))
+    rest |= _coefficients(values, of)
+    zero, known = (0.0,) * data.dof, _parameters(of, any("v" in name for name in of.features))
     rest = {own: x for name, x in rest.items() if x and (own := known(name))}
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
     assert isinstance(stiffness, tuple)
     assert isinstance(tilt, tuple)
     step = base.max_step if of.substeps == 1 else JITTER * data.typical_step / of.substeps
     return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
+
+
+def _coefficients(values: Mapping[str, float | tuple[float, ...]], of: FitConfig) -> dict[str, tuple[float, ...]]:
+    """Those of the terms of a model of these settings, by the parameter that holds them."""
+    still, moving = [x for x in of.features if "v" not in x], [x for x in of.features if "v" in x]
+    kinds = ((STILL, still), (MOVING, moving), (DRAG, of.drag))
+    return {parameter: tuple(float(values.get(x, 0.0)) for x in names) for parameter, names in kinds}  # type: ignore[arg-type]
 
 
 def _parameters(of: FitConfig, moving: bool):
