@@ -155,7 +155,7 @@ def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) ->
 
 
 def _searched(task: Task, user_settings: FitConfig, terms: _Terms, outliers: bool, exact: bool) -> _Terms:
-    """Named terms that follow whole trajectories, or `terms` where these explain exact data and the others miss them."""
+    """Named terms that follow whole trajectories, or `terms` where these explain exact data and those do not."""
     kept, base, settings, stages = task.data, task.base, task.config, task.stages
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
     first, plain = base, replace(settings, sticking=settings.sticking or user_settings.sticking)
