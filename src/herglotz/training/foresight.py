@@ -157,10 +157,8 @@ class _Ahead:
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
         out = continued(model, x, grid.h, grid_inputs(model, rest, grid))
-        if out is None:
-            return None
-        known[at[grid.sample]] = out.flatten(0, 1)[grid.node]
-        return known
+        known[at[grid.sample]] = out.flatten(0, 1)[grid.node]  # not what pads the shorter runs
+        return known if bool(torch.isfinite(known).all()) else None
 
 
 def _turn(data: Trajectories, states: Tensor) -> float:

@@ -74,8 +74,8 @@ def near_data(
     return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
 
 
-def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor | None:
-    """The free runs from `start`, (S, 2n+1), (S, K+1, 2n+1); None where a step fails.
+def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
+    """The free runs from `start`, (S, 2n+1), (S, K+1, 2n+1); NaN from a failed step of a run on.
 
     Blocks of steps are solved at once from straight lines: a block that converges doubles the next one, and after one
     that does not a single step is taken. A few batched evaluations stand for each step's own.
@@ -100,8 +100,6 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
             new = at_once(slice(k, k + block)) if block > 1 else None
             block = max(2, block // 4) if new is None else 2 * block
             new = stepped(slice(k, k + 1)) if new is None else new
-            if not bool(torch.isfinite(new).all()):
-                return None
             x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
     return x
 

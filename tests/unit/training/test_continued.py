@@ -31,17 +31,21 @@ def test_runs_continued_in_blocks_are_those_of_single_steps(name):
             model.get_parameter("friction.input_map").fill_(1.0)
         x = continued(model, start, h, u)
         out = Stepper(model).rollout(start[:, :1], start[:, 1:2], start[:, 2], h=h, inputs=u)
-    assert x is not None
     still = (out.q[:, 1:] == out.q[:, :-1]).any()
     assert bool(still) == held  # friction holds for a while
     torch.testing.assert_close(x[..., :1], out.q, rtol=0, atol=1e-11)
     torch.testing.assert_close(x[..., 1:2], out.p, rtol=0, atol=1e-11)
 
 
-def test_a_run_that_fails_is_none():  # fails if NaN is handed on
+def test_a_run_that_fails_leaves_the_others_alone():
+    # fails if a run that breaks off takes the ones beside it with it, or goes on as if nothing had been
     model = ContactLagrangian(ModelConfig(potential_width=0, rate=0.1))
-    start, h = torch.full((1, 3), 1e200, dtype=torch.float64), torch.full((1, 9), 1e200, dtype=torch.float64)
-    assert continued(model, start, h, None) is None
+    good = torch.tensor([0.8, 0.3, 0.0], dtype=torch.float64)
+    start, h = torch.stack([good, torch.full_like(good, 1e200)]), torch.full((2, 9), 0.05, dtype=torch.float64)
+    h[1] = 1e200
+    x = continued(model, start, h, None)
+    assert bool(x[1, -1].isnan().all())
+    torch.testing.assert_close(x[0], continued(model, start[:1], h[:1], None)[0], rtol=0, atol=1e-11)
 
 
 @pytest.fixture

@@ -51,6 +51,21 @@ def test_a_search_begins_with_as_few_samples_as_tell_the_motion(monkeypatch):
     assert found.config.substeps == 1
 
 
+@pytest.mark.parametrize(
+    ("rms", "length", "taken"), [(1.0, 300, True), (1.02, 300, True), (1.1, 300, False), (1.0, 150, False)]
+)
+def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
+    # fails if what a term is worth, ½ log N, has another sign or size, or shorter segments count as whole trajectories:
+    # 900 samples, 8 terms less: misfits may grow by a factor of exp(27.2 / 900) = 1.031
+    def found(names, rms, length):
+        fit = SimpleNamespace(problem=SimpleNamespace(grid=SimpleNamespace(length=length)))
+        return SimpleNamespace(terms=SimpleNamespace(names=names), rms=rms, fit=fit)
+
+    search = SimpleNamespace(data=SimpleNamespace(q=torch.zeros(450, 2)), floor=0.0)
+    rich, simple = found("abcdefghi", 1.0, 300), found("a", rms, length)
+    assert DictionarySearch._as_likely(search, simple, rich) is taken  # pyright: ignore
+
+
 def test_the_equation_is_printed_with_deviations(duffing):
     # fails if a sign, a factor of a derivative, a unit or a covariance is wrong: 4 deviations are 6e-5 of chance
     terms = {term.what: term for term in duffing.equation().terms}

@@ -79,7 +79,7 @@ def _swept(
             return None
         curvature = size / previous / previous if previous < math.inf else CURVED
         if size <= NEAR and 10 * curvature * size**2 <= tol:
-            return Path(x, A)
+            return Path(x, A)  # A is that of states off by at most NEAR
         previous = size
     return None
 
