@@ -282,15 +282,12 @@ class DictionarySearch:
         terms, count = found.terms, self.data.q.numel()
         if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
             return found
-        if (less := self._refit(found, replace(terms, one_rate=True))) is None:
+        less = self._refit(found, replace(terms, one_rate=True))
+        if less is None:
             return found
         fewer = (len(found.fit.theta) - len(less.fit.theta)) * math.log(count) / count
-        return (
-            less
-            if less.rms <= (1 + fewer) ** 0.5 * max(found.rms, self.floor)
-            or (found.coloured and self._as_good(less, found))
-            else found
-        )
+        likely = less.rms <= (1 + fewer) ** 0.5 * max(found.rms, self.floor)
+        return less if likely or (found.coloured and self._as_good(less, found)) else found
 
     def _as_good(self, less: Found, found: Found) -> bool:
         """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
