@@ -105,3 +105,19 @@ def test_terms_that_follow_better_than_the_dictionary_of_features_are_taken():
     run = fit(trajectories(of, of.train), progress=False)
     assert "|v1| v1" in run.metrics["plan"]["drag"]
     assert run.metrics["extrapolation_rms"] < 1e-4
+
+
+@pytest.mark.parametrize(("damping", "level"), [((0.2, 0.2), "linear"), ((0.05, 0.5), "forced")])
+def test_one_rate_where_frictions_say_no_more(damping, level):
+    # fails if masses that are damped alike keep frictions of their own, or others get one rate
+    K = torch.tensor([[2.0, -1.0], [-1.0, 2.0]], dtype=torch.float64)
+    zero, eye = torch.zeros_like(K), torch.eye(2, dtype=torch.float64)
+    A = torch.cat([torch.cat([zero, eye], 1), torch.cat([-K, -torch.diag(K.new_tensor(damping))], 1)])
+    t = 0.1 * torch.arange(200, dtype=torch.float64)
+    q = (torch.linalg.matrix_exp(A * t[:, None, None]) @ K.new_tensor([1.0, -0.3, 0.0, 0.5]))[:, :2]
+    q = q + 1e-3 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0), dtype=q.dtype)
+    data = Trajectories.of(t, q)
+    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
+    assert found is not None
+    assert found.config.level == level
+    assert found.rms < 1.2e-3
