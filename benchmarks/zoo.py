@@ -23,11 +23,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.harness import commit
 from benchmarks.zoo_systems.drawing import draw
-from benchmarks.zoo_systems.judging import Predictions, outcome, relative, score
 from benchmarks.zoo_systems.ours import fit_ours, plain
+from benchmarks.zoo_systems.peers import fit_sindy
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
-from benchmarks.zoo_systems.report import report, shares, shown
-from benchmarks.zoo_systems.sindy import fit_sindy
+from benchmarks.zoo_systems.report import Predictions, outcome, relative, report, score, shares, shown
 from benchmarks.zoo_systems.systems import ZooSystem
 from herglotz.data.files import write_atomically
 

@@ -13,10 +13,9 @@ from herglotz.models.action import ActionFlow
 from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
-from herglotz.models.coupling import CoupledFriction
 from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import kinetic_term
-from herglotz.models.friction import Friction
+from herglotz.models.friction import CoupledFriction, Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.order4 import Slope, missing
