@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from benchmarks.harness import table
 from benchmarks.zoo_systems.mechanisms import Array
 from benchmarks.zoo_systems.systems import ZooSystem
 
@@ -63,9 +64,7 @@ def shares(rows: Sequence[Row]) -> dict[str, float]:
 def report(rows: Sequence[Row], seed: int, limit: float) -> str:
     """Markdown."""
     commits = ", ".join(sorted({row["commit"] for row in rows}))
-    medians = {
-        name: statistics.median(_number(row[name]["score"]) for row in rows) for name in ("ours", "sindy", "known")
-    }
+    medians = {name: statistics.median(_number(row[name]["score"]) for row in rows) for name in METHODS}
     cpu = statistics.median(row["ours"]["cpu_s"] for row in rows)
     lines = [
         f"# The zoo: {len(rows)} systems drawn by seed {seed}",
@@ -77,26 +76,23 @@ def report(rows: Sequence[Row], seed: int, limit: float) -> str:
         "brackets: over the size of the motion. Known: the true equation with its numbers fitted. Time: of our fit,",
         "on one processor.",
         "",
-        "| share | " + " | ".join(shares(rows)) + " |",
-        "|---" * (len(shares(rows)) + 1) + "|",
-        f"| of {len(rows)} | " + " | ".join(f"{100 * x:.0f} %" for x in shares(rows).values()) + " |",
+        *table(("share", *shares(rows)), [(f"of {len(rows)}", *(f"{100 * x:.0f} %" for x in shares(rows).values()))]),
         "",
         "Medians: " + ", ".join(f"{name} {value:.3g}" for name, value in medians.items()) + f"; {cpu:.0f} s.",
         "",
-        "| | system | samples | outcome | ours | SINDy | known | time, s | what the fit said |",
-        "|---" * 9 + "|",
     ]
+    cells = []
     for row in rows:
         ours = row["ours"]
         how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
-        cells = [
+        cells.append([
             row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
             f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
             *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in METHODS),
             f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip().replace("|", "/"),
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join([*lines, ""])
+        ])  # fmt: skip
+    head = ("", "system", "samples", "outcome", "ours", "SINDy", "known", "time, s", "what the fit said")
+    return "\n".join([*lines, *table(head, cells), ""])
 
 
 def _number(score: float | None) -> float:

@@ -113,7 +113,6 @@ class ContactLagrangian(nn.Module):
             known_damping=type(self.damping) in (LinearDamping, AffineDamping, type(None)),
             correction=self.correction is not None,
             action_flow=self.action is not None,
-            position_features=self.potential.features is not None,
             friction=self.friction is not None,
             nonlinear_force=(self.friction is not None and not self.friction.linear)
             or self.drag is not None
