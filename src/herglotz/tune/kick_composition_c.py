@@ -148,9 +148,9 @@ class CompiledKicks:
         """K equal steps from (q, p, s) with shapes (B, 1), (B, 1), (B)."""
         if not abs(float(h) - self.h) <= 1e-6 * self.h:
             raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(h):g}")
-        run, (q, p, s, *rest) = self.prepared(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s), steps)
+        run, (q, p, s, sigma, status, left) = self.prepared(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s), steps)
         run()
-        return Rollout(q[..., None], p[..., None], s, *rest)
+        return Rollout(q[..., None], p[..., None], s, sigma, status, left)
 
     def prepared(self, start: State, steps: int) -> tuple[Callable[[], None], list[torch.Tensor]]:
         """The call of the loop in C with its arguments made beforehand, and the tensors that the loop writes."""
