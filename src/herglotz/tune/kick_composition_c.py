@@ -148,7 +148,8 @@ class CompiledKicks:
         """K equal steps from (q, p, s) with shapes (B, 1), (B, 1), (B)."""
         if not abs(float(h) - self.h) <= 1e-6 * self.h:
             raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(h):g}")
-        run, (q, p, s, sigma, status, left) = self.prepared(State(q, p, torch.zeros_like(q[..., 0]) if s is None else s), steps)
+        s = torch.zeros_like(q[..., 0]) if s is None else s
+        run, (q, p, s, sigma, status, left) = self.prepared(State(q, p, s), steps)
         run()
         return Rollout(q[..., None], p[..., None], s, sigma, status, left)
 
