@@ -12,7 +12,7 @@ from torch import Tensor
 from herglotz.export.differences import WEIGHTS, central_differences
 from herglotz.stepping import State
 from herglotz.verify.report import Check
-from herglotz.verify.sampled_rollout import SampledRollout, worst
+from herglotz.verify.sampled_rollout import SampledRollout, rounded, worst
 from herglotz.verify.subject import Subject
 
 # Offset of the differences of order 8, in units of each component's spread over the samples. float64: truncation and
@@ -23,6 +23,7 @@ OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 AGREES = {torch.float64: 1e-6, torch.float32: 1e-2}
 NARROW = 0.1  # of the offset: second differences, where the first do not agree
 COARSE = 0.01  # that these must agree with the wide ones to: a jump is seen by a wide stencil only
+VARIES = 1e4  # roundings of a component: a smaller spread is that of one value
 MOST = 4096  # steps in all: the points are drawn from all rollouts, 170 of one coordinate, 48 of ten
 
 
@@ -39,11 +40,12 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
     spread, keep = _spread(x), torch.randperm(len(x), generator=make)[: max(4, count)].to(x.device)
     x, D = x[keep], w.derivative[w.ok][keep]
     of_sample, sound = _errors(subject, x, D, spread, OFFSET[x.dtype])
-    bent = (of_sample > AGREES[x.dtype]).nonzero()[:, 0]
+    bound = max(AGREES[x.dtype], rounded(0.0, w) / OFFSET[x.dtype])
+    bent = (of_sample > bound).nonzero()[:, 0]
     if len(bent):
         narrow, fine = _errors(subject, x[bent], D[bent], spread, NARROW * OFFSET[x.dtype])
         narrow = torch.where(fine, torch.minimum(narrow, of_sample[bent]), of_sample[bent])
-        of_sample[bent] = torch.maximum(narrow, AGREES[x.dtype] / COARSE * of_sample[bent])
+        of_sample[bent] = torch.maximum(narrow, bound / COARSE * of_sample[bent])
     of_sample = of_sample[sound]
     left_out = int((~sound).sum())
     note = f"{left_out} of {len(x)} samples left out: a step beside them failed" if left_out else ""
@@ -52,7 +54,7 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
         claim = "autograd DΦ̃ is the derivative (median of differences)"
     else:
         value, claim = worst(of_sample), "autograd DΦ̃ is the derivative: central differences"
-    return Check.at_most("derivative", claim, value, AGREES[x.dtype], note)
+    return Check.at_most("derivative", claim, value, bound, note)
 
 
 def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> tuple[Tensor, Tensor]:
@@ -78,7 +80,7 @@ def _spread(x: Tensor) -> Tensor:
     if not len(x):
         return torch.ones_like(x[0:1].sum(0))
     spread, floor = x.std(0, correction=0), x.abs().amax(0)
-    spread = torch.where(spread > 1e-3 * floor, spread, floor)
+    spread = torch.where(spread > VARIES * torch.finfo(x.dtype).eps * floor, spread, floor)
     return torch.where(spread > 0, spread, 1.0)
 
 
