@@ -103,7 +103,8 @@ class Symmetries:
     def __str__(self) -> str:
         lines = [f"affine point symmetries: {len(self) or 'none'}"]
         for i, name in enumerate(self.names):
-            J = formula((self.A[i], self.b[i], self.a[i]), (self.k[i], self.w[i], self.B[i]), self.coordinates)
+            generator, boundary = (self.A[i], self.b[i], self.a[i]), (self.k[i], self.w[i], self.B[i])
+            J = formula(generator, boundary, self.coordinates, float(self.drift[i]))
             lines.append(f"  {name}: J = {J}, drift {float(self.drift[i]):.1e}")
         rest = self.spectrum[len(self) :]
         lines.append(f"  a symmetry keeps J_k = σ_k J_0 within {self.precision:.1e} of p·ξ")

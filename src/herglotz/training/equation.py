@@ -22,6 +22,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
+from herglotz.models.terms import Kinetic
 from herglotz.models.translations import across_in_words
 
 
@@ -148,10 +149,11 @@ def _lefts(run: Run) -> list[str]:
 
 
 def _kinetic(run: Run) -> list[Term]:
-    """½ vᵀ M v where L is printed as one function and M is constant; the first entry of M is 1."""
-    if _newtonian(run.model) or not run.model.capabilities.constant_mass or not run.model.config.baseline:
+    """½ vᵀ M v with the constant M that named products of speeds add to, where L is printed as one function."""
+    kinetic = getattr(run.model.kinetic, "base", run.model.kinetic)
+    if _newtonian(run.model) or not isinstance(kinetic, Kinetic) or not run.model.config.baseline:
         return []
-    mass, names = run.model.kinetic.mass().detach(), run.data.names  # type: ignore[operator]
+    mass, names = kinetic.mass().detach(), run.data.names
     n = range(len(names))
     return [
         Term("L", f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′", value, None, "")
@@ -296,7 +298,8 @@ def _named(text: str, names) -> str:
     """A feature's text with the names of the coordinates."""
     for i, name in reversed(list(enumerate(names, 1))):
         text = text.replace(f"1q{i}", f"q{i}").replace(f"q{i}", name).replace(f"v{i}", f"{name}′")
-    return text.replace("-", "−").replace("*", " ")
+    text = text.replace("-", "−").replace("*", " ")
+    return f"({text})" if " − " in text and "(" not in text else text  # x y′ − y x′ has one coefficient
 
 
 def _raised(base: str, power: int) -> str:

@@ -232,6 +232,9 @@ def test_what_is_printed():
     B = torch.tensor([[2.0, 0.3], [0.3, 0.0]], dtype=F64)
     J = formula((turn, zero, torch.tensor(2.0)), (torch.tensor(-4.0), torch.tensor([0.5, 0.0]), B), names)
     assert J == "x p_y − y p_x − 2 s − 0.5 x − x² − 0.3 x y + 4"
+    noisy = ((0 * one, one[0], torch.tensor(0.0)), (torch.tensor(0.0), torch.tensor([2e-3, -0.4]), 0 * one), names)
+    assert formula(*noisy) == "p_x − 0.002 x + 0.4 y"
+    assert formula(*noisy, drift=3e-4) == "p_x + 0.4 y"  # fails if terms below the drift of J are written
 
 
 @pytest.mark.parametrize(
