@@ -91,9 +91,8 @@ class Equation:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""
-        terms = [asdict(term) for term in self.terms]
         rest = {"lefts": list(self.lefts), "units": self.units, "network": self.network}
-        return {"text": str(self), "terms": terms, **rest}
+        return {"text": str(self), "terms": [asdict(term) for term in self.terms], **rest}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Equation:
@@ -154,11 +153,10 @@ def _kinetic(run: Run) -> list[Term]:
     if _newtonian(run.model) or not isinstance(kinetic, Kinetic) or not run.model.config.baseline:
         return []
     mass, names = kinetic.mass().detach(), run.data.names
-    n = range(len(names))
     return [
         Term("L", f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′", value, None, "")
-        for i in n
-        for j in n[i:]
+        for i in range(len(names))
+        for j in range(i, len(names))
         if (value := float(mass[i, j]) * (0.5 if i == j else 1.0)) != 0.0
     ]
 
@@ -194,10 +192,9 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
     texts = expand(config.features, config.angles)
     offset = 2 * n if config.order == 4 and not config.alike else 0
     still = [text for text in texts if not parse(text, config.angles)[0].velocities]
-    moving = [text for text in texts if text not in still]
     for g, text in enumerate(still):
         yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
-    for g, text in enumerate(moving):
+    for g, text in enumerate(text for text in texts if text not in still):
         yield "L", _named(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
 
 

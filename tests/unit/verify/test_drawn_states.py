@@ -70,6 +70,7 @@ def test_states_outside_L_d_are_left_out():
             "up to 12 coordinates the function fails",
         ),
         (lambda: verify(lambda q0, q1, s0, h: torch.log(-(q0 * q1).square()).sum(-1) + s0 * h, h=0.1), "no finite mom"),
+        (lambda: verify((pendulum, (1.0, 0.5, 0.0)), h=0.1), "q must be a tensor, got a float; one coordinate is q = "),
         (lambda: verify(hz.Stepper(pendulum), h=0.1), "a stepper alone has no states"),
         (
             lambda: hz.simulate(pendulum, trajectories=2, steps=5, h=0.1),  # pyright: ignore
