@@ -63,7 +63,7 @@ def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: floa
     sound = found.isfinite().all(-1).all(-1)
     scaled, error = D.abs() * spread, (D - found).abs() * spread
     error = error / scaled.amax((0, -1))[:, None] if len(scaled) else error
-    return torch.where(sound, error.flatten(1).amax(-1), 0.0), sound
+    return error.flatten(1).amax(-1), sound
 
 
 def _ends(subject: Subject, x: Tensor) -> Tensor:

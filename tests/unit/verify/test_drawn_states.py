@@ -69,7 +69,10 @@ def test_states_outside_L_d_are_left_out():
             lambda: verify(lambda q0, q1, s0, h: q0[..., 20] * q1[..., 0] + s0 * h, h=0.1),
             "up to 12 coordinates the function fails",
         ),
-        (lambda: verify(lambda q0, q1, s0, h: torch.log(-(q0 * q1).square()).sum(-1) + s0 * h, h=0.1), "no finite mom"),
+        (
+            lambda: verify(lambda q0, q1, s0, h: torch.log(-(q0 * q1).square()).sum(-1) + s0 * h, h=0.1),
+            "^L_d has no finite",
+        ),
         (lambda: verify((pendulum, (1.0, 0.5, 0.0)), h=0.1), "q must be a tensor, got a float; one coordinate is q = "),
         (lambda: verify(hz.Stepper(pendulum), h=0.1), "a stepper alone has no states"),
         (
