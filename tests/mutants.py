@@ -39,6 +39,7 @@ ROOMS = {  # room → where its tests are
     "mechanics": ["tests/unit/mechanics"],
     "theory": ["tests/unit/theory", "tests/verification"],
     "verify": ["tests/unit/verify", "tests/verification"],
+    "plots": ["tests/unit/plots", "tests/verification"],
     "scenes": ["tests/unit/scenes"],
     "models": ["tests/unit/models", "tests/contracts"],
     "stepping": ["tests/unit/stepping"],
