@@ -30,7 +30,7 @@ from typing import Any, NamedTuple
 import pytest
 import torch  # noqa: F401  loaded once, before the forks
 
-from mutant_list import MUTANTS
+from mutant_list import ALIKE, MUTANTS
 from mutant_operators import sample
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -46,6 +46,7 @@ ROOMS = {  # room → where its tests are
     "export": ["tests/unit/export"],
     "data": ["tests/unit/data"],
     "cli": ["tests/unit/cli"],
+    "tune": ["tests/unit/tune"],
 }
 SURVEY_SECONDS = 150  # of processor time for the sound run of a test file; tests beyond are not used
 MUTANT_SECONDS = 60  # of processor time for all tests of a mutant; what has not noticed by then, has not
@@ -312,7 +313,8 @@ def main() -> int:
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="at the same time (default: cores)")
     arguments = parser.parse_args()
     src, number = ROOT / "src" / "herglotz", arguments.sampled
-    drawn = [Mutant(*m) for room in ROOMS for m in sample(src, room, number, arguments.seed)]
+    alike = {same[:4] for same in ALIKE}
+    drawn = [Mutant(*m) for room in ROOMS for m in sample(src, room, number, arguments.seed, alike)]
     k, n = map(int, arguments.shard.split("/"))
     chosen = (written(arguments.only) + [m for m in drawn if arguments.only in m.name])[k - 1 :: n]
     KEPT.mkdir(parents=True, exist_ok=True)
