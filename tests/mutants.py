@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
+import inspect
 import json
 import os
 import resource
@@ -52,6 +53,7 @@ SURVEY_SECONDS = 150  # of processor time for the sound run of a test file; test
 MUTANT_SECONDS = 60  # of processor time for all tests of a mutant; what has not noticed by then, has not
 C_WRITER = "export/c_header.py"  # whose tests meet the mutants of the C runtime
 MOST_SECONDS = 900  # by the clock, for a child that blocks
+SHARED = ""  # the name of what the tests of a file share: its import, and fixtures that are set up once
 PATIENCE = 5  # a test that takes so many times what it took on the sound sources, and 10 s more, has noticed
 
 
@@ -108,18 +110,22 @@ def function_of(mutant: Mutant) -> int | None:
 
 
 class Survey:
-    """A pytest plugin: seconds of every passing test, and the functions of the package that it calls."""
+    """A pytest plugin: seconds of every passing test, and the functions of the package that it calls.
+
+    What is called while the file is imported or a wider fixture is set up, in whichever test, stands under `SHARED`.
+    """
 
     pipe: int
 
     def __init__(self, src: Path):
-        self.src, self.found, self.failed, self.spent = f"{src}/", {}, set(), time.process_time()
+        self.src, self.failed, self.spent = f"{src}/", set(), time.process_time()
         self.calls: set[tuple[str, int]] = set()
+        self.found: dict[str, dict[str, Any]] = {SHARED: {"seconds": 0.0, "calls": []}}
 
     def _tracer(self, frame: Any, *_: Any) -> None:
         code = frame.f_code
         if code.co_filename.startswith(self.src):
-            self.calls.add((code.co_filename, code.co_firstlineno))
+            self.calls.add((code.co_filename.removeprefix(self.src), code.co_firstlineno))
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
@@ -127,8 +133,28 @@ class Survey:
         sys.settrace(self._tracer)
         yield
         sys.settrace(None)
-        calls = sorted((name.removeprefix(self.src), line) for name, line in self.calls)
-        self.found[item.nodeid] = {"seconds": time.process_time() - start, "calls": calls}
+        self.found[item.nodeid] = {"seconds": time.process_time() - start, "calls": sorted(self.calls)}
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_collection(self) -> Iterator[None]:
+        sys.settrace(self._tracer)
+        yield from self._share()
+        sys.settrace(None)
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
+        if fixturedef.scope == "function":
+            yield
+        else:
+            yield from self._share()
+
+    def _share(self) -> Iterator[None]:
+        before, self.calls, start = self.calls, set(), time.process_time()
+        yield
+        shared = self.found[SHARED]
+        shared["calls"] = sorted({*shared["calls"], *self.calls})
+        shared["seconds"] += time.process_time() - start
+        self.calls |= before
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if not report.passed:
@@ -145,7 +171,7 @@ class Survey:
 
 
 class Killer:
-    """A pytest plugin: the first test that fails, or hangs; the cheapest test goes first."""
+    """A pytest plugin: the first test that fails, or hangs; the tests go in the order in which they are given."""
 
     pipe: int
 
@@ -175,7 +201,8 @@ class Killer:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        items.sort(key=lambda item: self.seconds.get(item.nodeid, 1e9))
+        first = {name: k for k, name in enumerate(self.seconds)}
+        items.sort(key=lambda item: first.get(item.nodeid, len(first)))
 
 
 def in_fork(tree: Path, plugin: Any, tests: list[str]) -> tuple[int, int]:
@@ -252,7 +279,7 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
     for path in [p for folder in folders for p in sorted((ROOT / folder).rglob("test_*.py"))]:
         name = str(path.relative_to(ROOT))
         kept = KEPT / f"survey-{name.replace('/', '-')}.json"
-        key = _digest(sources, path.read_text(encoding="utf-8"))
+        key = _digest(sources, inspect.getsource(Survey), path.read_text(encoding="utf-8"))
         before: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {"key": "", "tests": {}}
         if before["key"] == key:
             found[name] = before["tests"]
@@ -262,7 +289,7 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
             found[name] = answer or {}
             kept.write_text(json.dumps({"key": key, "tests": found[name]}))
             spent = sum(row["seconds"] for row in found[name].values())
-            print(f"sound     {name}: {len(found[name])} tests, {spent:.0f} s", flush=True)
+            print(f"sound     {name}: {max(0, len(found[name]) - 1)} tests, {spent:.0f} s", flush=True)
 
         workers.start(lambda tree, name=name: in_fork(tree, Survey(tree / "src" / "herglotz"), [name]), end)
     while workers.busy:
@@ -271,17 +298,28 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
 
 
 def tests_of(mutant: Mutant, found: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """The tests of the mutant's room that call its function, and what each costs, the cheapest first."""
+    """The tests of the mutant's room that call its function, and what each costs, the cheapest first.
+
+    Last come those of files whose tests share what it makes. The cost has what is shared: any test may pay for it.
+    """
     line, files, python = function_of(mutant), ROOMS[mutant.room], mutant.name.endswith(".py")
-    chosen: dict[str, float] = {}
+    chosen: list[tuple[bool, float, str, float]] = []
     for name, tests in found.items():
-        if not any(name.startswith(folder + "/") for folder in files):
+        if not tests or not any(name.startswith(folder + "/") for folder in files):
             continue
-        for test, row in tests.items():
-            called = [at for file, at in row["calls"] if file == (mutant.name if python else C_WRITER)]
-            if called if line is None else line in called:
-                chosen[test] = row["seconds"]
-    return dict(sorted(chosen.items(), key=lambda pair: pair[1]))
+        calling = {
+            test
+            for test, row in tests.items()
+            for file, at in row["calls"]
+            if file == (mutant.name if python else C_WRITER) and line in (None, at)
+        }
+        shared = tests[SHARED]["seconds"]
+        chosen += [
+            (test not in calling, row["seconds"], test, row["seconds"] + shared)
+            for test, row in tests.items()
+            if test != SHARED and (test in calling or SHARED in calling)
+        ]
+    return {test: most for *_, test, most in sorted(chosen)}
 
 
 def attempt(workers: Workers, mutant: Mutant, seconds: dict[str, float], end: Callable[[str | None], None]) -> None:
@@ -301,6 +339,15 @@ def attempt(workers: Workers, mutant: Mutant, seconds: dict[str, float], end: Ca
         end(None)
         return
     workers.start(begin, restore)
+
+
+def table(chosen: list[Mutant], survivors: list[Mutant]) -> str:
+    """Tried and killed, a line a room."""
+    lines = [f"{'room':<10} {'tried':>5} {'killed':>6} {'%':>4}"]
+    for room in (*sorted({m.room for m in chosen}), ""):
+        tried, alive = (sum(m.room == room or not room for m in each) for each in (chosen, survivors))
+        lines.append(f"{room or 'all':<10} {tried:>5} {tried - alive:>6} {100 * (tried - alive) / (tried or 1):>4.0f}")
+    return "\n".join(lines)
 
 
 def main() -> int:
@@ -344,7 +391,7 @@ def main() -> int:
                 attempt(workers, mutant, tests_of(mutant, found), end)
         while workers.busy:
             workers.wait()
-    print(f"{len(chosen) - len(survivors)} of {len(chosen)} mutants killed")
+    print(table(chosen, survivors))
     return 1 if survivors else 0
 
 
