@@ -1,9 +1,10 @@
 """Break the package on purpose, one place at a time, and see whether the tests of that room notice: `make mutants`.
 
-Two kinds of mutants: those of `mutant_list.py`, written by hand, and a sample of all that `mutant_operators.py` finds
-(`--sampled`). First the tests of the rooms run on the sound sources, which says what each test costs and which
-functions it calls; then each mutant, on a copy of the sources, meets the tests of its own room that call its function,
-the cheapest first, until one fails. All of it forks from one process that has torch loaded.
+Two kinds of mutants: those of `mutant_list.py`, written by hand, and a sample of all that `mutant_operators.py` finds,
+which fills every room up to `--least` mutants. First the tests of the rooms run on the sound sources, which says what
+each test costs and which functions it calls; then each mutant, on a copy of the sources, meets the tests of its own
+room that call its function, the cheapest first, until one fails. All of it forks from one process that has torch
+loaded.
 
 What was found is kept in `runs/mutants`: a run that was stopped goes on where it stopped, and only what changed since
 (the mutated file, a test file, for a survivor) is tried again. `--shard 2/4` takes every fourth mutant.
@@ -82,12 +83,19 @@ def _digest(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def written(only: str = "") -> list[Mutant]:
-    """The mutants of the list whose file has `only` in its name; one whose line is gone is an error of the list."""
+def everything(least: int, seed: int) -> list[Mutant]:
+    """The mutants of the list, and drawn ones of the rooms of which it has fewer than `least`."""
+    found, alike = written(), {same[:4] for same in ALIKE}
+    for room in ROOMS:
+        missing = max(0, least - sum(m.room == room for m in found))
+        found += [Mutant(*m) for m in sample(ROOT / "src" / "herglotz", room, missing, seed, alike)]
+    return found
+
+
+def written() -> list[Mutant]:
+    """The mutants of the list; one whose line is gone is an error of the list."""
     found = []
     for name, old, new in MUTANTS:
-        if only not in name:
-            continue
         at = source(name).find(old)
         if at < 0:
             raise SystemExit(f"{name}: no line with {old!r}; the list of mutants is out of date")
@@ -354,16 +362,20 @@ def main() -> int:
     """Run the mutants that are chosen and print a line each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="mutants whose file name contains this")
-    parser.add_argument("--sampled", type=int, default=0, metavar="N", help="beside the list, N drawn mutants a room")
+    parser.add_argument(
+        "--least",
+        type=int,
+        default=25,
+        metavar="N",
+        help="mutants a room; where the list has fewer, others are drawn (default: 25)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
     parser.add_argument("--shard", default="1/1", metavar="K/N", help="every N-th mutant, from the K-th")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="at the same time (default: cores)")
     arguments = parser.parse_args()
-    src, number = ROOT / "src" / "herglotz", arguments.sampled
-    alike = {same[:4] for same in ALIKE}
-    drawn = [Mutant(*m) for room in ROOMS for m in sample(src, room, number, arguments.seed, alike)]
+    chosen = [m for m in everything(arguments.least, arguments.seed) if arguments.only in m.name]
     k, n = map(int, arguments.shard.split("/"))
-    chosen = (written(arguments.only) + [m for m in drawn if arguments.only in m.name])[k - 1 :: n]
+    chosen = chosen[k - 1 :: n]
     KEPT.mkdir(parents=True, exist_ok=True)
     kept = KEPT / "killed.json"
     killed: dict[str, str] = json.loads(kept.read_text()) if kept.exists() else {}
