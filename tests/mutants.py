@@ -29,8 +29,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+# What takes a second to load is loaded once, before the forks.
+import hypothesis  # noqa: F401
+import matplotlib.pyplot  # noqa: F401
 import pytest
-import torch  # noqa: F401  loaded once, before the forks
+import torch
 
 from mutant_list import ALIKE, MUTANTS
 from mutant_operators import sample
@@ -51,7 +54,7 @@ ROOMS = {  # room → where its tests are
     "tune": ["tests/unit/tune"],
 }
 SURVEY_SECONDS = 150  # of processor time for the sound run of a test file; tests beyond are not used
-MUTANT_SECONDS = 60  # of processor time for all tests of a mutant; what has not noticed by then, has not
+MUTANT_SECONDS = 30  # of processor time for all tests of a mutant; what has not noticed by then, has not
 C_WRITER = "export/c_header.py"  # whose tests meet the mutants of the C runtime
 MOST_SECONDS = 900  # by the clock, for a child that blocks
 SHARED = ""  # the name of what the tests of a file share: its import, and fixtures that are set up once
@@ -379,6 +382,7 @@ def main() -> int:
     KEPT.mkdir(parents=True, exist_ok=True)
     kept = KEPT / "killed.json"
     killed: dict[str, str] = json.loads(kept.read_text()) if kept.exists() else {}
+    torch.func.jvp(torch.sin, (torch.ones(()),), (torch.ones(()),))  # the first one takes half a second
     survivors: list[Mutant] = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         workers = Workers(arguments.workers, Path(folder))

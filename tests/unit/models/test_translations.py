@@ -92,7 +92,7 @@ def test_damping_does_not_see_it_either():
         ({"translations": ("q1",), "known": ("q1^2",)}, "feature 'q1\\^2': changes under the translation"),
         ({"translations": ("q1",), "mass_width": 3}, "a mass that depends on position would see them"),
         ({"translations": ("q1",), "level": "full"}, "the level full would see them"),
-        ({"translations": ("q1",), "level": "forced", "drag": ("q1^2 v1",)}, "drag that depends on position"),
+        ({"translations": ("q1",), "level": "forced", "drag": ("v2", "q1^2 v1")}, "drag that depends on position"),
         ({"translations": ("q1",), "order": 4, "potential_width": 0, "features": ("q2^4",)}, "order 4 would see"),
     ],
 )
