@@ -89,10 +89,11 @@ def test_damping_does_not_see_it_either():
         ({"translations": ("q1 - q1",)}, "is no direction; name what moves together"),
         ({"translations": ("q1 + q2",), "angles": (True, False)}, "an angle is translated alone"),
         ({"translations": ("q1 + q2",), "features": ("r^-1",)}, "changes under the translation"),
+        ({"translations": ("q1 + q2", "q1 - q2"), "features": ("(q1 - q2)^2",)}, "changes under the translation"),
         ({"translations": ("q1",), "known": ("q1^2",)}, "feature 'q1\\^2': changes under the translation"),
         ({"translations": ("q1",), "mass_width": 3}, "a mass that depends on position would see them"),
         ({"translations": ("q1",), "level": "full"}, "the level full would see them"),
-        ({"translations": ("q1",), "level": "forced", "drag": ("v2", "q1^2 v1")}, "drag that depends on position"),
+        ({"translations": ("q1",), "level": "forced", "drag": ("q1^2 v1",)}, "drag that depends on position"),
         ({"translations": ("q1",), "order": 4, "potential_width": 0, "features": ("q2^4",)}, "order 4 would see"),
     ],
 )
