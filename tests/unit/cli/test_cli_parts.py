@@ -32,7 +32,7 @@ def test_an_internal_error_names_the_innermost_line():  # fails if another frame
     with pytest.raises(ZeroDivisionError) as caught:
         outer()
     line = inner.__code__.co_firstlineno + 1
-    assert f"ZeroDivisionError: two lines (test_parts.py:{line})" in _internal(caught.value, ["fit", "a b"])
+    assert f"ZeroDivisionError: two lines (test_cli_parts.py:{line})" in _internal(caught.value, ["fit", "a b"])
     assert "the command `herglotz fit 'a b'`" in _internal(caught.value, ["fit", "a b"])
 
 
