@@ -8,6 +8,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.equation import _baseline
 from herglotz.training.quantities import DIMENSIONS, _unit
 from herglotz.training.structure import dictionary, start_of_features
 from herglotz.training.task import drag_starts_the_fit
@@ -62,3 +63,20 @@ def test_features_beside_other_settings_do_not_start_the_fit(settings):
     free = start_of_features(data, base, FitConfig(level="linear", features=("q1^4",)))
     assert free is not base
     assert start_of_features(data, base, FitConfig(**{"level": "linear", "features": ("q1^4",), **settings})) is base
+
+
+@pytest.mark.parametrize(
+    ("angle", "power", "in_L", "in_force"),
+    [
+        (True, 2, ("cos x", 3.0), ("sin x", -3.0)),  # V = k (1 − cos x), k = 3
+        (True, 1, ("sin x", -3.0), ("cos x", -3.0)),  # V = b sin x
+        (False, 2, ("x²", -1.5), ("x", -3.0)),  # V = k x² / 2
+        (False, 1, ("x", -3.0), ("", -3.0)),  # V = b x
+    ],
+)
+def test_the_baseline_in_words(angle, power, in_L, in_force):
+    # fails if L has +V, or the force +V′, or a factor 2 is lost between them
+    run = SimpleNamespace(data=SimpleNamespace(units=("m",), time_unit="s"))
+    for newton, wanted in ((False, in_L), (True, in_force)):
+        _, what, _, parts = _baseline(run, ["x″"], newton, 0, "x", angle, power, ("k", 0, 3.0))  # type: ignore[arg-type]
+        assert (what, parts) == (wanted[0], [("k", 0, wanted[1])])
