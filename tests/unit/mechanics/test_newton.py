@@ -1,7 +1,6 @@
 """The one Newton iteration: samples apart, bad starts, singular Jacobians, and its twin in plain numbers."""
 
 import math
-from typing import Any
 
 import pytest
 import torch
@@ -71,13 +70,13 @@ def test_a_solution_gets_its_derivative():
 
 
 @pytest.mark.parametrize("matrix", [[2.0, 1.0, -3.0, 0.5], [0.0, 1.0, 2.0, 5.0], [1.0, 2.0, 4.0, 9.0]])
-def test_two_equations_are_solved_by_hand(matrix: Any):
+def test_two_equations_are_solved_by_hand(matrix):
     # fails if a row is not exchanged with its right side, or a factor has another sign; small whole numbers are exact
     J = torch.tensor(matrix, dtype=torch.float64).reshape(2, 2)
-    move = torch.tensor(_eliminate(*matrix, 3.0, -1.0), dtype=torch.float64)
+    move = torch.tensor(_eliminate(*[*matrix, 3.0, -1.0]), dtype=torch.float64)
     torch.testing.assert_close(J @ move, torch.tensor([-3.0, 1.0], dtype=torch.float64), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("matrix", [[0.0, 1.0, 0.0, 2.0], [1.0, 2.0, 2.0, 4.0]])
-def test_two_singular_equations_move_nowhere(matrix: Any):  # fails if a division by zero is raised
-    assert all(math.isnan(x) for x in _eliminate(*matrix, 3.0, -1.0))
+def test_two_singular_equations_move_nowhere(matrix):  # fails if a division by zero is raised
+    assert all(math.isnan(x) for x in _eliminate(*[*matrix, 3.0, -1.0]))
