@@ -16,6 +16,7 @@ from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import MANY
 from herglotz.training.solvers import lifted_newton
@@ -404,3 +405,14 @@ def test_many_coordinates_have_the_derivative_of_the_residual(inputs):
     J = momentum_jacobian(ours.parameters.partials(x, q1, q2, s0, h1, 2, u1), p)
     found, wanted = (problem._linearised(x, every, None)[1] for problem in (ours, raw))
     torch.testing.assert_close(J @ (found * data.balance[:, None]), wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["viscous", "coulomb", "log"])
+def test_one_standard_deviation_of_friction_is_a_residual_of_one(name):
+    # fails if a spread multiplies, the speed of dry friction's is forgotten, or one kind is measured by another's
+    model = model_of("forced", 1, coulomb=True)
+    prior, start = prior_of(model, data_of()), ParameterVector(model).get()
+    moved = {"viscous": 0.1, "coulomb": 0.1 * 1.2, "log": 0.5}[name]  # spreads in the class's own words
+    theta = start.index_add(0, prior._index(f"friction.{name}")[:1], torch.tensor([moved], dtype=start.dtype))
+    change = prior.residuals(theta) - prior.residuals(start)
+    assert change[change != 0].tolist() == pytest.approx([1.0])
