@@ -302,3 +302,9 @@ MUTANTS = [
     ("plots/parachute_motion.py", "t = H * np.arange(steps + 1)", "t = H * np.arange(1, steps + 2)"),
     ("plots/parachute_motion.py", "max(residuals)", "min(residuals)"),
 ]  # fmt: skip
+
+# Mutants that the draw leaves out: (file, line, column in it, what stands there instead, why no test can tell)
+ALIKE: list[tuple[str, str, int, str, str]] = [
+    ("data/simulate.py", "bad = ~(torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s))", 30, "", "the last axis of (B, n) is the first after B"),
+    ("data/simulate.py", "bad = ~(torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s))", 58, "", "the last axis of (B, n) is the first after B"),
+]  # fmt: skip

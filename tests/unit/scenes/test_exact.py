@@ -14,7 +14,7 @@ from herglotz.scenes import (
     scene,
     scene_names,
 )
-from herglotz.scenes.lobatto import lobatto
+from herglotz.scenes.collocation import lobatto
 from herglotz.scenes.motion import constant_rate
 from herglotz.stepping import State, Status, Stepper
 
