@@ -11,12 +11,24 @@ is what a hold gives, for the whole recorded step or for each of the equal parts
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 HOLDS = ("zero", "first", "smooth")
 POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in between is made of
+
+
+class Arrival(NamedTuple):
+    """What happens to recorded inputs before they act; "" or None: not said."""
+
+    hold: str = ""
+    delay: float | None = None  # in units of time
+    lag: float | None = None  # time constant of the actuator
+
+
+NOT_SAID = Arrival()
 
 
 def held(

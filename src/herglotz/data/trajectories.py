@@ -12,9 +12,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from herglotz.data.actuator import InputPieces
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
 from herglotz.data.column_table import column_table
-from herglotz.data.holds import HOLDS, held
+from herglotz.data.holds import HOLDS, NOT_SAID, Arrival, held
 from herglotz.data.splits import liveliest_rows, time_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
@@ -37,8 +38,10 @@ class Trajectories:
         (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
     s, p, u
         (N,) action, (N, n) momentum and (N, m) control input, where they are known.
-    time_unit, source, hold, columns
-        Of t; origin, for messages; what u does between samples; name, role and unit of each column that was read.
+    time_unit, source, columns
+        Of t; origin, for messages; name, role and unit of each column that was read.
+    hold, delay, lag
+        What u does between samples, and the delay and the time constant with which it acts; 0: u is what acts.
 
     Raises
     ------
@@ -58,6 +61,8 @@ class Trajectories:
     time_unit: str = "s"
     source: str = ""  # file or scene of origin, for messages
     hold: str = ""  # what u does between samples (`herglotz.data.holds`); "": not said
+    delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
+    lag: float | None = None  # time constant of the actuator; None: not said
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
 
     def __post_init__(self) -> None:
@@ -65,6 +70,9 @@ class Trajectories:
         if self.hold not in ("", *HOLDS):
             where = self.source or "trajectories"
             raise InputError(f"{where}: unknown hold {self.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
+        for name in ("delay", "lag"):
+            if (value := getattr(self, name)) is not None and not 0 <= value < float("inf"):
+                raise InputError(f"{self.source or 'trajectories'}: the {name} of the inputs must be >= 0, got {value}")
         check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
 
     @classmethod
@@ -83,6 +91,8 @@ class Trajectories:
         time_unit: str = "s",
         source: str = "",
         hold: str = "",
+        delay: float | None = None,
+        lag: float | None = None,
         columns: tuple[tuple[str, str, str], ...] = (),
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
@@ -108,6 +118,8 @@ class Trajectories:
             time_unit=time_unit,
             source=source,
             hold=hold,
+            delay=delay,
+            lag=lag,
             columns=columns,
         )
 
@@ -190,6 +202,33 @@ class Trajectories:
         row = torch.arange(self.samples, device=self.t.device) if row is None else row
         part = torch.full_like(row, 0.5, dtype=self.t.dtype) if part is None else part
         return held(self.hold, self.t, self.u, self.lengths, row, part)
+
+    @property
+    def arrival(self) -> Arrival:
+        """What the recording says of its inputs."""
+        return Arrival(self.hold, self.delay, self.lag)
+
+    def acting(self, unsaid: Arrival = NOT_SAID) -> Trajectories:
+        """Return the set with the inputs that act, after their delay and lag, as the inputs.
+
+        Parameters
+        ----------
+        unsaid
+            Takes the place of what the recording does not say.
+        """
+        if self.u is None:
+            return self
+        hold, delay, lag = (
+            self.hold or unsaid.hold,
+            *(
+                own if own is not None else other or 0.0
+                for own, other in zip(self.arrival[1:], unsaid[1:], strict=True)
+            ),
+        )
+        u = self.u
+        if delay or lag:
+            u = InputPieces.of(hold, self.t, u, self.lengths).acting(delay, lag).to(u)
+        return replace(self, u=u, hold=hold, delay=0.0, lag=0.0)
 
     def triples(self, max_step: float | None = None) -> Triples:
         """Return all three-sample windows; those with a step longer than `max_step` are left out.
@@ -304,7 +343,7 @@ class Trajectories:
         """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
-        labels += [self.hold] if self.hold else []
+        labels += [x for x in self.arrival if x]
         shapes = {name: list(x.shape) for name, x in arrays.items()}
         sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
         for x in arrays.values():

@@ -1,55 +1,194 @@
-"""What the inputs do between samples, where neither the data nor the user say it: the hold that explains the steps.
+"""What happens to recorded inputs before they act, where neither the data nor the user say it.
 
-Each hold makes other inputs of the steps, and one linear problem (`dry_friction.acceleration_terms` and the signs of
-the velocities) is solved for each with as many unknowns. A hold other than "zero" is taken where it explains the
-accelerations better, beyond the spread of that difference over blocks of time.
+The hold between samples, a delay and the lag of an actuator (`herglotz.data.actuator`) make other inputs of the steps.
+One linear problem is solved for each: accelerations by differences against `dry_friction.acceleration_terms`, the signs
+of the velocities and what joints move in one another, all averaged over short windows, for differences amplify noise.
+What explains the accelerations better, by more than a twentieth and beyond the spread of that difference over blocks of
+time, is taken: first a hold, then a delay or a lag, then both.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.holds import HOLDS
+from herglotz.data.actuator import InputPieces
+from herglotz.data.holds import HOLDS, Arrival
+from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.splits import liveliest_rows
 from herglotz.least_squares import least_squares
+from herglotz.training.baseline import differences
+from herglotz.training.cross_validation import MARGIN
 from herglotz.training.dry_friction import BLOCKS, acceleration_terms
 
 CLEARLY = 2.0  # standard errors of the difference
+MOST = 4000  # samples that are looked at
+TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps
+FINEST = 2e-3  # of a typical step
+MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # of delay and lag; their sum is known best
+RANK = 1e-9  # of the largest singular value: columns below it repeat others
 
 
-def with_hold(data: Trajectories, wanted: str, train: Trajectories) -> tuple[Trajectories, str]:
-    """The data with what their inputs do between samples, and the reason.
+def with_arrival(data: Trajectories, train: Trajectories) -> tuple[Trajectories, Arrival, dict[str, str]]:
+    """The data with their inputs as they act, how recorded inputs arrive, and the reasons.
 
     Parameters
     ----------
     data
-        All samples.
-    wanted
-        One of `HOLDS`, or "": as the data say or, where they say nothing, as explains the steps of `train`.
+        All samples; what they do not say is what explains the steps of `train`.
     train
         The part of the data that a fit may see.
     """
+    said = data.arrival
     if data.u is None:
-        return data, "there are no inputs"
-    if wanted:
-        return replace(data, hold=wanted), "as planned"
-    if data.hold:
-        return data, "the data say so"
-    errors = {hold: _errors(replace(train, hold=hold)) for hold in HOLDS}
-    best = min(HOLDS, key=lambda hold: float(errors[hold].mean()))
-    gain = errors["zero"] - errors[best]
-    found = best if float(gain.mean()) > CLEARLY * float(gain.std()) / BLOCKS**0.5 else "zero"
-    said = ", ".join(f"{hold} {float(e.mean().sqrt()):.3g}" for hold, e in errors.items())
-    return replace(data, hold=found), f"RMS error of a linear model of the accelerations: {said}"
+        return data, said, dict.fromkeys(Arrival._fields, "there are no inputs")
+    free = [name for name, value in said._asdict().items() if value in ("", None)]
+    reasons = dict.fromkeys(Arrival._fields, "the data or the settings say so")
+    if free:
+        way, numbers = _searched(train, said)
+        said, reasons = way.arrival, reasons | dict.fromkeys(free, numbers)
+    return replace(data, **said._asdict()).acting(), said, reasons
 
 
-def _errors(train: Trajectories) -> Tensor:
-    """Mean squares over blocks of time, (BLOCKS,)."""
-    a, columns, v = acceleration_terms(train)
-    A, y = torch.cat([columns, torch.diag_embed(v.sign())], -1).flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
-    left = A @ least_squares(A, y) - y
-    return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
+@dataclass(frozen=True)
+class Way:
+    """How inputs arrive, and the errors of the accelerations with it."""
+
+    arrival: Arrival
+    errors: Tensor  # mean squares over blocks of time, (BLOCKS,)
+
+    @property
+    def rms(self) -> float:
+        """Over all blocks."""
+        return float(self.errors.mean().sqrt())
+
+    def beats(self, other: Way) -> bool:
+        """Whether the errors are less by more than a twentieth, and beyond the spread of the difference."""
+        gain = other.errors - self.errors
+        clear = float(gain.mean()) > CLEARLY * float(gain.std()) / BLOCKS**0.5
+        return clear and other.rms > MARGIN * self.rms
+
+
+def _searched(train: Trajectories, said: Arrival) -> tuple[Way, str]:
+    """What explains the accelerations, where `said` leaves it open, and the numbers that say so."""
+    ways = Ways(train)
+    delay, lag = said.delay or 0.0, said.lag or 0.0
+    plain = [ways.of(Arrival(hold, delay, lag)) for hold in ([said.hold] if said.hold else HOLDS)]
+    best = min(plain, key=lambda way: way.rms)
+    found = best if best.beats(plain[0]) else plain[0]
+    told = {way.arrival.hold: way for way in plain}
+    axes = [move for move, value in (((1, 0), said.delay), ((0, 1), said.lag)) if value is None]
+    singles = [ways.along(axis, [way.arrival for way in plain]) for axis in axes]
+    told |= dict(zip([("a delay", "a lag")[lag] for _, lag in axes], singles, strict=True))
+    single = min(singles, key=lambda way: way.rms, default=found)
+    if single.beats(found):
+        found = single
+        both = ways.nearby(single, MOVES if len(axes) == 2 else (), 0.5)
+        told |= {"both": both} if len(axes) == 2 else {}
+        found = both if both.beats(single) else single
+    said_all = ", ".join(f"{name} {way.rms:.3g}" for name, way in told.items())
+    return found, f"RMS error of a linear model of the accelerations: {said_all}"
+
+
+class Ways:
+    """Ways in which the inputs of these data could arrive."""
+
+    def __init__(self, data: Trajectories):
+        data = data.to(torch.float64, "cpu")
+        rows, _ = liveliest_rows(data.q, data.lengths, MOST)
+        self.all, self.rows, self.problem = data, rows, Accelerations(data.liveliest(MOST))
+        self.step, self.pieces = data.typical_step, cache(self._pieces)
+
+    def of(self, arrival: Arrival) -> Way:
+        """One of them with its errors."""
+        u = self.pieces(arrival.hold).acting(arrival.delay or 0.0, arrival.lag or 0.0)
+        u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps()
+        assert u is not None
+        return Way(arrival, self.problem.errors(u[self.rows]))
+
+    def along(self, axis: tuple[int, int], plain: Iterable[Arrival]) -> Way:
+        """The best delay (1, 0), or the best lag (0, 1), with any of these holds."""
+        tried = [(x, self._moved(one, axis, x)) for one in plain for x in TRIED]
+        ways = [(self.of(arrival), x) for x, arrival in tried if arrival is not None]
+        best, x = min(ways, key=lambda found: found[0].rms)
+        return self.nearby(best, (axis, (-axis[0], -axis[1])), x / 4)
+
+    def nearby(self, way: Way, moves: Sequence[tuple[int, int]], size: float) -> Way:
+        """The best one that steps along these moves lead to, shorter ones where long ones lead nowhere."""
+        while size > FINEST:
+            moved = [self._moved(way.arrival, move, size) for move in moves]
+            best = min((self.of(one) for one in moved if one is not None), key=lambda other: other.rms, default=way)
+            if best.rms < way.rms:
+                way = best
+            else:
+                size /= 2
+        return way
+
+    def _moved(self, arrival: Arrival, move: tuple[int, int], size: float) -> Arrival | None:
+        """By so many typical steps; None where time would run backwards."""
+        delay, lag = (x + by * size * self.step for x, by in zip(arrival[1:], move, strict=True))
+        return arrival._replace(delay=delay, lag=lag) if min(delay, lag) >= 0 else None
+
+    def _pieces(self, hold: str) -> InputPieces:
+        assert self.all.u is not None
+        return InputPieces.of(hold, self.all.t, self.all.u, self.all.lengths)
+
+
+class Accelerations:
+    """What the terms of the linear problem leave of the accelerations for the inputs to explain."""
+
+    def __init__(self, data: Trajectories):
+        data = replace(data, u=None)
+        local = local_polynomials(data)
+        _, triples, _, a, _ = differences(data, False)
+        terms = acceleration_terms(smooth := data if local is None else smoothed(data, local))
+        q = differences(smooth, False)[1].q1
+        self.index, self.balance = triples.index, data.balance[:, None]
+        self.window = 1 if local is None else local.width // 2
+        ends = self.index[self.window - 1 :]
+        self.whole = ends - self.index[: len(ends)] == self.window - 1  # no window spans a gap or two trajectories
+        turning = [q[:, i] for i, angle in enumerate(data.angles) if angle and data.dof > 1]
+        self.directions = torch.stack(
+            [torch.ones_like(q[:, 0]), *(f(x) for x in turning for f in (torch.sin, torch.cos))], -1
+        )
+        columns = [terms.columns, torch.diag_embed(terms.v.sign())]
+        if data.dof > 1:
+            columns.append(_for_each(torch.cat(list(_of_others(data.angles, q, terms.v)), -1), data.dof))
+        A = self._averaged(torch.cat(columns, -1)).flatten(0, 1)
+        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+        U, S, _ = torch.linalg.svd(A, full_matrices=False)
+        self.Q = U[:, RANK * S[0] < S]
+        y = self._averaged(a[..., None]).flatten(0, 1)
+        self.y = y - self.Q @ (self.Q.T @ y)
+
+    def errors(self, u: Tensor) -> Tensor:
+        """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
+        each = (u[self.index] + u[self.index + 1]) / 2
+        A = _for_each((each[:, :, None] * self.directions[:, None]).flatten(1), len(self.balance))
+        A = self._averaged(A).flatten(0, 1)
+        A = A - self.Q @ (self.Q.T @ A)
+        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+        left = A @ least_squares(A, self.y) - self.y
+        return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
+
+    def _averaged(self, x: Tensor) -> Tensor:
+        """(T, n, k) over the balance, averaged over windows, (T', n, k)."""
+        weight = torch.hann_window(self.window + 2, periodic=False, dtype=x.dtype)[1:-1]
+        return ((x / self.balance).unfold(0, self.window, 1) @ (weight / weight.sum()))[self.whole]
+
+
+def _for_each(x: Tensor, n: int) -> Tensor:
+    """Columns (T, k) in the equation of each coordinate with coefficients of its own, (T, n, n k)."""
+    return (torch.eye(n, dtype=x.dtype)[None, :, :, None] * x[:, None, None]).flatten(2)
+
+
+def _of_others(angles: Sequence[bool], q: Tensor, v: Tensor) -> Iterable[Tensor]:
+    """What each coordinate may do to the others: springs, weight, friction and centrifugal forces, (T, k)."""
+    for i, angle in enumerate(angles):
+        s, c, w = q[:, i].sin(), q[:, i].cos(), v[:, i]
+        yield torch.stack([s, c, s * c, w, w.square() * s, w.square() * c] if angle else [q[:, i], w], -1)
