@@ -21,6 +21,7 @@ from herglotz.data.actuator import InputPieces
 from herglotz.data.holds import HOLDS, Arrival
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.splits import liveliest_rows
+from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
 from herglotz.training.baseline import differences
 from herglotz.training.cross_validation import MARGIN
@@ -31,6 +32,7 @@ MOST = 4000  # samples that are looked at
 TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps
 FINEST = 2e-3  # of a typical step
 MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # of delay and lag; their sum is known best
+LONGEST = 64  # triples in a window
 RANK = 1e-9  # of the largest singular value: columns below it repeat others
 
 
@@ -149,9 +151,7 @@ class Accelerations:
         terms = acceleration_terms(smooth := data if local is None else smoothed(data, local))
         q = differences(smooth, False)[1].q1
         self.index, self.balance = triples.index, data.balance[:, None]
-        self.window = 1 if local is None else local.width // 2
-        ends = self.index[self.window - 1 :]
-        self.whole = ends - self.index[: len(ends)] == self.window - 1  # no window spans a gap or two trajectories
+        self.rows, self.factor = _windows(triples, data)
         turning = [q[:, i] for i, angle in enumerate(data.angles) if angle and data.dof > 1]
         self.directions = torch.stack(
             [torch.ones_like(q[:, 0]), *(f(x) for x in turning for f in (torch.sin, torch.cos))], -1
@@ -159,27 +159,49 @@ class Accelerations:
         columns = [terms.columns, torch.diag_embed(terms.v.sign())]
         if data.dof > 1:
             columns.append(_for_each(torch.cat(list(_of_others(data.angles, q, terms.v)), -1), data.dof))
-        A = self._averaged(torch.cat(columns, -1)).flatten(0, 1)
+        A = self._whitened(torch.cat(columns, -1))
         A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
         U, S, _ = torch.linalg.svd(A, full_matrices=False)
         self.Q = U[:, RANK * S[0] < S]
-        y = self._averaged(a[..., None]).flatten(0, 1)
+        y = self._whitened(a[..., None])
         self.y = y - self.Q @ (self.Q.T @ y)
 
     def errors(self, u: Tensor) -> Tensor:
         """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
         each = (u[self.index] + u[self.index + 1]) / 2
         A = _for_each((each[:, :, None] * self.directions[:, None]).flatten(1), len(self.balance))
-        A = self._averaged(A).flatten(0, 1)
+        A = self._whitened(A)
         A = A - self.Q @ (self.Q.T @ A)
         A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
         left = A @ least_squares(A, self.y) - self.y
         return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
 
-    def _averaged(self, x: Tensor) -> Tensor:
-        """(T, n, k) over the balance, averaged over windows, (T', n, k)."""
-        weight = torch.hann_window(self.window + 2, periodic=False, dtype=x.dtype)[1:-1]
-        return ((x / self.balance).unfold(0, self.window, 1) @ (weight / weight.sum()))[self.whole]
+    def _whitened(self, x: Tensor) -> Tensor:
+        """(T, n, k) over the balance, as positions whose noise is white, (T' n, k)."""
+        windows = (x / self.balance)[self.rows]
+        return torch.linalg.solve_triangular(self.factor, windows.flatten(2), upper=False).reshape(-1, x.shape[-1])
+
+
+def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
+    """Triples (M, L) of windows in a row, and the factor of their accelerations' covariance, (M, L, L).
+
+    White noise of positions makes D n of accelerations, D being second differences; Σ = D Dᵀ. The noise of the terms,
+    left out there, adds up with time: of a spring ω² it is ω² L^{3/2} h^{1/2} / √3 as large after a time L.
+    """
+    omega = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())  # squared
+    h = data.typical_step
+    longest = max(3, round((3**0.5 / (omega * h**0.5)) ** (2 / 3) / h)) if omega > 0 else 3
+    ends = torch.cat([(t.index.diff() != 1).nonzero()[:, 0] + 1, torch.tensor([len(t)])]).tolist()
+    begins = [0, *ends[:-1]]
+    longest = min(longest, LONGEST, min(b - a for a, b in zip(begins, ends, strict=True)))
+    starts = torch.cat([torch.arange(a, b - longest + 1, longest) for a, b in zip(begins, ends, strict=True)])
+    rows = starts[:, None] + torch.arange(longest)
+    h0, h1 = t.h0[rows], t.h1[rows]
+    D = t.q0.new_zeros(len(rows), longest, longest + 2)
+    each = torch.arange(longest)
+    for k, value in enumerate((1 / h0, -1 / h0 - 1 / h1, 1 / h1)):
+        D[:, each, each + k] = 2 * value / (h0 + h1)
+    return rows, torch.linalg.cholesky(D @ D.mT)
 
 
 def _for_each(x: Tensor, n: int) -> Tensor:
