@@ -27,6 +27,11 @@ class Arrival(NamedTuple):
     delay: float | None = None  # in units of time
     lag: float | None = None  # time constant of the actuator
 
+    @property
+    def late(self) -> tuple[float, float]:
+        """Delay and lag; 0 where nothing is said."""
+        return self.delay or 0.0, self.lag or 0.0
+
 
 NOT_SAID = Arrival()
 

@@ -343,7 +343,8 @@ class Trajectories:
         """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
-        labels += [x for x in self.arrival if x]
+        labels += [self.hold] if self.hold else []
+        labels += [{name: x} for name, x in (("delay", self.delay), ("lag", self.lag)) if x]
         shapes = {name: list(x.shape) for name, x in arrays.items()}
         sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
         for x in arrays.values():

@@ -102,7 +102,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
         level=c.level, objective=objective, network=network, order=c.order, features=c.features, drag=c.drag,
-        substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.delay or 0.0, lag=seen.arrival.lag or 0.0,
+        substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
         start={**own, **base.start},

@@ -1,8 +1,8 @@
 """What happens to recorded inputs before they act, where neither the data nor the user say it.
 
 The hold between samples, a delay and the lag of an actuator (`herglotz.data.actuator`) make other inputs of the steps.
-One linear problem is solved for each: accelerations by differences against `dry_friction.acceleration_terms`, the signs
-of the velocities and what joints move in one another. Differences amplify noise: over short windows the problem is made
+One linear problem is solved for each: accelerations by differences against `dry_friction.acceleration_terms`, dry
+friction and what joints move in one another. Differences amplify noise: over short windows the problem is made
 one of positions again, whose noise is white. What misses them less, by more than a tenth and beyond the spread of
 that gain over blocks of time, is taken: first a hold, then a delay or a lag, then both.
 """
@@ -34,8 +34,11 @@ MOST = 3000  # samples that are looked at
 TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps
 LEAST = 0.3  # typical steps: errors of the linear model itself look like up to 0.27 of one
 FINEST = 2e-3  # of a typical step
+DELAY, LAG = (1, 0), (0, 1)
 MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # of delay and lag; their sum is known best
 LONGEST = 64  # triples in a window
+SMOOTHED = (0.01, 0.1, 0.3)  # widths of dry friction, in RMS velocities
+STILL = 0.1  # RMS velocities: dry friction may hold what is slower against its input
 RANK = 1e-9  # of the largest singular value: columns below it repeat others
 
 
@@ -81,24 +84,21 @@ class Way:
 def _searched(train: Trajectories, said: Arrival) -> tuple[Way, str]:
     """What explains the motion best, where `said` leaves it open, and the numbers that say so."""
     ways = Ways(train)
-    delay, lag = said.delay or 0.0, said.lag or 0.0
-    plain = [ways.of(Arrival(hold, delay, lag)) for hold in ([said.hold] if said.hold else HOLDS)]
+    plain = [ways.of(Arrival(hold, *said.late)) for hold in ([said.hold] if said.hold else HOLDS)]
     best = min(plain, key=lambda way: way.rms)
     found = best if best.beats(plain[0]) else plain[0]
     told = {way.arrival.hold: way for way in plain}
-    axes = [move for move, value in (((1, 0), said.delay), ((0, 1), said.lag)) if value is None]
-    singles = [ways.along(axis, [way.arrival for way in plain]) for axis in axes]
-    told |= dict(zip([("a delay", "a lag")[lag] for _, lag in axes], singles, strict=True))
+    axes = [axis for axis, value in ((DELAY, said.delay), (LAG, said.lag)) if value is None]
+    singles = [ways.along(axis, found.arrival) for axis in axes]
+    told |= {"a delay" if axis == DELAY else "a lag": way for axis, way in zip(axes, singles, strict=True)}
     single = min(singles, key=lambda way: way.rms, default=found)
-    late = sum(single.arrival[1:]) - delay - lag  # type: ignore[arg-type]
-    inside = max(single.arrival[1:]) < TRIED[-1] * ways.step  # type: ignore[type-var]
-    if inside and late >= LEAST * ways.step and single.beats(found):
+    if ways.inside(single.arrival, found.arrival) and single.beats(found):
         found = single
-        both = ways.nearby(single, MOVES if len(axes) == 2 else (), 0.5)
-        told |= {"both": both} if len(axes) == 2 else {}
-        found = both if both.beats(single) else single
-    said_all = ", ".join(f"{name} {way.rms:.3g}" for name, way in told.items())
-    return found, f"a linear model over short windows misses positions by: {said_all}"
+        if len(axes) == 2:
+            told["both"] = both = ways.nearby(single, MOVES, 0.5)
+            found = both if both.beats(single) else single
+    numbers = ", ".join(f"{name} {way.rms:.3g}" for name, way in told.items())
+    return found, f"a linear model over short windows misses positions by: {numbers}"
 
 
 class Ways:
@@ -112,17 +112,21 @@ class Ways:
 
     def of(self, arrival: Arrival) -> Way:
         """One of them with its errors."""
-        u = self.pieces(arrival.hold).acting(arrival.delay or 0.0, arrival.lag or 0.0)
+        u = self.pieces(arrival.hold).acting(*arrival.late)
         u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps()
         assert u is not None
         return Way(arrival, self.problem.errors(u[self.rows]))
 
-    def along(self, axis: tuple[int, int], plain: Iterable[Arrival]) -> Way:
-        """The best delay (1, 0), or the best lag (0, 1), with any of these holds."""
-        tried = [(x, self._moved(one, axis, x)) for one in plain for x in TRIED]
+    def along(self, axis: tuple[int, int], plain: Arrival) -> Way:
+        """The best delay, or the best lag."""
+        tried = [(x, self._moved(plain, axis, x)) for x in TRIED]
         ways = [(self.of(arrival), x) for x, arrival in tried if arrival is not None]
         best, x = min(ways, key=lambda found: found[0].rms)
         return self.nearby(best, (axis, (-axis[0], -axis[1])), x / 4)
+
+    def inside(self, found: Arrival, plain: Arrival) -> bool:
+        """Whether it is later by more than the linear model may err, and not at the end of what is tried."""
+        return sum(found.late) - sum(plain.late) >= LEAST * self.step and max(found.late) < TRIED[-1] * self.step
 
     def nearby(self, way: Way, moves: Sequence[tuple[int, int]], size: float) -> Way:
         """The best one that steps along these moves lead to, shorter ones where long ones lead nowhere."""
@@ -137,7 +141,7 @@ class Ways:
 
     def _moved(self, arrival: Arrival, move: tuple[int, int], size: float) -> Arrival | None:
         """By so many typical steps; None where time would run backwards, or further than is tried."""
-        delay, lag = (x + by * size * self.step for x, by in zip(arrival[1:], move, strict=True))
+        delay, lag = (x + by * size * self.step for x, by in zip(arrival.late, move, strict=True))
         allowed = min(delay, lag) >= 0 and max(delay, lag) <= TRIED[-1] * self.step
         return arrival._replace(delay=delay, lag=lag) if allowed else None
 
@@ -161,7 +165,9 @@ class Accelerations:
         self.directions = torch.stack(
             [torch.ones_like(q[:, 0]), *(f(x) for x in turning for f in (torch.sin, torch.cos))], -1
         )
-        columns = [terms.columns, torch.diag_embed(terms.v.sign())]
+        slow = terms.v / terms.v.square().mean(0).sqrt()
+        columns = [terms.columns, *(torch.diag_embed(torch.tanh(slow / width)) for width in SMOOTHED)]
+        self.still = (slow.abs() < STILL).to(q)
         if data.dof > 1:
             columns.append(_for_each(torch.cat(list(_of_others(data.angles, q, terms.v)), -1), data.dof))
         A = self._whitened(torch.cat(columns, -1))
@@ -174,7 +180,9 @@ class Accelerations:
     def errors(self, u: Tensor) -> Tensor:
         """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
         each = (u[self.index] + u[self.index + 1]) / 2
-        A = _for_each((each[:, :, None] * self.directions[:, None]).flatten(1), len(self.balance))
+        each = (each[:, :, None] * self.directions[:, None]).flatten(1)
+        A = _for_each(each, len(self.balance))
+        A = torch.cat([A, A * self.still[:, :, None]], -1)
         A = self._whitened(A)
         A = A - self.Q @ (self.Q.T @ A)
         A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
