@@ -15,14 +15,29 @@ values and means are exact. The stepper takes one input a step and sees nothing 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
-from herglotz.data.holds import held
+from herglotz.data.holds import NOT_SAID, Arrival, held
+
+if TYPE_CHECKING:
+    from herglotz.data.trajectories import Trajectories
 
 PARTS = 8  # straight pieces of a polynomial between samples: at nine samples a period they miss it by a thousandth
+
+
+def acting(data: Trajectories, unsaid: Arrival = NOT_SAID) -> Trajectories:
+    """The recording with the inputs that act as its inputs; `unsaid` stands for what it does not say itself."""
+    if data.u is None:
+        return data
+    said = [own if own is not None else other for own, other in zip(data.arrival[1:], unsaid[1:], strict=True)]
+    arrival, u = Arrival(data.hold or unsaid.hold, *said), data.u
+    if any(arrival.late):
+        u = InputPieces.of(arrival.hold, data.t, u, data.lengths).acting(*arrival.late).to(u)
+    return replace(data, u=u, hold=arrival.hold, delay=0.0, lag=0.0)
 
 
 @dataclass(frozen=True)

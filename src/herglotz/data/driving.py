@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import torch
 
+from herglotz.data.actuator import acting
 from herglotz.data.holds import NOT_SAID, Arrival
 from herglotz.data.readers import load
 from herglotz.data.trajectories import Trajectories
@@ -42,7 +43,7 @@ def recorded(
     """
     found = path if isinstance(path, Trajectories) else load(path)
     path = found.source or "recording"
-    found = found.acting(unsaid)
+    found = acting(found, unsaid)
     if found.u is None:
         raise InputError(f"inputs {path}: holds no inputs; name their columns u, u_*, force or torque")
     if found.time_unit != time_unit:

@@ -16,6 +16,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
+
 HOLDS = ("zero", "first", "smooth")
 POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in between is made of
 
@@ -34,6 +36,15 @@ class Arrival(NamedTuple):
 
 
 NOT_SAID = Arrival()
+
+
+def check_arrival(where: str, arrival: Arrival) -> None:
+    """Raise unless the hold is one of `HOLDS` or not said, and no input acts before it is given."""
+    if arrival.hold not in ("", *HOLDS):
+        raise InputError(f"{where}: unknown hold {arrival.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
+    for name, value in zip(("delay", "lag"), arrival.late, strict=True):
+        if not 0 <= value < float("inf"):
+            raise InputError(f"{where}: the {name} of the inputs must be a time >= 0, got {value:g}")
 
 
 def held(

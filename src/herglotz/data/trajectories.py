@@ -12,10 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.actuator import InputPieces
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
 from herglotz.data.column_table import column_table
-from herglotz.data.holds import HOLDS, NOT_SAID, Arrival, held
+from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import liveliest_rows, time_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
@@ -67,12 +66,7 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
-        if self.hold not in ("", *HOLDS):
-            where = self.source or "trajectories"
-            raise InputError(f"{where}: unknown hold {self.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
-        for name in ("delay", "lag"):
-            if (value := getattr(self, name)) is not None and not 0 <= value < float("inf"):
-                raise InputError(f"{self.source or 'trajectories'}: the {name} of the inputs must be >= 0, got {value}")
+        check_arrival(self.source or "trajectories", self.arrival)
         check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
 
     @classmethod
@@ -106,22 +100,11 @@ class Trajectories:
         angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         default_names = ("q",) if n == 1 else tuple(f"q{i}" for i in range(n))
         return cls(
-            t,
-            q,
-            (len(t),) if counts is None else tuple(counts),
-            names=default_names if names is None else tuple(names),
-            units=tuple("rad" if a else "1" for a in angles) if units is None else tuple(units),
-            angles=angles,
-            s=None if s is None else _tensor("s", s),
-            p=None if p is None else _column(_tensor("p", p)),
-            u=None if u is None else _column(_tensor("u", u)),
-            time_unit=time_unit,
-            source=source,
-            hold=hold,
-            delay=delay,
-            lag=lag,
-            columns=columns,
-        )
+            t, q, (len(t),) if counts is None else tuple(counts), default_names if names is None else tuple(names),
+            tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
+            None if s is None else _tensor("s", s), None if p is None else _column(_tensor("p", p)),
+            None if u is None else _column(_tensor("u", u)), time_unit, source, hold, delay, lag, columns,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         return f"Trajectories({self.summary()})"
@@ -207,28 +190,6 @@ class Trajectories:
     def arrival(self) -> Arrival:
         """What the recording says of its inputs."""
         return Arrival(self.hold, self.delay, self.lag)
-
-    def acting(self, unsaid: Arrival = NOT_SAID) -> Trajectories:
-        """Return the set with the inputs that act, after their delay and lag, as the inputs.
-
-        Parameters
-        ----------
-        unsaid
-            Takes the place of what the recording does not say.
-        """
-        if self.u is None:
-            return self
-        hold, delay, lag = (
-            self.hold or unsaid.hold,
-            *(
-                own if own is not None else other or 0.0
-                for own, other in zip(self.arrival[1:], unsaid[1:], strict=True)
-            ),
-        )
-        u = self.u
-        if delay or lag:
-            u = InputPieces.of(hold, self.t, u, self.lengths).acting(delay, lag).to(u)
-        return replace(self, u=u, hold=hold, delay=0.0, lag=0.0)
 
     def triples(self, max_step: float | None = None) -> Triples:
         """Return all three-sample windows; those with a step longer than `max_step` are left out.
@@ -343,8 +304,7 @@ class Trajectories:
         """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
-        labels += [self.hold] if self.hold else []
-        labels += [{name: x} for name, x in (("delay", self.delay), ("lag", self.lag)) if x]
+        labels += [x if name == "hold" else {name: x} for name, x in self.arrival._asdict().items() if x]
         shapes = {name: list(x.shape) for name, x in arrays.items()}
         sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
         for x in arrays.values():

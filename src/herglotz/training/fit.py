@@ -93,7 +93,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
-    data = _with_arrival(data, config, plan)
+    data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
@@ -103,14 +103,14 @@ def fit(
         return run
 
 
-def _with_arrival(data: Trajectories, config: FitConfig, plan: Plan | None) -> Trajectories:
+def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None) -> Trajectories:
     """The data with what settings say of their inputs, and what a plan says where the data say nothing."""
     if data.u is None:
         return data
     if config.frequencies:  # amplitude and phase are learned
         return replace(data, delay=0.0, lag=0.0)
     told = Arrival(data.hold, config.input_delay, config.actuator_lag)
-    known = [x for x in (told, data.arrival, plan and Arrival(plan.hold, plan.delay, plan.lag)) if x]
+    known = [x for x in (told, data.arrival, planned) if x]
     hold, delay, lag = (next((x for x in each if x not in ("", None)), each[0]) for each in zip(*known, strict=True))
     return replace(data, hold=hold, delay=delay, lag=lag)
 

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.actuator import InputPieces
+from herglotz.data.actuator import InputPieces, acting
 from herglotz.data.holds import HOLDS, Arrival
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.splits import liveliest_rows
@@ -60,7 +60,7 @@ def with_arrival(data: Trajectories, train: Trajectories) -> tuple[Trajectories,
     if free:
         way, numbers = _searched(train, said)
         said, reasons = way.arrival, reasons | dict.fromkeys(free, numbers)
-    return replace(data, **said._asdict()).acting(), said, reasons
+    return acting(replace(data, **said._asdict())), said, reasons
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.actuator import acting
 from herglotz.data.holds import Arrival
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
@@ -214,7 +215,7 @@ def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     u = data.u if run.model.inputs else None
     p = None if data.p is None else data.p[:, at]
     data = replace(data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles)
-    return data.acting(arrival_of(run))
+    return acting(data, arrival_of(run))
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
