@@ -88,7 +88,8 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         config = FitConfig(
             level=self.level, objective=self.objective, seed=self.seed, train_fraction=self.train_fraction
         )
-        self.run_ = fit(data, config.changed(self.settings or {}), progress=False)
+        at_once = {"input_delay": 0.0, "actuator_lag": 0.0}  # rows of X act when they are given
+        self.run_ = fit(data, config.changed({**(self.settings or {}), **at_once}), progress=False)
         self.n_features_in_, self._flat = X.shape[1], np.ndim(y) == 1
         return self
 

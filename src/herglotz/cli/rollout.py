@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     import torch
 
     from herglotz.data import Trajectories
+    from herglotz.data.holds import Arrival
     from herglotz.export import ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
 
@@ -50,7 +51,7 @@ class Source:
     time_unit: str
     box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
     h_range: tuple[float, float] | None  # steps of the fit
-    hold: str = ""  # what the inputs of the fit do between samples
+    arrival: Arrival | None = None  # what happened to the inputs of the fit before they acted
     frequencies: tuple[float, ...] = ()  # of waves that are its inputs
     inputs: int = 0
     states: str = "(q, p, s)"  # what the box bounds
@@ -202,10 +203,11 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
         model, labels = run_.model, (data.names, data.units, data.angles, data.time_unit)
         box = Box(run_.box, data.angles, start.q.dtype, by_s=model.s_enters_motion)
         return Source(
-            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, data.hold, run_.config.frequencies,
+            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.arrival, run_.config.frequencies,
             model.inputs, _bounded(model.s_enters_motion), data.degrees,
         )  # fmt: skip
 
+    from herglotz.data.holds import Arrival
     from herglotz.export import load_exported
 
     stepper = load_exported(path, trust_code=trust_code)
@@ -221,7 +223,8 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     t0 = (stored or {}).get("t", 0.0)
     return Source(
         stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span,
-        inputs=stepper.inputs, states=_bounded(by_s), degrees=tuple(m.get("degrees", ())),
+        Arrival(**m.get("arrival", {})), inputs=stepper.inputs, states=_bounded(by_s),
+        degrees=tuple(m.get("degrees", ())),
     )  # fmt: skip
 
 
@@ -255,6 +258,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     import torch
 
     from herglotz.data.driving import driven, even_times, recorded
+    from herglotz.data.holds import Arrival
     from herglotz.data.waves import waves
 
     steps, path = arguments.steps, arguments.inputs
@@ -268,7 +272,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
         return torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1), times
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    found = recorded(path, arguments.trajectory, source.time_unit, source.hold)
+    found = recorded(path, arguments.trajectory, source.time_unit, source.arrival or Arrival())
     if arguments.q0 is not None and arguments.t0 is None:
         t0 = float(found.t[0])
     return driven(found, t0, steps, arguments.h)

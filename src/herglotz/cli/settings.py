@@ -190,6 +190,23 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
         "or what explains the data best)",
     )  # fmt: skip
 
+    for flag, what in (("--input-delay", "time by which inputs act later"), ("--actuator-lag", "their time constant")):
+        _setting(
+            parser, flag, type=_duration, metavar="T",
+            help=f"{what}, in the data's unit; none, or auto: what the file says or else what explains the data best "
+            "(default auto)",
+        )  # fmt: skip
+
+
+def _duration(text: str) -> float | None:
+    """None for auto, 0 for none, or a time that is not negative (argparse type)."""
+    known = {"auto": None, "none": 0.0}
+    if text in known:
+        return known[text]
+    if (value := finite(text)) < 0:
+        raise argparse.ArgumentTypeError(f"must be a time >= 0, none or auto, got {text}")
+    return value
+
 
 def _setting(parser: argparse._ActionsContainer, flag: str, *, field: str | None = None, **options: Any) -> None:
     """A flag of one field of `FitConfig`, in the namespace only where it is given."""

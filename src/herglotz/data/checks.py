@@ -178,7 +178,7 @@ def check_alike(sets: Sequence[Any]) -> None:
     if not sets:
         raise InputError("cat needs at least one set of trajectories, got none")
     for other in sets[1:]:
-        for what in ("names", "units", "angles", "time_unit", "hold"):
+        for what in ("names", "units", "angles", "time_unit", "hold", "delay", "lag"):
             one, two = getattr(sets[0], what), getattr(other, what)
             if one != two:
                 raise InputError(f"sets with different {what} cannot be joined: {one} and {two}; make them the same")

@@ -21,7 +21,7 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 LONG = 100_000  # characters of a row of plain numbers
-HOLD = r"#\s*hold:\s*(\w+)"  # the comment that says what inputs do between samples
+ARRIVAL = r"#\s*(hold|delay|lag):\s*(.+)"  # comments that say what happens to inputs before they act
 
 
 def read_csv(
@@ -41,7 +41,8 @@ def read_csv(
     `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs; velocities (`v`, `velocity`,
     `*_dot`) are left aside; every other column is a coordinate. Times may be dates in ISO 8601: they become seconds
     since the first row. Lines that start with # and blank lines are skipped, but for `# hold: zero` (or `first`,
-    `smooth`), which says what the inputs do between samples. A coordinate in rad is taken for an angle.
+    `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between samples and how late they act,
+    in the file's unit of time. A coordinate in rad is taken for an angle.
 
     Returns
     -------
@@ -108,9 +109,12 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
 
 
 def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
-    """With what the first comment `# hold: …` among the lines says of the inputs."""
-    said = [match[1] for line in lines if (match := re.fullmatch(HOLD, line.strip()))]
-    return replace(found, hold=said[0]) if said else found
+    """With what the first comments `# hold: …`, `# delay: …` and `# lag: …` among the lines say of the inputs."""
+    said: dict[str, str | float] = {}
+    for match in filter(None, (re.fullmatch(ARRIVAL, line.strip()) for line in lines)):
+        name, text = match.groups()
+        said.setdefault(name, text if name == "hold" else number(text, f"{found.source}, comment '# {name}: {text}'"))
+    return replace(found, **said)  # type: ignore[arg-type]
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:
@@ -137,7 +141,8 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     _check_header(Path(path), header, trajectories)
     table = np.concatenate([x.detach().cpu().numpy().astype(np.float64) for x in parts], axis=1).tolist()
     names = trajectories.trajectory.tolist()
-    comments = [*comments, f"hold: {trajectories.hold}"] if trajectories.hold else comments
+    said = trajectories.arrival._asdict().items()
+    comments = [*comments, *(f"{name}: {value}" for name, value in said if value not in ("", None))]
     lines = [f"# {line}" for text in comments for line in text.splitlines()] + [",".join(header)]
     lines += [",".join([str(b), *map(repr, row)]) for b, row in zip(names, table, strict=True)]
     write_atomically(path, ("\n".join(lines) + "\n").encode())

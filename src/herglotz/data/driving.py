@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
 
+from herglotz.data.actuator import acting
+from herglotz.data.holds import NOT_SAID, Arrival
 from herglotz.data.readers import load
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
@@ -28,10 +29,12 @@ def even_times(t0: float, h: float, steps: int) -> Tensor:
     return clean(t0 + float(f"{h:.12g}") * torch.arange(steps + 1, dtype=torch.float64))
 
 
-def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str, hold: str = "") -> Trajectories:
+def recorded(
+    path: str | Path | Trajectories, trajectory: int, time_unit: str, unsaid: Arrival = NOT_SAID
+) -> Trajectories:
     """The recording whose inputs drive the model: the trajectory of that number, or the only one.
 
-    Between samples its inputs do what it says itself or, where it says nothing, `hold`.
+    Its inputs are those that act: before they do what it says itself or, where it says nothing, `unsaid`.
 
     Raises
     ------
@@ -40,7 +43,7 @@ def recorded(path: str | Path | Trajectories, trajectory: int, time_unit: str, h
     """
     found = path if isinstance(path, Trajectories) else load(path)
     path = found.source or "recording"
-    found = replace(found, hold=found.hold or hold)
+    found = acting(found, unsaid)
     if found.u is None:
         raise InputError(f"inputs {path}: holds no inputs; name their columns u, u_*, force or torque")
     if found.time_unit != time_unit:

@@ -11,12 +11,40 @@ is what a hold gives, for the whole recorded step or for each of the equal parts
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
+from herglotz.errors import InputError
+
 HOLDS = ("zero", "first", "smooth")
 POINTS = {"zero": 1, "first": 2, "smooth": 8}  # samples that an input in between is made of
+
+
+class Arrival(NamedTuple):
+    """What happens to recorded inputs before they act; "" or None: not said."""
+
+    hold: str = ""
+    delay: float | None = None  # in units of time
+    lag: float | None = None  # time constant of the actuator
+
+    @property
+    def late(self) -> tuple[float, float]:
+        """Delay and lag; 0 where nothing is said."""
+        return self.delay or 0.0, self.lag or 0.0
+
+
+NOT_SAID = Arrival()
+
+
+def check_arrival(where: str, arrival: Arrival) -> None:
+    """Raise unless the hold is one of `HOLDS` or not said, and no input acts before it is given."""
+    if arrival.hold not in ("", *HOLDS):
+        raise InputError(f"{where}: unknown hold {arrival.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
+    for name, value in zip(("delay", "lag"), arrival.late, strict=True):
+        if not 0 <= value < float("inf"):
+            raise InputError(f"{where}: the {name} of the inputs must be a time >= 0, got {value:g}")
 
 
 def held(

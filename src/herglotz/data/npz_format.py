@@ -18,7 +18,7 @@ from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
-LABELS = ("names", "units", "angles", "time_unit", "source", "hold", "columns")
+LABELS = ("names", "units", "angles", "time_unit", "source", "hold", "delay", "lag", "columns")
 USED = (*ARRAYS, "lengths", "metadata")
 LARGEST = 2**31  # bytes that the arrays of an archive may take: 67 million samples of t and three coordinates
 # Exceptions that numpy and zipfile raise on a damaged archive.
@@ -32,8 +32,8 @@ def read_npz(path: PathLike) -> Trajectories:
     """Read trajectories from a .npz archive.
 
     Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and
-    `metadata` (a JSON object with names, units, angles, time_unit, source, hold, columns) may follow. Integer arrays
-    become float64.
+    `metadata` (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns) may follow.
+    Integer arrays become float64.
 
     Raises
     ------
@@ -145,5 +145,7 @@ def _has_its_type(label: str, x: object) -> bool:
     """Whether `x` is the list of texts, of truth values or of rows (name, role, unit), or the text, of this label."""
     if label == "columns":
         return isinstance(x, list) and all(_has_its_type("names", row) and len(row) == 3 for row in x)
+    if label in ("delay", "lag"):
+        return x is None or (isinstance(x, (int, float)) and not isinstance(x, bool))
     kind = {"names": str, "units": str, "angles": bool}.get(label)
     return isinstance(x, str) if kind is None else isinstance(x, list) and all(isinstance(y, kind) for y in x)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
 from herglotz.data.column_table import column_table
-from herglotz.data.holds import HOLDS, held
+from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import liveliest_rows, time_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
@@ -37,8 +37,10 @@ class Trajectories:
         (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
     s, p, u
         (N,) action, (N, n) momentum and (N, m) control input, where they are known.
-    time_unit, source, hold, columns
-        Of t; origin, for messages; what u does between samples; name, role and unit of each column that was read.
+    time_unit, source, columns
+        Of t; origin, for messages; name, role and unit of each column that was read.
+    hold, delay, lag
+        What u does between samples, and the delay and the time constant with which it acts; 0: u is what acts.
 
     Raises
     ------
@@ -58,13 +60,13 @@ class Trajectories:
     time_unit: str = "s"
     source: str = ""  # file or scene of origin, for messages
     hold: str = ""  # what u does between samples (`herglotz.data.holds`); "": not said
+    delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
+    lag: float | None = None  # time constant of the actuator; None: not said
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
-        if self.hold not in ("", *HOLDS):
-            where = self.source or "trajectories"
-            raise InputError(f"{where}: unknown hold {self.hold!r} of the inputs; choose one of {', '.join(HOLDS)}")
+        check_arrival(self.source or "trajectories", self.arrival)
         check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
 
     @classmethod
@@ -83,6 +85,8 @@ class Trajectories:
         time_unit: str = "s",
         source: str = "",
         hold: str = "",
+        delay: float | None = None,
+        lag: float | None = None,
         columns: tuple[tuple[str, str, str], ...] = (),
     ) -> Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
@@ -96,20 +100,11 @@ class Trajectories:
         angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
         default_names = ("q",) if n == 1 else tuple(f"q{i}" for i in range(n))
         return cls(
-            t,
-            q,
-            (len(t),) if counts is None else tuple(counts),
-            names=default_names if names is None else tuple(names),
-            units=tuple("rad" if a else "1" for a in angles) if units is None else tuple(units),
-            angles=angles,
-            s=None if s is None else _tensor("s", s),
-            p=None if p is None else _column(_tensor("p", p)),
-            u=None if u is None else _column(_tensor("u", u)),
-            time_unit=time_unit,
-            source=source,
-            hold=hold,
-            columns=columns,
-        )
+            t, q, (len(t),) if counts is None else tuple(counts), default_names if names is None else tuple(names),
+            tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
+            None if s is None else _tensor("s", s), None if p is None else _column(_tensor("p", p)),
+            None if u is None else _column(_tensor("u", u)), time_unit, source, hold, delay, lag, columns,
+        )  # fmt: skip
 
     def __repr__(self) -> str:
         return f"Trajectories({self.summary()})"
@@ -190,6 +185,11 @@ class Trajectories:
         row = torch.arange(self.samples, device=self.t.device) if row is None else row
         part = torch.full_like(row, 0.5, dtype=self.t.dtype) if part is None else part
         return held(self.hold, self.t, self.u, self.lengths, row, part)
+
+    @property
+    def arrival(self) -> Arrival:
+        """What the recording says of its inputs."""
+        return Arrival(self.hold, self.delay, self.lag)
 
     def triples(self, max_step: float | None = None) -> Triples:
         """Return all three-sample windows; those with a step longer than `max_step` are left out.
@@ -304,7 +304,7 @@ class Trajectories:
         """Return the sha256 (hex) of values, dtype and labels; the source and the device do not enter."""
         arrays = {name: x for name in ARRAYS if (x := getattr(self, name)) is not None}
         labels = [self.lengths, self.names, self.units, self.angles, self.time_unit, str(self.t.dtype)]
-        labels += [self.hold] if self.hold else []
+        labels += [x if name == "hold" else {name: x} for name, x in self.arrival._asdict().items() if x]
         shapes = {name: list(x.shape) for name, x in arrays.items()}
         sha = hashlib.sha256(json.dumps([labels, shapes]).encode())
         for x in arrays.values():

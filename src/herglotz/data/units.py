@@ -25,7 +25,9 @@ def in_radians_and_seconds(data: Trajectories) -> Trajectories:
         )
     if data.time_unit in PER_SECOND:
         # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
-        data = replace(data, t=data.t / PER_SECOND[data.time_unit], time_unit="s")
+        many = PER_SECOND[data.time_unit]
+        delay, lag = (None if x is None else x / many for x in data.arrival[1:])
+        data = replace(data, t=data.t / many, time_unit="s", delay=delay, lag=lag)
     return data
 
 

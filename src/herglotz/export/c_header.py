@@ -37,7 +37,7 @@ TOP = """\
    Written by herglotz {version}; do not edit. One step (q, p, s) -> (q1, p1, s1) solves D1 L_d + c p = 0 for q1.
 
    #include <stdio.h>
-   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
+{arrival}   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
 
    int main(void) {{
      hz_real q0[hz_N] = {{0}}, q1[hz_N] = {{0}}, left;
@@ -242,6 +242,17 @@ def _identifier(stem: str) -> str:
     return name if re.match("[A-Za-z]", name) else f"model_{name}"[:41]
 
 
+def _arrival(entries: Mapping[str, Any]) -> str:
+    """What to do with recorded inputs before a step takes them; nothing where they act at once."""
+    _, delay, lag = (entries.get("arrival") or {"hold": "", "delay": 0.0, "lag": 0.0}).values()
+    if not delay and not lag:
+        return ""
+    unit = entries.get("time_unit", "s")
+    late = f"u(t - {delay:.6g} {unit})" if delay else "u(t)"
+    formula = f"T u_f' = {late} - u_f with T = {lag:.6g} {unit}" if lag else f"u_f(t) = {late}"
+    return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
+
+
 def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
     """The comment, the guard, and what the preprocessor decides by."""
     inputs = entries["inputs"]
@@ -249,6 +260,7 @@ def _top(entries: Mapping[str, Any], step: StepInC, derivatives: bool) -> str:
         version=entries["herglotz_version"],
         file="@FILE@",
         no_u="0, " if inputs else "",
+        arrival=_arrival(entries),
         mark=MARK,
         comment="@METADATA@",
         guard=f"0x{hashlib.sha256(json.dumps(entries).encode()).hexdigest()[:8]}u",

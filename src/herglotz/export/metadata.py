@@ -52,6 +52,7 @@ class Metadata(_Needed, total=False):
     time_unit: str
     start: dict[str, float | list[float]] | None
     metrics: dict[str, Any]
+    arrival: dict[str, Any]
     name: str
 
 

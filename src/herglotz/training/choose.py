@@ -102,7 +102,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
     own = {"stiffness": base.stiffness, "tilt": base.tilt, "rate": (base.rate,)}
     return Plan(
         level=c.level, objective=objective, network=network, order=c.order, features=c.features, drag=c.drag,
-        substeps=c.substeps, hold=seen.data.hold,
+        substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
         start={**own, **base.start},
@@ -125,7 +125,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
         "substeps": "the fit needed shorter steps: halved ones met the data better" if named else AS_SET,
-        "hold": seen.hold,
+        **seen.why_arrival,
         "forces": _forces_reason(seen),
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),

@@ -90,6 +90,10 @@ class FitConfig:
         where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
     use_inputs
         Drive the model with the recorded inputs u (forced level); False leaves them out of the fit.
+    input_delay, actuator_lag
+        Time by which the inputs act later than they were recorded, and time constant of the actuator behind them, in
+        the data's unit of time (`herglotz.data.actuator`). None: what the data say or, where they say nothing, what
+        explains the accelerations (`herglotz.training.hold`); 0: there is none.
     input_map
         The map G from inputs to forces, n · m numbers row by row, where it is known; empty: learned. Forces are in
         units in which the first coordinate's mass is 1: for one joint of inertia J, a torque has G = 1/J.
@@ -148,6 +152,8 @@ class FitConfig:
     supervision: str = "q"
     restarts: int | None = None
     use_inputs: bool = True
+    input_delay: float | None = None
+    actuator_lag: float | None = None
     input_map: tuple[float, ...] = ()
     features: tuple[str, ...] = ()
     known: tuple[str, ...] = ()

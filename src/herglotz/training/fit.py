@@ -6,12 +6,14 @@ import hashlib
 import json
 import time
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
+from herglotz.data.holds import Arrival
 from herglotz.data.lock import locked
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
@@ -91,6 +93,7 @@ def fit(
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)
+    data = told_arrival(data, config, None if plan is None else Arrival(plan.hold, plan.delay, plan.lag))
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
@@ -98,6 +101,18 @@ def fit(
         if log is not None:
             log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
+
+
+def told_arrival(data: Trajectories, config: FitConfig, planned: Arrival | None) -> Trajectories:
+    """The data with what settings say of their inputs, and what a plan says where the data say nothing."""
+    if data.u is None:
+        return data
+    if config.frequencies:  # amplitude and phase are learned
+        return replace(data, delay=0.0, lag=0.0)
+    told = Arrival(data.hold, config.input_delay, config.actuator_lag)
+    known = [x for x in (told, data.arrival, planned) if x]
+    hold, delay, lag = (next((x for x in each if x not in ("", None)), each[0]) for each in zip(*known, strict=True))
+    return replace(data, hold=hold, delay=delay, lag=lag)
 
 
 def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stages) -> Run:

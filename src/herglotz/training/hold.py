@@ -1,55 +1,229 @@
-"""What the inputs do between samples, where neither the data nor the user say it: the hold that explains the steps.
+"""What happens to recorded inputs before they act, where neither the data nor the user say it.
 
-Each hold makes other inputs of the steps, and one linear problem (`dry_friction.acceleration_terms` and the signs of
-the velocities) is solved for each with as many unknowns. A hold other than "zero" is taken where it explains the
-accelerations better, beyond the spread of that difference over blocks of time.
+The hold between samples, a delay and the lag of an actuator (`herglotz.data.actuator`) make other inputs of the steps.
+One linear problem is solved for each: accelerations by differences against `dry_friction.acceleration_terms`, dry
+friction and what joints move in one another. Differences amplify noise: over short windows the problem is made
+one of positions again, whose noise is white. What misses them less, by more than a tenth and beyond the spread of
+that gain over blocks of time, is taken: first a hold, then a delay or a lag, then both.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.holds import HOLDS
+from herglotz.data.actuator import InputPieces, acting
+from herglotz.data.holds import HOLDS, Arrival
+from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.splits import liveliest_rows
+from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
+from herglotz.training.baseline import differences
 from herglotz.training.dry_friction import BLOCKS, acceleration_terms
 
-CLEARLY = 2.0  # standard errors of the difference
+# The mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
+# noise of 1 % lets see, up to 0.16 for errors of the linear model itself.
+WORTH = 0.2
+CLEARLY = 3.0  # standard errors over blocks
+MOST = 3000  # samples that are looked at
+TRIED = (0.25, 0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 12.0, 16.0, 24.0, 32.0)  # delays and lags, in typical steps
+LEAST = 0.3  # typical steps: errors of the linear model itself look like up to 0.27 of one
+FINEST = 2e-3  # of a typical step
+DELAY, LAG = (1, 0), (0, 1)
+MOVES = ((1, 0), (-1, 0), (0, 1), (0, -1), (1, -1), (-1, 1))  # of delay and lag; their sum is known best
+LONGEST = 64  # triples in a window
+SMOOTHED = (0.01, 0.1, 0.3)  # widths of dry friction, in RMS velocities
+STILL = 0.1  # RMS velocities: dry friction may hold what is slower against its input
+RANK = 1e-9  # of the largest singular value: columns below it repeat others
 
 
-def with_hold(data: Trajectories, wanted: str, train: Trajectories) -> tuple[Trajectories, str]:
-    """The data with what their inputs do between samples, and the reason.
+def with_arrival(data: Trajectories, train: Trajectories) -> tuple[Trajectories, Arrival, dict[str, str]]:
+    """The data with their inputs as they act, how recorded inputs arrive, and the reasons.
 
     Parameters
     ----------
     data
-        All samples.
-    wanted
-        One of `HOLDS`, or "": as the data say or, where they say nothing, as explains the steps of `train`.
+        All samples; what they do not say is what explains the steps of `train`.
     train
         The part of the data that a fit may see.
     """
+    said = data.arrival
     if data.u is None:
-        return data, "there are no inputs"
-    if wanted:
-        return replace(data, hold=wanted), "as planned"
-    if data.hold:
-        return data, "the data say so"
-    errors = {hold: _errors(replace(train, hold=hold)) for hold in HOLDS}
-    best = min(HOLDS, key=lambda hold: float(errors[hold].mean()))
-    gain = errors["zero"] - errors[best]
-    found = best if float(gain.mean()) > CLEARLY * float(gain.std()) / BLOCKS**0.5 else "zero"
-    said = ", ".join(f"{hold} {float(e.mean().sqrt()):.3g}" for hold, e in errors.items())
-    return replace(data, hold=found), f"RMS error of a linear model of the accelerations: {said}"
+        return data, said, dict.fromkeys(Arrival._fields, "there are no inputs")
+    free = [name for name, value in said._asdict().items() if value in ("", None)]
+    reasons = dict.fromkeys(Arrival._fields, "the data or the settings say so")
+    if free:
+        way, numbers = _searched(train, said)
+        said, reasons = way.arrival, reasons | dict.fromkeys(free, numbers)
+    return acting(replace(data, **said._asdict())), said, reasons
 
 
-def _errors(train: Trajectories) -> Tensor:
-    """Mean squares over blocks of time, (BLOCKS,)."""
-    a, columns, v = acceleration_terms(train)
-    A, y = torch.cat([columns, torch.diag_embed(v.sign())], -1).flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
-    A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
-    left = A @ least_squares(A, y) - y
-    return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
+@dataclass(frozen=True)
+class Way:
+    """How inputs arrive, and how far the linear model misses positions with it."""
+
+    arrival: Arrival
+    errors: Tensor  # mean squares over blocks of time, (BLOCKS,)
+
+    @property
+    def rms(self) -> float:
+        """Over all blocks."""
+        return float(self.errors.mean().sqrt())
+
+    def beats(self, other: Way) -> bool:
+        """Whether it misses less, by a tenth and beyond the spread over blocks, which one block cannot decide."""
+        gain = (other.errors / self.errors.clamp_min(torch.finfo(self.errors.dtype).tiny)).log()
+        return float(gain.mean()) > max(WORTH, CLEARLY * float(gain.std()) / BLOCKS**0.5)
+
+
+def _searched(train: Trajectories, said: Arrival) -> tuple[Way, str]:
+    """What explains the motion best, where `said` leaves it open, and the numbers that say so."""
+    ways = Ways(train)
+    plain = [ways.of(Arrival(hold, *said.late)) for hold in ([said.hold] if said.hold else HOLDS)]
+    best = min(plain, key=lambda way: way.rms)
+    found = best if best.beats(plain[0]) else plain[0]
+    told = {way.arrival.hold: way for way in plain}
+    axes = [axis for axis, value in ((DELAY, said.delay), (LAG, said.lag)) if value is None]
+    singles = [ways.along(axis, found.arrival) for axis in axes]
+    told |= {"a delay" if axis == DELAY else "a lag": way for axis, way in zip(axes, singles, strict=True)}
+    single = min(singles, key=lambda way: way.rms, default=found)
+    if ways.inside(single.arrival, found.arrival) and single.beats(found):
+        found = single
+        if len(axes) == 2:
+            told["both"] = both = ways.nearby(single, MOVES, 0.5)
+            found = both if both.beats(single) else single
+    numbers = ", ".join(f"{name} {way.rms:.3g}" for name, way in told.items())
+    return found, f"a linear model over short windows misses positions by: {numbers}"
+
+
+class Ways:
+    """Ways in which the inputs of these data could arrive."""
+
+    def __init__(self, data: Trajectories):
+        data = data.to(torch.float64, "cpu")
+        rows, _ = liveliest_rows(data.q, data.lengths, MOST)
+        self.all, self.rows, self.problem = data, rows, Accelerations(data.liveliest(MOST))
+        self.step, self.pieces = data.typical_step, cache(self._pieces)
+
+    def of(self, arrival: Arrival) -> Way:
+        """One of them with its errors."""
+        u = self.pieces(arrival.hold).acting(*arrival.late)
+        u = replace(self.all, u=u, hold=arrival.hold).inputs_of_steps()
+        assert u is not None
+        return Way(arrival, self.problem.errors(u[self.rows]))
+
+    def along(self, axis: tuple[int, int], plain: Arrival) -> Way:
+        """The best delay, or the best lag."""
+        tried = [(x, self._moved(plain, axis, x)) for x in TRIED]
+        ways = [(self.of(arrival), x) for x, arrival in tried if arrival is not None]
+        best, x = min(ways, key=lambda found: found[0].rms)
+        return self.nearby(best, (axis, (-axis[0], -axis[1])), x / 4)
+
+    def inside(self, found: Arrival, plain: Arrival) -> bool:
+        """Whether it is later by more than the linear model may err, and not at the end of what is tried."""
+        return sum(found.late) - sum(plain.late) >= LEAST * self.step and max(found.late) < TRIED[-1] * self.step
+
+    def nearby(self, way: Way, moves: Sequence[tuple[int, int]], size: float) -> Way:
+        """The best one that steps along these moves lead to, shorter ones where long ones lead nowhere."""
+        while size > FINEST:
+            moved = [self._moved(way.arrival, move, size) for move in moves]
+            best = min((self.of(one) for one in moved if one is not None), key=lambda other: other.rms, default=way)
+            if best.rms < way.rms:
+                way = best
+            else:
+                size /= 2
+        return way
+
+    def _moved(self, arrival: Arrival, move: tuple[int, int], size: float) -> Arrival | None:
+        """By so many typical steps; None where time would run backwards, or further than is tried."""
+        delay, lag = (x + by * size * self.step for x, by in zip(arrival.late, move, strict=True))
+        allowed = min(delay, lag) >= 0 and max(delay, lag) <= TRIED[-1] * self.step
+        return arrival._replace(delay=delay, lag=lag) if allowed else None
+
+    def _pieces(self, hold: str) -> InputPieces:
+        assert self.all.u is not None
+        return InputPieces.of(hold, self.all.t, self.all.u, self.all.lengths)
+
+
+class Accelerations:
+    """What the terms of the linear problem leave of the accelerations for the inputs to explain."""
+
+    def __init__(self, data: Trajectories):
+        data = replace(data, u=None)
+        local = local_polynomials(data)
+        _, triples, _, a, _ = differences(data, False)
+        terms = acceleration_terms(smooth := data if local is None else smoothed(data, local))
+        q = differences(smooth, False)[1].q1
+        self.index, self.balance = triples.index, data.balance[:, None]
+        self.rows, self.factor = _windows(triples, data)
+        turning = [q[:, i] for i, angle in enumerate(data.angles) if angle and data.dof > 1]
+        self.directions = torch.stack(
+            [torch.ones_like(q[:, 0]), *(f(x) for x in turning for f in (torch.sin, torch.cos))], -1
+        )
+        slow = terms.v / terms.v.square().mean(0).sqrt()
+        columns = [terms.columns, *(torch.diag_embed(torch.tanh(slow / width)) for width in SMOOTHED)]
+        self.still = (slow.abs() < STILL).to(q)
+        if data.dof > 1:
+            columns.append(_for_each(torch.cat(list(_of_others(data.angles, q, terms.v)), -1), data.dof))
+        A = self._whitened(torch.cat(columns, -1))
+        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+        U, S, _ = torch.linalg.svd(A, full_matrices=False)
+        self.Q = U[:, RANK * S[0] < S]
+        y = self._whitened(a[..., None])
+        self.y = y - self.Q @ (self.Q.T @ y)
+
+    def errors(self, u: Tensor) -> Tensor:
+        """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
+        each = (u[self.index] + u[self.index + 1]) / 2
+        each = (each[:, :, None] * self.directions[:, None]).flatten(1)
+        A = _for_each(each, len(self.balance))
+        A = torch.cat([A, A * self.still[:, :, None]], -1)
+        A = self._whitened(A)
+        A = A - self.Q @ (self.Q.T @ A)
+        A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
+        left = A @ least_squares(A, self.y) - self.y
+        return torch.stack([block.square().mean() for block in left.tensor_split(BLOCKS)])
+
+    def _whitened(self, x: Tensor) -> Tensor:
+        """(T, n, k) over the balance, as positions whose noise is white, (T' n, k)."""
+        windows = (x / self.balance)[self.rows]
+        return torch.linalg.solve_triangular(self.factor, windows.flatten(2), upper=False).reshape(-1, x.shape[-1])
+
+
+def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
+    """Triples (M, L) of windows in a row, and the factor of their accelerations' covariance, (M, L, L).
+
+    White noise of positions makes D n of accelerations, D being second differences; Σ = D Dᵀ. The noise of the terms,
+    left out there, adds up with time: of a spring ω² it is ω² L^{3/2} h^{1/2} / √3 as large after a time L.
+    """
+    omega = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())  # squared
+    h = data.typical_step
+    longest = max(3, round((3**0.5 / (omega * h**0.5)) ** (2 / 3) / h)) if omega > 0 else 3
+    ends = torch.cat([(t.index.diff() != 1).nonzero()[:, 0] + 1, torch.tensor([len(t)])]).tolist()
+    begins = [0, *ends[:-1]]
+    longest = min(longest, LONGEST, min(b - a for a, b in zip(begins, ends, strict=True)))
+    starts = torch.cat([torch.arange(a, b - longest + 1, longest) for a, b in zip(begins, ends, strict=True)])
+    rows = starts[:, None] + torch.arange(longest)
+    h0, h1 = t.h0[rows], t.h1[rows]
+    D = t.q0.new_zeros(len(rows), longest, longest + 2)
+    each = torch.arange(longest)
+    for k, value in enumerate((1 / h0, -1 / h0 - 1 / h1, 1 / h1)):
+        D[:, each, each + k] = 2 * value / (h0 + h1)
+    return rows, torch.linalg.cholesky(D @ D.mT)
+
+
+def _for_each(x: Tensor, n: int) -> Tensor:
+    """Columns (T, k) in the equation of each coordinate with coefficients of its own, (T, n, n k)."""
+    return (torch.eye(n, dtype=x.dtype)[None, :, :, None] * x[:, None, None]).flatten(2)
+
+
+def _of_others(angles: Sequence[bool], q: Tensor, v: Tensor) -> Iterable[Tensor]:
+    """What each coordinate may do to the others: springs, weight, friction and centrifugal forces, (T, k)."""
+    for i, angle in enumerate(angles):
+        s, c, w = q[:, i].sin(), q[:, i].cos(), v[:, i]
+        yield torch.stack([s, c, s * c, w, w.square() * s, w.square() * c] if angle else [q[:, i], w], -1)

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.holds import Arrival
 from herglotz.data.roughness import roughness
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
@@ -16,7 +17,7 @@ from herglotz.training.baseline import Baseline, across_translations, estimate_b
 from herglotz.training.baseline_motion import fit_baseline_motion
 from herglotz.training.config import FitConfig
 from herglotz.training.dry_friction import friction_holds
-from herglotz.training.hold import with_hold
+from herglotz.training.hold import with_arrival
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
 from herglotz.training.smoothing_fit import SMOOTHED
@@ -58,13 +59,14 @@ class Probe:
 class Look:
     """The properties of the data that a plan depends on."""
 
-    data: Trajectories  # all, angles unwrapped
+    data: Trajectories  # all, angles unwrapped, with the inputs that act
     train: Trajectories  # the first part of every trajectory
     unseen: Trajectories | None  # the rest; None: nothing is held out
     kept: Trajectories  # of the first part all but single spikes
     spikes: Tensor  # (N_train,) bool
     outliers: bool  # more than single spikes are suspected
-    hold: str  # why the inputs do between samples what they do
+    arrival: Arrival  # what happens to recorded inputs before they act
+    why_arrival: dict[str, str]  # the reason of each of its fields
     friction: str  # why friction is set-valued or not
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
@@ -86,7 +88,7 @@ def look(
         If the data cannot be used, or do not suit the settings.
     """
     settings = user_settings.resolved(data)
-    data, why_hold = _read(data, settings, "" if plan is None else plan.hold)
+    data, arrival, why_arrival = _read(data, settings)
     train, unseen = _split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -104,8 +106,8 @@ def look(
         terms = replace(terms, motion=_baseline_motion(task))
     probe = _probe(task) if (terms.leaves_objective if plan is None else plan.continues_probe) else None
     return Look(
-        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, hold=why_hold,
-        friction=why_friction, noise=roughness(kept), settings=terms.settings, base=terms.base,
+        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, arrival=arrival,
+        why_arrival=why_arrival, friction=why_friction, noise=roughness(kept), settings=terms.settings, base=terms.base,
         structure=terms.structure, found=terms.found, baseline_motion=terms.motion, probe=probe,
     )  # fmt: skip
 
@@ -127,11 +129,11 @@ class _Terms:
         return c.objective == "auto" and c.supervision == "q" and self.motion is None and not c.sticking
 
 
-def _read(data: Trajectories, settings: FitConfig, hold: str) -> tuple[Trajectories, str]:
-    """The data as a fit takes them, with what their inputs do between samples, and why."""
+def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arrival, dict[str, str]]:
+    """The data as a fit takes them, how their recorded inputs arrive, and why."""
     data = data if settings.use_inputs else replace(data, u=None)
     data = data.unwrapped().to(dtype=settings.torch_dtype, device=settings.device)
-    return with_hold(data, hold, _split(data, settings)[0])
+    return with_arrival(data, _split(data, settings)[0])
 
 
 def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Trajectories | None]:

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, recorded
+from herglotz.data.holds import Arrival
 from herglotz.data.waves import waves
 from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
@@ -31,6 +32,8 @@ class Steppable(Protocol):
     def data(self) -> Trajectories: ...  # noqa: D102
     @property
     def config(self) -> FitConfig: ...  # noqa: D102
+    @property
+    def arrival(self) -> Arrival: ...  # noqa: D102
     @property
     def h(self) -> float: ...  # noqa: D102
 
@@ -107,7 +110,7 @@ def _inputs(
     """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
     (time, steps, h), (trajectory, from_first) = span, recording
     if isinstance(inputs, (str, Path, Trajectories)):
-        found = recorded(inputs, trajectory, run.data.time_unit, run.data.hold)
+        found = recorded(inputs, trajectory, run.data.time_unit, run.arrival)
         return driven(found, float(found.t[0]) if from_first else time, steps, h)
     times = even_times(time, h or run.h, steps)
     if inputs is None:

@@ -28,6 +28,8 @@ class Plan:
     order: int  # of the rule, 2 or 4
     features: tuple[str, ...]  # what L may hold beside its terms
     hold: str  # of the inputs between samples: zero, first or smooth; "" without inputs
+    delay: float  # with which recorded inputs act, in the data's unit of time
+    lag: float  # time constant of the actuator
     drag: tuple[str, ...]  # friction forces beside the viscous one
     substeps: int  # model steps in a recorded one
     forces: dict[str, bool]  # coulomb, sticking, coupled; diagonal: which masses and friction there are
@@ -68,6 +70,8 @@ class Plan:
         one_step = self.objective in ("residual", "raw")
         idle = {
             "hold": not self.hold,
+            "delay": not self.delay,
+            "lag": not self.lag,
             "drag": not self.drag,
             "substeps": self.substeps == 1,
             "continues_probe": not self.continues_probe,
@@ -114,6 +118,8 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "order": "order of the time step",
     "features": "terms that were named",
     "hold": "inputs between samples",
+    "delay": "delay of the inputs",
+    "lag": "lag of the actuator",
     "drag": "friction beside the viscous one",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",

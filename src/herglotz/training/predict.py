@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.actuator import acting
+from herglotz.data.holds import Arrival
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
@@ -188,6 +190,12 @@ def predict(
     return Prediction(data, state, warmup, every, most, outside)
 
 
+def arrival_of(run: Trained) -> Arrival:
+    """What happened to the inputs of the fit before they acted; other recordings that say nothing are alike."""
+    plan = run.metrics.get("plan") or {}
+    return Arrival(plan.get("hold") or run.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
+
+
 def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
     wanted, where = run.data, data.source or "data"
@@ -206,10 +214,8 @@ def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     data = with_waves(data, run.config.frequencies)
     u = data.u if run.model.inputs else None
     p = None if data.p is None else data.p[:, at]
-    return replace(
-        data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
-        hold=wanted.hold if u is not None and not data.hold else data.hold,
-    )  # fmt: skip
+    data = replace(data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles)
+    return acting(data, arrival_of(run))
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:

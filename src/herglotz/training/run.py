@@ -12,6 +12,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
+from herglotz.data.holds import Arrival
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.mechanics import Driven
@@ -23,7 +24,7 @@ from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
-from herglotz.training.predict import Prediction, predict
+from herglotz.training.predict import Prediction, arrival_of, predict
 from herglotz.training.summary import as_html, one_line, summary
 
 
@@ -81,6 +82,11 @@ class Run:
             fitted = fitted / (fitted / (JITTER * self.h) - 1e-6).ceil()
         ends = [self.h, *([] if self.setting else (float(fitted.min()), float(fitted.max())))]
         return min(ends) * (1 - 1e-7), max(ends) * (1 + 1e-7)
+
+    @property
+    def arrival(self) -> Arrival:
+        """What happens to recorded inputs before they act: hold, delay and lag; `data.u` is what acts."""
+        return arrival_of(self)
 
     @property
     def setting(self) -> dict[str, Any]:

@@ -43,5 +43,5 @@ def test_the_plan_says_why(settings, expected):
     assert plan.forces["sticking"] is expected
     assert (plan.objective == "trajectory" and "standard errors" in plan.reasons["forces"]) is expected
     assert plan.hold == "zero"
-    assert plan.reasons["hold"] == "the data say so"
+    assert plan.reasons["hold"] == "the data or the settings say so"
     assert torch.isfinite(torch.tensor(plan.start["stiffness"])).all()

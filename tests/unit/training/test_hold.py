@@ -7,13 +7,13 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
-from herglotz.training.hold import with_hold
+from herglotz.training.hold import with_arrival
 
 
 def test_the_hold_of_a_recording_is_found():
     # fails if the wrong samples are compared: inputs held over steps, and a smooth input of the exact motion
     held = replace(simulate(scene("driven_pendulum"), trajectories=2, steps=60, h=0.1, seed=1), hold="")
-    assert with_hold(held, "", held)[0].hold == "zero"
+    assert with_arrival(held, held)[1] == ("zero", 0.0, 0.0)
     t = torch.arange(200, dtype=torch.float64) / 5
     waves = torch.tensor([0.7, 2.0, 4.1], dtype=torch.float64)
     phase = waves * t[:, None]
@@ -21,8 +21,9 @@ def test_the_hold_of_a_recording_is_found():
     gain, loss = 1 - waves**2, 0.2 * waves  # of q'' + 0.2 q' + q = u, driven by cosines
     q = ((gain * c + loss * s) / (gain**2 + loss**2)).sum(1)
     smooth = Trajectories.of(t, q, u=c.sum(1))
-    assert with_hold(smooth, "", smooth)[0].hold == "smooth"
-    assert with_hold(smooth, "first", smooth)[0].hold == "first"
+    assert with_arrival(smooth, smooth)[1].hold == "smooth"
+    smooth = replace(smooth, hold="first")
+    assert with_arrival(smooth, smooth)[1].hold == "first"
 
 
 @pytest.mark.parametrize("seed", [0, 3, 6, 7])
@@ -33,4 +34,4 @@ def test_a_hold_that_explains_no_more_is_not_taken(seed):
     t = torch.arange(200, dtype=torch.float64) / 5
     noise, u = torch.randn(2, 200, generator=make, dtype=torch.float64)
     data = Trajectories.of(t, t.sin() + 0.01 * noise, u=u)
-    assert with_hold(data, "", data)[0].hold == "zero"
+    assert with_arrival(data, data)[1].hold == "zero"

@@ -122,5 +122,5 @@ def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or o
     assert words["fitted to"] == "whole trajectories (trajectory)"
     assert words["noise assumed"] == "0.0123 rad"
     assert words["masses and friction"] == "one mass, and a potential of the named terms alone"
-    idle = ("hold", "drag", "substeps", "restarts", "departures", "continues_probe")
+    idle = ("hold", "delay", "lag", "drag", "substeps", "restarts", "departures", "continues_probe")
     assert not {WORDS[name] for name in idle} & set(words)

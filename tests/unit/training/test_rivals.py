@@ -17,7 +17,8 @@ NOISE = 0.01
 def plan(network):
     plain = {"coulomb": False, "sticking": False, "coupled": False, "diagonal": False, "alike": False}
     return Plan(
-        level="linear", objective="trajectory", network=network, order=2, features=(), hold="", drag=(), substeps=1,
+        level="linear", objective="trajectory", network=network, order=2, features=(), hold="",
+        delay=0.0, lag=0.0, drag=(), substeps=1,
         forces=plain, start={"stiffness": (1.0,), "tilt": (0.0,), "rate": (0.1,)}, outliers=False,
         continues_probe=False, sigma=None, fitted_before=network == "none", restarts=1, departures=(2e-4, 6e-3),
         reasons={"network": "", "objective": ""},

@@ -1,0 +1,115 @@
+"""How a recorded input reaches the machine: later by a delay, and through an actuator's lag.
+
+With the recorded u(t) as its hold has it between samples, the input that acts is u_f of
+
+    lag · u_f′(t) = u(t − delay) − u_f(t),
+
+constant before the first sample. Every hold makes u of straight pieces (polynomials are cut into `PARTS` of them a
+step), and on a piece a + b x that starts at x = 0
+
+    u_f = a + b (x − lag) + (u_f(0) − a + b lag) e^(−x/lag),     ∫u_f = ∫u(t − delay) − lag (u_f − u_f(0)):
+
+values and means are exact. The stepper takes one input a step and sees nothing of this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from herglotz.data.holds import NOT_SAID, Arrival, held
+
+if TYPE_CHECKING:
+    from herglotz.data.trajectories import Trajectories
+
+PARTS = 8  # straight pieces of a polynomial between samples: at nine samples a period they miss it by a thousandth
+
+
+def acting(data: Trajectories, unsaid: Arrival = NOT_SAID) -> Trajectories:
+    """The recording with the inputs that act as its inputs; `unsaid` stands for what it does not say itself."""
+    if data.u is None:
+        return data
+    said = [own if own is not None else other for own, other in zip(data.arrival[1:], unsaid[1:], strict=True)]
+    arrival, u = Arrival(data.hold or unsaid.hold, *said), data.u
+    if any(arrival.late):
+        u = InputPieces.of(arrival.hold, data.t, u, data.lengths).acting(*arrival.late).to(u)
+    return replace(data, u=u, hold=arrival.hold, delay=0.0, lag=0.0)
+
+
+@dataclass(frozen=True)
+class InputPieces:
+    """Recorded inputs as straight pieces, trajectory after trajectory on one axis of time."""
+
+    times: Tensor  # (N,) of the samples
+    begins: Tensor  # (N,) of their trajectories
+    last: Tensor  # (B,) sample that ends each trajectory
+    left: Tensor  # (P,) start of each piece
+    width: Tensor  # (P, 1)
+    value: Tensor  # (P, m) at the start
+    slope: Tensor  # (P, m)
+    leads: Tensor  # (P, 1) bool: the first piece of a trajectory
+    constant: bool  # whether the hold is "zero"
+
+    @classmethod
+    def of(
+        cls,
+        hold: str,  # of the inputs; "" (not said) is "zero"
+        t: Tensor,  # (N,)
+        u: Tensor,  # (N, m) as recorded
+        lengths: Sequence[int],
+    ) -> InputPieces:
+        """The pieces of all trajectories, in float64."""
+        t, u, counts, constant = t.double().cpu(), u.double().cpu(), torch.tensor(lengths), hold in ("", "zero")
+        last = counts.cumsum(0) - 1
+        first = last + 1 - counts
+        spans = t[last] - t[first] + t.diff().abs().max()  # a gap keeps trajectories apart
+        owner = torch.repeat_interleave(torch.arange(len(counts)), counts)
+        begins = (spans.cumsum(0) - spans)[owner]
+        times = t - t[first][owner] + begins
+        steps = torch.ones_like(t, dtype=torch.bool)
+        steps[last] = False
+        parts = PARTS if hold == "smooth" else 1
+        row = steps.nonzero()[:, 0].repeat_interleave(parts)
+        part = torch.arange(parts, dtype=t.dtype).repeat(len(row) // parts) / parts
+        width = (times[row + 1] - times[row])[:, None] / parts
+        value = held(hold, t, u, lengths, row, part)
+        slope = torch.zeros_like(value) if constant else (held(hold, t, u, lengths, row, part + 1 / parts) - value)
+        leads = (torch.isin(row, first) & (part == 0))[:, None]
+        left = times[row] + part * parts * width[:, 0]
+        return cls(times, begins, last, left, width, value, slope / width, leads, constant)
+
+    def acting(self, delay: float, lag: float) -> Tensor:
+        """The inputs that act, (N, m): means over the steps where the hold is "zero", else values at the samples."""
+        lag = max(lag, torch.finfo(self.left.dtype).tiny)
+        a, b, decay = self.value, self.slope, torch.exp(-self.width / lag)
+        forced = a + b * (self.width - lag)
+        end = _scanned(
+            torch.where(self.leads, 0.0, decay), forced - torch.where(self.leads, -b * lag, a - b * lag) * decay
+        )
+        start = torch.where(self.leads, a, torch.cat([a[:1], end[:-1]]))
+        asked = (self.times - delay).maximum(self.begins)
+        at = torch.searchsorted(self.left, asked, right=True) - 1
+        x = (asked - self.left[at])[:, None]
+        value = a[at] + b[at] * (x - lag) + (start[at] - a[at] + b[at] * lag) * torch.exp(-x / lag)
+        if not self.constant:
+            return value
+        area = (self.width * a).cumsum(0) - self.width * a  # before each piece
+        early = (self.times - delay - asked)[:, None]  # before the first sample
+        total = area[at] + a[at] * (x + early) - lag * value
+        mean = torch.cat([total.diff(dim=0) / self.times.diff()[:, None], value[-1:]])
+        mean[self.last] = value[self.last]  # no step starts there
+        return mean
+
+
+def _scanned(factor: Tensor, add: Tensor) -> Tensor:
+    """y_j = factor_j y_{j−1} + add_j of all j at once, by doubling."""
+    by, y, reach = factor, add, 1
+    while reach < len(y) and bool((by > 0).any()):
+        y = torch.cat([y[:reach], y[reach:] + by[reach:] * y[:-reach]])
+        by = torch.cat([by[:reach], by[reach:] * by[:-reach]])
+        reach *= 2
+    return y
