@@ -80,7 +80,8 @@ static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residu
    by_h       (2 hz_N + 1)
    by_input   (2 hz_N + 1, hz_M), where the model takes inputs
 
-   Any of them and `residual` may be null; they are written on success only. */
+   Any of them and `residual` may be null; they are written on success only. A derivative that is not finite is
+   hz_DIVERGED, and the state stays. */
 static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual, hz_real *by_state,
     hz_WITH_U(hz_real *by_input) hz_real *by_h) {
   enum { SIZE = 2 * hz_N + 1, WIDTH = SIZE + 1 + hz_INPUTS * hz_N };
@@ -101,6 +102,11 @@ static inline int hz_step_jacobian(hz_state *state, hz_real h, hz_TAKES_U hz_rea
   hz_push(u, P.push);
 #endif
   hz_slopes(&P, move, slopes);
+  for (i = 0; i < SIZE * WIDTH; i++)
+    if (!hz_finite(slopes[i])) { /* the step exists, but a derivative is beyond the largest number */
+      *state = before;
+      return hz_DIVERGED;
+    }
   for (i = 0; i < SIZE; i++) {
     for (j = 0; by_state && j < SIZE; j++) by_state[i * SIZE + j] = slopes[i * WIDTH + j];
     if (by_h) by_h[i] = slopes[i * WIDTH + SIZE];
@@ -133,8 +139,9 @@ static inline int hz_run_some(hz_state *states, long b, long count, const hz_job
 }
 
 /* hz_rollout of `count` samples, each as it would go by itself up to rounding: registers of them are stepped at once.
-   The outputs hold one sample after the other; statuses[b] receives what hz_rollout would return. Any but `states` may
-   be null. Returns the status of the first sample that failed, or 0, with the flags of any. */
+   Inputs u are (count, steps, hz_M). The outputs hold one sample after the other; statuses[b] receives what hz_rollout
+   would return. Any but `states` may be null. Returns the status of the first sample that failed, or 0, with the flags
+   of any. */
 static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_TAKES_U long steps, long every,
     hz_real *q_out, hz_real *p_out, hz_real *s_out, int *statuses) {
   const hz_job job = {steps, every, &h, 0, 0, hz_WITH_U(u) hz_WITH_U(steps * hz_M) q_out, p_out, s_out, 0, 0, 0};
