@@ -70,7 +70,7 @@ MUTANTS = [
     ("scenes/lobatto.py", "(2 * degrees[1:] + 1)", "(2 * degrees[1:] - 1)"),
     ("scenes/lobatto.py", "(-1.0) ** np", "(1.0) ** np"),
     ("scenes/lobatto.py", "x = 0.5 * (x - x[::-1])", "x = 0.5 * (x + x[::-1])"),
-    ("scenes/lobatto.py", "2 / (count - 1))", "2 / (2 * count - 1))"),
+    ("scenes/lobatto.py", "norm = 2 / (2 * degrees + 1)", "norm = 2 / (2 * degrees - 1)"),
     ("scenes/lobatto.py", "2 / (count * (count - 1)", "2 / (count * (count + 1)"),
     ("scenes/lobatto.py", "P[:, 2:] - P[:, :-2]", "P[:, 2:] + P[:, :-2]"),
     ("scenes/lobatto.py", "integral[:, 0] = x + 1", "integral[:, 0] = x"),
