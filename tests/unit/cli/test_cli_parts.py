@@ -9,7 +9,7 @@ import torch
 
 from herglotz.cli import _internal, main, rollout
 from herglotz.cli.common import print_table
-from herglotz.cli.interrupts import SIGNALS, orderly
+from herglotz.cli import SIGNALS, _orderly
 from herglotz.cli.tune import _whole
 from herglotz.errors import InputError
 
@@ -40,10 +40,10 @@ def test_a_program_that_calls_a_command_keeps_its_signals():
     # fails if the handlers of a command outlive one that ended, or come back while an interrupted one ends
     before = [signal.getsignal(one) for one in SIGNALS]
     try:
-        with orderly():
+        with _orderly():
             assert all(signal.getsignal(one) not in before for one in SIGNALS)
         assert [signal.getsignal(one) for one in SIGNALS] == before
-        with pytest.raises(KeyboardInterrupt), orderly():
+        with pytest.raises(KeyboardInterrupt), _orderly():
             signal.raise_signal(signal.SIGTERM)
         assert all(signal.getsignal(one) not in before for one in SIGNALS)
     finally:
