@@ -150,7 +150,7 @@ def test_a_delay_and_a_lag_are_told_apart():
     assert abs((delay + lag) / H - 2.5) < 0.1
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1, 1.0])
 def test_nothing_is_found_where_there_is_nothing(noise):
     # fails if a gain that chance or the linear model's own error makes is taken for a delay
     data = oscillator(noise=noise, seed=3)
