@@ -65,7 +65,8 @@ test-pythons: .venv/installed
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow
 
-# Break the geometry line by line; every mutant must be noticed (several minutes).
+# Break the package place by place: 25 mutants a room and more, each to be noticed by the tests of its own room. It can
+# be stopped and goes on where it was; CONTRIBUTING.md has what was noticed.
 mutants: .venv/installed
 	$(ENV) $(PY) tests/mutants.py
 

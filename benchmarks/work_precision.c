@@ -1,5 +1,5 @@
-/* What a learned stepper is compared with, in C: RK4, DOP853, implicit midpoint and leapfrog on y' = f(y), with f of the
-   true equations or a neural network. Compiled by work_precision_native.py with -DSYSTEM=... -DDOF=... -Dreal=...;
+/* What a learned stepper is compared with, in C: RK4, DOP853 and leapfrog on y' = f(y), with f of the
+   true equations or a neural network. Compiled by work_precision_rivals.py with -DSYSTEM=... -DDOF=... -Dreal=...;
    `dop853_step.h` is generated there from the coefficients in scipy. y is (q, v), of the rigid body (angles, angular
    velocity in the body). */
 #include <math.h>
@@ -189,28 +189,6 @@ static void rk4(real *y, real h, long steps) {
   }
 }
 
-/* y1 = y + h f((y + y1)/2) by fixed-point iteration from an Euler step: cheaper than Newton at these steps. */
-static void implicit_midpoint(real *y, real h, long steps) {
-  const real tol = sizeof(real) == 4 ? (real)1e-7 : (real)1e-13;
-  real k[D], z[D];
-  int d, i;
-  while (steps--) {
-    rhs(y, k);
-    for (i = 0; i < 50; i++) {
-      real change = 0, last[D];
-      memcpy(last, k, sizeof k);
-      for (d = 0; d < D; d++) z[d] = y[d] + h / 2 * last[d];
-      rhs(z, k);
-      for (d = 0; d < D; d++) {
-        const real e = fabs(k[d] - last[d]) * h, size = tol * (1 + fabs(y[d]));
-        if (e > size) change = 1;
-      }
-      if (change == 0) break;
-    }
-    for (d = 0; d < D; d++) y[d] += h * k[d];
-  }
-}
-
 #ifdef SEPARABLE
 /* damp(h/2) kick(h/2) drift(h) kick(h/2) damp(h/2), one force a step: the method of the explicit C stepper. */
 static void leapfrog(real *y, real h, long steps) {
@@ -263,7 +241,8 @@ static real dop853(real *y, real T, real tol, real h) {
 }
 
 /* `samples` motions of `segments` segments of length dt each; out is (samples, segments, 2N). method 0: RK4, 1: DOP853,
-   2: implicit midpoint, 3: leapfrog, 4: DOP853 with equal steps and no error estimate. x is the tolerance of DOP853, else the number of steps in a segment. `inputs` holds
+   2: leapfrog, 3: DOP853 with equal steps and no error estimate. x is the tolerance of DOP853, else the number of steps
+   in a segment. `inputs` holds
    the torque of each segment, or is null. Each motion waits for the one before, as in a loop of control: `wait` is 0.
    Returns the evaluations of f. */
 long motions(long samples, long segments, double dt, int method, double x, double wait, const double *inputs,
@@ -281,8 +260,7 @@ long motions(long samples, long segments, double dt, int method, double x, doubl
       if (inputs) input = (real)inputs[k];
       if (method == 0) rk4(y, (real)(dt / x), (long)x);
       else if (method == 1) h = dop853(y, (real)dt, (real)x, h);
-      else if (method == 2) implicit_midpoint(y, (real)(dt / x), (long)x);
-      else if (method == 4) fixed8(y, (real)(dt / x), (long)x);
+      else if (method == 3) fixed8(y, (real)(dt / x), (long)x);
 #ifdef SEPARABLE
       else leapfrog(y, (real)(dt / x), (long)x);
 #endif

@@ -1,15 +1,14 @@
-"""Error against cost, for every way to step: `python benchmarks/work_precision.py [--quick] [--scenes a,b] [--resume]`.
+"""Error against cost, for every way to step: `python benchmarks/work_precision.py [--scenes a,b]`.
 
-Eight scenes. In C: learned steppers (their own step, larger steps re-trained, several widths and depths, float64,
-float32, bfloat16 weights, loose Newton; large steps of a few learned kicks), RK4, DOP853 (adaptive and with equal
-steps), implicit midpoint and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same
-data. In PyTorch: discrete Lagrangians of order 1 to 6, compositions, and the learned model eager, as ONNX and by
-AOTInductor. Needs scipy.
+Eight scenes, all in C: learned steppers (their own step, larger steps re-trained, several widths and depths, float64
+and float32; large steps of a few learned kicks; with terms more and less), RK4, DOP853 (adaptive and with equal steps)
+and leapfrog on the true equations, and RK4 and DOP853 on neural ODEs trained on the same data. Needs scipy.
 
 Error: largest |q − exact| at 4 times up to T, of motions from unseen starts (median, and 95 % of them), in units of q.
-Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn; rules in
-PyTorch: of 4 motions at once, one round), the same in steps of C leapfrog, evaluations and flops beside it.
-Written: work_precision.json after each scene, .md and .png.
+Cost: processor time in µs of one motion per unit of simulated time (the least of several rounds in turn), the same in
+steps of C leapfrog, evaluations and flops beside it. Written after each scene, beside those of earlier runs:
+work_precision.json and .md. `--page` only puts the table of terms into docs/work_precision.md, where it stands between
+`<!-- terms -->` and `<!-- /terms -->`; nothing there is typed in.
 
 `--headline` measures two scenes over several training seeds instead, into headline.json and .md: learned kicks on the
 damped pendulum and a learned equation on the double pendulum, beside neural ODEs trained on the same motions and what
@@ -20,7 +19,6 @@ that is as accurate on the judging half itself, a choice no user can make.
 
 from __future__ import annotations
 
-import math
 import statistics
 import sys
 import time
@@ -34,24 +32,10 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from benchmarks.work_precision_rivals import classical, equation, neural
-from benchmarks.work_precision_ways import SETUPS, TOLD, Timed, analytic, costs, kicks, learned, prepare
-from herglotz.plots.style import SERIES, new_figure, styled
+from benchmarks.work_precision_ways import SETUPS, TOLD, Timed, costs, kicks, learned, prepare
 
+PAGE = harness.ROOT / "docs" / "work_precision.md"
 WANTED = {"damped_pendulum": (1e-2, 1e-3, 1e-4, 2e-5), "double_pendulum": (2e-2, 5e-3, 1e-3)}  # errors of the headline
-# Families of the figure, each with what its kinds begin with; the first that fits.
-FAMILIES = (
-    ("learned kicks (C)", ("learned kicks",)),
-    ("learned equation (C)", ("learned equation",)),
-    ("learned, C", ("learned",)),
-    ("neural ODE (C)", ("neural ODE",)),
-    ("DOP853 (C)", ("DOP853",)),
-    ("RK4 (C)", ("RK4",)),
-    ("leapfrog (C)", ("leapfrog",)),
-    ("implicit midpoint (C)", ("implicit midpoint",)),
-    ("rules and compositions (PyTorch)", ("",)),
-)
-SLOW, SLOW_LEARNED = ("eager", "ONNX", "AOTInductor", "torch.compile"), "learned (PyTorch, ONNX)"
-COLOURS = (*SERIES, "#7F7F7F", "#8C564B", "#332288", "#BCBD22")
 RIVALS = (
     ("neural ODE", lambda p: p["kind"].startswith("neural ODE")),
     ("DOP853", lambda p: p["kind"] == "DOP853, true equations"),
@@ -61,13 +45,6 @@ RIVALS = (
 )
 
 
-def family(p: dict) -> str:
-    """The family of a point."""
-    if p["kind"].startswith("learned") and p.get("artefact") in SLOW:
-        return SLOW_LEARNED
-    return next(name for name, starts in FAMILIES if p["kind"].startswith(starts))
-
-
 def front(points: list[dict]) -> list[dict]:
     """Points that no other beats in both error and cost, cheapest first."""
     kept: list[dict] = []
@@ -75,9 +52,6 @@ def front(points: list[dict]) -> list[dict]:
         if not kept or p["median"] < kept[-1]["median"]:
             kept.append(p)
     return kept
-
-
-NOT_TERMS = ("learned, bf16 weights",)
 
 
 # What a fit with another set of terms lacks or has besides, where its label does not say it.
@@ -104,7 +78,7 @@ def terms(scenes: dict[str, list[dict]]) -> list[str]:
             rows.append([f"**{name}**", f"**{TERMS[name]}**", f"{own['us_per_time'] * own['h']:.2g}", _error(own), ""])
         for p in points:
             label = p["kind"][9:]
-            if not p["kind"].startswith("learned, ") or not p["setting"].startswith(label) or p["kind"] in NOT_TERMS:
+            if not p["kind"].startswith("learned, ") or not p["setting"].startswith(label):
                 continue
             times = ""
             if own is not None:
@@ -142,65 +116,14 @@ def markdown(result: dict[str, Any]) -> str:
                          *("" if c is None else f"{c:.3g}" for c in work), f"{p['median']:.2g}",
                          "" if p["q95"] is None else f"{p['q95']:.2g}"])  # fmt: skip
         lines += ["", f"## {name}", "", *harness.table(head, rows)]
-        if rows := knob_rows(points):
-            lines += ["", *harness.table(("knob", "setting", "µs per time", "median"), rows)]
     return "\n".join([*lines, *terms(result["scenes"])])
-
-
-ON_FRONT = ("learned", "learned, distilled", "learned kicks")  # shown there; all others are knobs or terms
-
-
-def knob_rows(points: list[dict]) -> list[list[str]]:
-    """Settings that are off the front and stand for a knob."""
-    learned = [p for p in points if p["kind"].startswith("learned") and p["kind"] not in ON_FRONT]
-    return [[p["kind"], p["setting"], f"{p['us_per_time']:.3g}", _error(p)] for p in learned]
 
 
 def _error(p: dict) -> str:
     return "fails" if p["median"] is None else f"{p['median']:.2g}"
 
 
-def draw(scenes: dict[str, list[dict]], path: Path) -> None:
-    """A panel a scene: every setting as a faint dot, the front of every family as a line; learned ones are thick."""
-    order = [*(n for n, _ in FAMILIES[:3]), SLOW_LEARNED, *(n for n, _ in FAMILIES[3:])]
-    styles = {name: {"color": colour, "marker": marker, "zorder": 3 if name.startswith("learned") else 2}
-              for name, colour, marker in zip(order, COLOURS, "o*sD^vPX<>", strict=True)}  # fmt: skip
-    with styled():
-        columns = min(4, len(scenes))
-        rows = -(-len(scenes) // columns)
-        figure = new_figure(4.4 * columns, 3.7 * rows + 0.7, "Error against cost: lower left is better")
-        axes = list(figure.subplots(rows, columns, squeeze=False).flat)
-        for ax in axes[len(scenes) :]:
-            ax.set_visible(False)
-        handles: dict[str, Any] = {}
-        for ax, (name, points) in zip(axes, scenes.items(), strict=False):
-            _panel(ax, name, points, styles, handles)
-        shown = [n for n in order if n in handles]
-        keys = [handles[n] for n in shown]
-        figure.legend(keys, shown, loc="outside lower center", ncols=columns + 1, fontsize=8)
-        harness.picture(figure, path)
-
-
-def _panel(ax: Any, name: str, points: list[dict], styles: dict[str, Any], handles: dict[str, Any]) -> None:
-    """One scene; `handles` receives a line a family."""
-    for kind in styles:
-        mine = [p for p in points if family(p) == kind and p["median"] and math.isfinite(p["median"])]
-        thick = kind.startswith("learned")
-        for some, size, faint in ((mine, 3, 0.25), (front(mine), 6 if thick else 4, 1.0)) if mine else ():
-            x, y = [p["us_per_time"] for p in some], [max(p["median"], 1e-13) for p in some]
-            width = 0 if faint < 1 else 2.2 if thick else 1.0
-            (handles[kind],) = ax.plot(x, y, lw=width, ms=size, alpha=faint, **styles[kind])
-    ax.set(xscale="log", yscale="log", title=name.replace("_", " "))
-    ax.set(xlabel="µs per unit of time", ylabel="median error of q")
-    ax.set_ylim(top=10)
-
-
-def spread_of(points: list[dict]) -> float:
-    """The median of spread over cost: how far to trust a time."""
-    return statistics.median(p["spread"] / p["us_per_time"] for p in points if p["us_per_time"] > 0)
-
-
-def study(name: str, seeds: int, quick: bool, say: Callable[[str], None]) -> dict[str, Any]:
+def study(name: str, seeds: int, say: Callable[[str], None]) -> dict[str, Any]:
     """Every seed's learned and neural settings and the classical ones, timed together; the ratios of each seed."""
     setup = SETUPS[name]
     if name == "double_pendulum":
@@ -209,13 +132,13 @@ def study(name: str, seeds: int, quick: bool, say: Callable[[str], None]) -> dic
     seconds = []
     for seed in range(seeds):
         say(f"seed {seed}")
-        case = prepare(setup, quick, seed)
-        mine = kicks(case, quick) + equation(case, quick) + neural(case, quick)
+        case = prepare(setup, seed)
+        mine = kicks(case) + equation(case) + neural(case)
         timed += [replace(t, point={**t.point, "seed": seed}) for t in mine]
         seconds.append(case.seconds)
         if seed == 0:
-            timed += classical(case, quick)
-    found = costs(timed, 3 if quick else 9)
+            timed += classical(case)
+    found = costs(timed)
     rows = {e: [chosen(found, e, w, seeds) for w in WANTED[name]] for e in ("median", "q95")}
     return {"seeds": seeds, "seconds": seconds, "rows": rows, "points": found}
 
@@ -277,66 +200,61 @@ def middle(values: list[float | None]) -> str:
     return text if len(known) == len(values) else f"{text}, not reached by {len(values) - len(known)}"
 
 
-def measure_headline(path: Path, names: list[str], seeds: int, quick: bool) -> None:
+def measure_headline(path: Path, names: list[str], seeds: int) -> None:
     """Two scenes over several seeds, into headline.json and .md; the points themselves are not stored."""
     scenes = harness.load(path, {"scenes": {}})["scenes"]
     for name in names:
-        found = study(name, seeds, quick, lambda what, name=name: print(name, what, flush=True))
+        found = study(name, seeds, lambda what, name=name: print(name, what, flush=True))
         scenes[name] = {k: v for k, v in found.items() if k != "points"} | {"measured": harness.conditions()}
         tables = [line for scene, one in scenes.items() for line in study_table(scene, one)]
         harness.store(path, {"scenes": scenes}, "\n".join(["# Cost of the others over the learned stepper's", *tables]))
 
 
-def measure_scene(name: str, result: dict[str, Any], quick: bool, only: str | None, say: Callable[[str], None]) -> None:
+def measure_scene(name: str, result: dict[str, Any], say: Callable[[str], None]) -> None:
     """Every setting of a scene, into the result."""
-    began, found, notes = time.process_time(), [], {}
-    setup = SETUPS[name]
-    if only != "learned":
-        say("rules")
-        found += analytic(setup, quick)
-    if only != "analytic":
-        say("fit")
-        case = prepare(setup, quick)
-        timed = []
-        for ways in (learned, equation, classical, neural):
-            say(ways.__name__)
-            timed += ways(case, quick)
-        say("timing")
-        found += costs(timed, 3 if quick else 9)
-        notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
-    result["scenes"][name] = found
-    notes |= {"T": setup.T, "h": setup.h, "spread": spread_of(found), "total_seconds": time.process_time() - began}
-    result["notes"][name] = notes
+    began, setup, timed = time.process_time(), SETUPS[name], []
+    say("fit")
+    case = prepare(setup)
+    for ways in (learned, equation, classical, neural):
+        say(ways.__name__)
+        timed += ways(case)
+    say("timing")
+    result["scenes"][name] = costs(timed)
+    notes = {"seconds": case.seconds, "one_step_rms": case.run.metrics["one_step_rms"]}
+    result["notes"][name] = {**notes, "T": setup.T, "h": setup.h, "total_seconds": time.process_time() - began}
+
+
+def page() -> str:
+    """docs/work_precision.md with the table of terms as the stored results have it."""
+    begin, end = "<!-- terms -->\n", "<!-- /terms -->\n"
+    before, rest = PAGE.read_text().split(begin)
+    lines = terms(harness.load(harness.RESULTS / "work_precision.json", {})["scenes"])[3:]
+    return before + begin + "\n".join(lines) + "\n" + end + rest.split(end)[1]
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = harness.parser(__doc__, quick=True)
+    parser = harness.parser(__doc__)
     parser.add_argument("--scenes", help="with commas (default: all)")
-    parser.add_argument("--resume", action="store_true", help="keep the scenes that are stored already")
-    parser.add_argument("--only", choices=("analytic", "learned"), help="one half of the settings")
     parser.add_argument("--headline", action="store_true", help="two scenes, several training seeds")
     parser.add_argument("--seeds", type=int, default=5, help="training seeds of the headline (default 5)")
+    parser.add_argument("--page", action="store_true", help="only write the table of terms into the page")
     arguments = parser.parse_args(argv)
+    if arguments.page:
+        PAGE.write_text(page())
+        return
     names = harness.chosen(parser, arguments.scenes, WANTED if arguments.headline else SETUPS, "scene")
     path = harness.json_file(arguments, "headline" if arguments.headline else "work_precision")
     if arguments.headline:
-        measure_headline(path, names, arguments.seeds, arguments.quick)
+        measure_headline(path, names, arguments.seeds)
         return
-    result = {**harness.conditions(), "quick": arguments.quick, "scenes": {}, "notes": {}}
-    if arguments.resume:
-        result |= {k: harness.load(path, result)[k] for k in ("scenes", "notes")}
-    with tqdm([n for n in names if n not in result["scenes"]], disable=None) as bar:
+    earlier = harness.load(path, {"scenes": {}, "notes": {}})
+    result = {**harness.conditions(), "scenes": earlier["scenes"], "notes": earlier["notes"]}
+    with tqdm(names, disable=None) as bar:
         for name in bar:
-            say = lambda what, name=name: bar.set_postfix_str(f"{name}: {what}")  # noqa: E731
-            measure_scene(name, result, arguments.quick, arguments.only, say)
+            measure_scene(name, result, lambda what, name=name: bar.set_postfix_str(f"{name}: {what}"))
             result["scenes"] = {name: result["scenes"][name] for name in SETUPS if name in result["scenes"]}
             add_leapfrog_unit(result)
             harness.store(path, result, markdown(result))
-            draw(result["scenes"], path.with_suffix(".png"))
-    for name in names:
-        print(f"{name}: the front")
-        for p in front(result["scenes"][name]):
-            print(f"  {p['us_per_time']:>10.3g} µs/time  {p['median']:>8.2g}  {p['kind']}: {p['setting']}")
 
 
 if __name__ == "__main__":

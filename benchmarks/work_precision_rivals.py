@@ -36,7 +36,7 @@ SYSTEMS = {"damped_pendulum": 0, "double_pendulum": 1, "damped_oscillator": 2, "
            "driven_pendulum": 6, "rigid_body": 7}  # fmt: skip
 NETWORK = 9  # of SYSTEM in work_precision.c
 # Numbers of work_precision.c.
-METHODS = {"RK4": 0, "DOP853": 1, "implicit midpoint": 2, "leapfrog": 3, "DOP853 fixed": 4}
+METHODS = {"RK4": 0, "DOP853": 1, "leapfrog": 2, "DOP853 fixed": 3}
 SEPARABLE = ("damped_pendulum", "damped_oscillator", "kepler", "chain", "driven_pendulum")
 REAL = {"float64": "double", "float32": "float"}
 
@@ -251,8 +251,8 @@ def train_neural_ode(data: Any, setup: Setup, width: int, layers: int, iteration
     return Weights(found.x.detach(), n, width, layers, angles)
 
 
-def classical(case: Case, _quick: bool) -> list[Timed]:
-    """RK4, DOP853, implicit midpoint and leapfrog on the true equations."""
+def classical(case: Case) -> list[Timed]:
+    """RK4, DOP853 and leapfrog on the true equations."""
     setup, name = case.setup, case.setup.name
     v = setup.scene.velocity(*case.start)
     if name == "rigid_body":
@@ -275,8 +275,6 @@ def _settings(method: str, dtype: str) -> list[float]:
         return [10.0**-k for k in range(1, 11 if double else 6)]
     if method == "DOP853 fixed":
         return [1, 2, 3, 4, 6, *([8, 12] if double else [])]
-    if method == "implicit midpoint":
-        return [8, 32, 128]
     if method == "leapfrog":
         return [8, 16, 32, 128, *([512] if double else [])]
     return [4, 6, 8, 12, 16, 24, 32, *([64, 128] if double else [])]
@@ -300,18 +298,17 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
     return Timed({**point, **errors, **more}, library.timing(y, setup.T, segments, method, x, u), setup.T)
 
 
-def neural(case: Case, quick: bool) -> list[Timed]:
+def neural(case: Case) -> list[Timed]:
     """Neural ODEs of several sizes, by RK4 and DOP853."""
     setup = case.setup
     if not setup.neural:
         return []
     size = {"trajectories": setup.trajectories, "steps": setup.steps, "h": setup.h, "seed": case.seed}
     data = simulate(setup.scene, **size, keep_state=True)
-    sizes, iterations = setup.neural, setup.neural_iterations
     y = torch.cat([case.start.q, setup.scene.velocity(*case.start)], -1)
     found, began = [], time.process_time()
-    for width, layers in sizes[:1] if quick else sizes:
-        weights: Weights = train_neural_ode(data, setup, width, layers, 10 if quick else iterations, case.seed)
+    for width, layers in setup.neural:
+        weights: Weights = train_neural_ode(data, setup, width, layers, setup.neural_iterations, case.seed)
         for dtype in ("float64", "float32"):
             library = Native(setup.name, dtype, weights, setup.scene.dof)
             for method in ("RK4", "DOP853"):
@@ -329,7 +326,7 @@ def body_velocity(q: Tensor, v: Tensor) -> Tensor:
     return torch.stack([roll - yaw * sp, pitch * cr + yaw * cp * sr, yaw * cp * cr - pitch * sr], -1)
 
 
-def equation(case: Case, _quick: bool) -> list[Timed]:
+def equation(case: Case) -> list[Timed]:
     """RK4 and DOP853 on the *learned* Lagrangian's own Herglotz equation, in C: no contact map, nothing is solved.
 
     For two links told as such; the entry is the learned model's, from two positions.

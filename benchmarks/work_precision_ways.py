@@ -1,20 +1,15 @@
 """The ways to step that `work_precision.py` compares, without the rivals: scenes, fits, and how each way is timed.
 
 A way is a `Timed`: a point of the plot with its errors, and what `herglotz.tune.cost` times. Learned steppers
-come in every form, at the step of the data and at larger ones, with terms more and less; rules and compositions on the
-true Lagrangian are timed in PyTorch.
+come in C, at the step of the data and at larger ones, with terms more and less.
 """
 
 from __future__ import annotations
 
-import copy
 import math
-import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import torch
@@ -23,9 +18,9 @@ from torch import Tensor
 from herglotz.data import simulate
 from herglotz.data.simulate import uniform
 from herglotz.errors import InputError
-from herglotz.export import compile_c, export_aoti, export_onnx, load_onnx, load_pt2
+from herglotz.export import compile_c
 from herglotz.scenes import scene
-from herglotz.stepping import State, Stepper, kahan_li, suzuki, yoshida
+from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit
 from herglotz.tune.cost import Timed as Timing
 from herglotz.tune.cost import measure_costs, timed_stepping
@@ -36,8 +31,7 @@ from herglotz.tune.reference import JITTER, draw_starts, record
 
 CHECKS = 4  # times at which errors are taken
 COUNT = 192  # motions whose errors are taken: half to choose a setting by, half to judge it
-RULE_MOTIONS = 4  # motions of a rule in PyTorch, which share their time
-PATIENCE = 1.5  # seconds of a rule after which no finer step of it is tried
+ROUNDS = 9  # of timings of each setting, in turn
 # What a user knows of two links.
 TOLD = {"features": ("pendulums",), "order": 4, "correction_width": 0, "mass_width": 0}
 
@@ -56,19 +50,12 @@ class Setup:
     kick_steps: tuple[int, ...] = ()  # in h
     neural: tuple[tuple[int, int], ...] = ((8, 1),)  # width and depth of the neural ODEs
     neural_iterations: int = 60
-    rules: tuple[int, ...] = (1, 2, 4)  # steps of analytic rules in one h
-    # What a term of the model brings, or costs where it is not needed: the same data fitted without it, or with it.
     other: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
 
     @property
     def scene(self) -> Any:
         """The scene itself."""
         return scene(self.name)
-
-    @property
-    def held(self) -> int | None:
-        """Number of steps h over which an input is held one after the other; None without inputs."""
-        return round(self.T / self.h) if self.scene.drive is not None else None
 
     def inputs(self) -> Tensor | None:
         """(T/h, m) the input of each step of the data."""
@@ -102,7 +89,7 @@ SETUPS = {
         Setup("damped_oscillator", 0.5, 12.0, {"potential_width": 0, "correction_width": 8}, kick_steps=(2, 6),
               other=_others("level conservative", "level affine", "potential network", "no correction")),
         Setup("damped_pendulum", 0.5, 12.0, {"correction_width": 16, "iterations": 300}, 40, 40, (2, 3), (2, 3, 6),
-              ((4, 1), (8, 1), (8, 2), (16, 2)), 200, (1, 2, 4, 8),
+              ((4, 1), (8, 1), (8, 2), (16, 2)), 200,
               _others("level conservative", "level affine", "no correction")),
         Setup("double_pendulum", 0.05, 2.4, {"correction_width": 16, "mass_width": 8, "iterations": 120},
               multiples=(2, 3), neural=((8, 1), (16, 2)), neural_iterations=120,
@@ -164,9 +151,9 @@ class Timed:
     h: float
 
 
-def costs(timed: list[Timed], rounds: int) -> list[dict]:
+def costs(timed: list[Timed]) -> list[dict]:
     """The points with their costs: the least of all rounds, in turn, and how far the middle one lies above it."""
-    measured = zip(timed, measure_costs([one.timing for one in timed], rounds), strict=True)
+    measured = zip(timed, measure_costs([one.timing for one in timed], ROUNDS), strict=True)
     return [{**t.point, "us_per_time": c.step_us / t.h, "spread": c.spread_us / t.h} for t, c in measured]
 
 
@@ -183,15 +170,15 @@ class Case:
     seed: int = 0
 
 
-def prepare(setup: Setup, quick: bool, seed: int = 0) -> Case:
+def prepare(setup: Setup, seed: int = 0) -> Case:
     """Fit the model to positions, and enter it from two positions as a user must."""
     system = setup.scene
-    size = (10, 20) if quick else (setup.trajectories, setup.steps)
-    data = simulate(system, trajectories=size[0], steps=size[1], h=setup.h, seed=seed, keep_state=True)
+    size = {"trajectories": setup.trajectories, "steps": setup.steps, "h": setup.h}
+    data = simulate(system, **size, seed=seed, keep_state=True)
     began = time.process_time()
-    run = fit(replace(data, s=None, p=None), fit_config(setup, quick, seed=seed), progress=False)
+    run = fit(replace(data, s=None, p=None), fit_config(setup, seed=seed), progress=False)
     took = {"fit": time.process_time() - began}
-    first = starts_of(system, 16 if quick else COUNT, 1000)
+    first = starts_of(system, COUNT, 1000)
     u = setup.inputs()
     before = system if u is None else system.at(u[0])
     start = State(*before.flow(*first, setup.h))
@@ -206,11 +193,9 @@ def entered(setup: Setup, run: Run, first: State, start: State) -> State:
     return State(*(x.detach() for x in entry))
 
 
-def fit_config(setup: Setup, quick: bool, **changes: Any) -> FitConfig:
+def fit_config(setup: Setup, **changes: Any) -> FitConfig:
     options = {"level": "linear", "iterations": 60, **setup.fit, **changes}
-    iterations = options.pop("iterations")
-    iterations = 10 if quick else iterations
-    return FitConfig(train_fraction=1.0, objective="residual", iterations=iterations, departures=(2e-3,), **options)
+    return FitConfig(train_fraction=1.0, objective="residual", departures=(2e-3,), **options)
 
 
 def rolled(case: Case, stepper: Any, h: float, dtype: torch.dtype = torch.float64) -> dict[str, float | None]:
@@ -247,77 +232,10 @@ def motions_of(case: Case) -> State:
     return record(run, State(starts.q, starts.p, starts.s[:, 0]), case.setup.T).states
 
 
-ORDERS = {"left": 1, "right": 1, "midpoint": 2, "midpoint_heun": 2, "trapezoid_heun": 2, "strang": 2, "lobatto4": 4,
-          "lobatto6": 6, "strang_exponential": 2}  # fmt: skip
-COMPOSED = ((yoshida, 4), (suzuki, 4), (kahan_li, 6))  # with their orders
-
-
-class Counted:
-    """A discrete Lagrangian that counts its evaluations, with those of the Lagrangians that an input makes of it."""
-
-    def __init__(self, L_d: Any, owner: Counted | None = None):
-        self.L_d, self.count, self.owner = L_d, 0, owner or self
-        if hasattr(L_d, "partials"):
-            self.partials = lambda *x, **options: self._counted(L_d.partials, *x, **options)
-        if hasattr(L_d, "at"):
-            self.at = lambda u: Counted(L_d.at(u), self.owner)
-
-    def __call__(self, *arguments: Tensor) -> Tensor:
-        """The Lagrangian itself."""
-        return self._counted(self.L_d, *arguments)
-
-    def _counted(self, call: Callable[..., Any], *arguments: Any, **options: Any) -> Any:
-        self.owner.count += 1
-        return call(*arguments, **options)
-
-
-def analytic(setup: Setup, quick: bool) -> list[dict]:
-    """Every rule and composition of a scene at several steps."""
-    system = setup.scene
-    start = starts_of(system, RULE_MOTIONS, 1)
-    truth = exact_motion(setup, start)
-    found = []
-    for kind, label, L_d, make in _methods(setup):
-        for parts in setup.rules[-2:] if quick else setup.rules:
-            one, seconds = _measured(setup, L_d, make, parts, start, truth)
-            order = ORDERS.get(kind, int(kind[-1]) if kind[-1].isdigit() else None)
-            found.append({"kind": kind, "setting": f"{label}, h {setup.h / parts:.4g}", "order": order, **one})
-            if seconds > PATIENCE:
-                break
-    return found
-
-
-def _methods(setup: Setup) -> list[tuple[str, str, Any, Any]]:
-    """Kind, label, L_d and stepper of every rule and composition."""
-    system, driven = setup.scene, setup.held is not None
-    rules = {name: system.L_d_rules[name] for name in ORDERS if name in system.L_d_rules}
-    if driven:  # rules that take no input for each step are left out
-        rules = {name: L_d for name, L_d in rules.items() if hasattr(L_d, "at")}
-    if system.exact:
-        rules["exact"] = system.L_d
-    methods: list[tuple[str, str, Any, Any]] = [(r, r, L_d, Stepper) for r, L_d in rules.items()]
-    for make, order in COMPOSED if "strang" in rules and not driven else ():
-        name = f"{make.__name__}{order}"
-        methods.append((name, f"{name}(strang)", rules["strang"], partial(make, order=order)))
-    return methods
-
-
-def _measured(setup: Setup, L_d: Any, make: Any, parts: int, start: State, truth: Tensor) -> tuple[dict, float]:
-    counted = Counted(L_d)
-    steps, u = round(setup.T / setup.h) * parts, setup.inputs()
-    options = {} if u is None else {"inputs": u.repeat_interleave(parts, 0)}
-    with torch.no_grad():
-        began = time.process_time()
-        q = make(counted).rollout(*start, h=setup.h / parts, steps=steps, **options).q[:, 1:]
-        seconds = time.process_time() - began
-    cost = {"us_per_time": 1e6 * seconds / setup.T, "spread": 0.0, "evaluations_per_time": counted.count / setup.T}
-    form = {"artefact": "eager", "dtype": "float64", "batch": RULE_MOTIONS, "h": setup.h / parts}
-    return {**errors_of(q[:, steps // CHECKS - 1 :: steps // CHECKS], truth), **cost, **form}, seconds
-
-
-def learned(case: Case, quick: bool) -> list[Timed]:
-    """Everything learned of one scene."""
-    return [*_own(case, quick), *_distilled(case, quick), *_other_terms(case, quick), *kicks(case, quick)]
+def learned(case: Case) -> list[Timed]:
+    """Everything learned of one scene, its own model first."""
+    own = _forms(case, case.run.model, case.setup.h, "learned", "own model")
+    return [*own, *_distilled(case), *_other_terms(case), *kicks(case)]
 
 
 def _evaluations(model: Any, case: Case, h: float) -> tuple[float, float]:
@@ -338,12 +256,10 @@ def _evaluations(model: Any, case: Case, h: float) -> tuple[float, float]:
     return each / h, each / h * 2 * weights * (1 + n if explicit else 1 + n + n * (n + 1) / 2)
 
 
-def _timed(
-    case: Case, stepper: Any, h: float, kind: str, setting: str, artefact: str = "C", dtype: str = "float64"
-) -> Timed:
-    """A stepper with its errors, to be timed."""
+def _timed(case: Case, stepper: Any, h: float, kind: str, setting: str, dtype: str) -> Timed:
+    """A stepper in C with its errors, to be timed."""
     number = getattr(torch, dtype)
-    point = {"kind": kind, "setting": setting, "h": h, "dtype": dtype, "artefact": artefact}
+    point = {"kind": kind, "setting": setting, "h": h, "dtype": dtype, "artefact": "C"}
     start = State(*(x.to(number).contiguous() for x in case.entry))
     timing = timed_stepping(stepper, start, h, round(case.setup.T / h))
     return Timed({**point, **rolled(case, stepper, h, number)}, timing, h)
@@ -357,52 +273,26 @@ def _forms(
     found = []
     for dtype in dtypes:
         stepper = compile_c(model, h=h, dtype=dtype)
-        one = _timed(case, stepper, h, kind, f"{label}, h {h:.4g}, C {dtype}", dtype=dtype)
+        one = _timed(case, stepper, h, kind, f"{label}, h {h:.4g}, C {dtype}", dtype)
         one.point.update(evaluations_per_time=evaluations, flops_per_time=flops)
         found.append(one)
     return found
 
 
-def _own(case: Case, quick: bool) -> list[Timed]:
-    """The run's own model: C, eager, weights rounded to bfloat16, loose Newton in C, ONNX and AOTInductor."""
-    model, h = case.run.model, case.setup.h
-    found = _forms(case, model, h, "learned", "own model")
-    found.append(_timed(case, Stepper(model), h, "learned, eager", "own model, eager", "eager"))
-    if not model.linear_in_q1:
-        label, loose = "own model, eager, tol 0.0001", Stepper(model, tol=1e-4)
-        found.append(_timed(case, loose, h, "learned, eager", label, "eager"))
-        loose = compile_c(model, h=h, tolerance=1e-4)
-        found.append(_timed(case, loose, h, "learned, Newton tolerance", "own model, C float64, tol 0.0001"))
-    rounded = copy.deepcopy(model)
-    with torch.no_grad():
-        for parameter in rounded.parameters():
-            parameter.copy_(parameter.bfloat16())
-    found += _forms(case, rounded, h, "learned, bf16 weights", "bf16 weights", ("float32",))
-    formats = (("ONNX", "a.onnx", export_onnx, load_onnx), ("AOTInductor", "a.pt2", export_aoti, load_pt2))
-    for name, file, write, read in formats[:1] if quick else formats:  # AOTInductor compiles for a minute
-        try:
-            with tempfile.TemporaryDirectory() as folder:
-                stepper = read(write(model, Path(folder) / file, h=h))
-            found.append(_timed(case, stepper, h, f"learned, {name}", f"own model, {name}", name))
-        except (InputError, RuntimeError) as error:
-            print(f"{name}, {case.setup.name}: {error}")
-    return found
-
-
-def _distilled(case: Case, quick: bool) -> list[Timed]:
+def _distilled(case: Case) -> list[Timed]:
     """Larger steps: a correction of each width and depth, re-trained on motions of the fitted model."""
     setup = case.setup
     if setup.inputs() is not None or not setup.multiples:
         return []
     states, found, began = motions_of(case), [], time.process_time()
     sizes = ((8, 1), (8, 2), (16, 2)) if setup.name == "damped_pendulum" else ((8, 1), (12, 2))
-    for m in setup.multiples[:1] if quick else setup.multiples:
+    for m in setup.multiples:
         if round(setup.T / setup.h) % (m * CHECKS):
             continue
-        before, after = pairs_of(states, m, 200 if quick else 600, 0)
-        for width, depth in sizes[:1] if quick else sizes:
+        before, after = pairs_of(states, m, 600, 0)
+        for width, depth in sizes:
             start = widened(case.run.model, width, depth)
-            model, _ = distil(start, before, after, m * setup.h, iterations=5 if quick else 50)
+            model, _ = distil(start, before, after, m * setup.h, iterations=50)
             model.requires_grad_(False)
             found += _forms(case, model, m * setup.h, "learned, distilled", f"{width} × {depth}")
         found += _forms(case, case.run.model, m * setup.h, "learned, no re-training", "own model at a larger step")
@@ -410,40 +300,34 @@ def _distilled(case: Case, quick: bool) -> list[Timed]:
     return found
 
 
-def _other_terms(case: Case, quick: bool) -> list[Timed]:
+def _other_terms(case: Case) -> list[Timed]:
     """The same data with a term less, or with one that the scene does not need."""
     found, setup = [], case.setup
-    if quick:
-        return []
     first = starts_of(setup.scene, COUNT, 1000)
     for label, change in setup.other.items():
-        run = fit(case.run.data, fit_config(setup, quick, **change), progress=False)
+        run = fit(case.run.data, fit_config(setup, **change), progress=False)
         other = replace(case, run=run, entry=entered(setup, run, first, case.start))
-        kind = f"learned, {label}"
-        try:
-            found += _forms(other, run.model, setup.h, kind, label, ("float64",))
-        except InputError:  # no C for these terms: PyTorch
-            found.append(_timed(other, Stepper(run.model), setup.h, kind, f"{label}, eager", "eager"))
+        found += _forms(other, run.model, setup.h, f"learned, {label}", label, ("float64",))
     return found
 
 
-def kicks(case: Case, quick: bool) -> list[Timed]:
+def kicks(case: Case) -> list[Timed]:
     """Steps of several h as a few learned kicks and drifts."""
     setup = case.setup
     if not setup.kick_steps or not can_kick(case.run.model):
         return []
     states, found, began = motions_of(case), [], time.process_time()
-    for m in setup.kick_steps[:1] if quick else setup.kick_steps:
+    for m in setup.kick_steps:
         if round(setup.T / setup.h) % (m * CHECKS):
             continue
         before, after = pairs_of(states, m, 1000, case.seed)
         h = m * setup.h
         least = max(2, round(1.5 * h))
-        for count in range(least, least + (1 if quick else 5 if m > 3 else 4)):
-            stepper = fit_kicks(case.run.model, before, after, h, kicks=count, iterations=30 if quick else 150)
+        for count in range(least, least + (5 if m > 3 else 4)):
+            stepper = fit_kicks(case.run.model, before, after, h, kicks=count, iterations=150)
             for dtype in ("float64", "float32"):
                 label = f"{count} kicks, h {h:.4g}, C {dtype}"
-                one = _timed(case, CompiledKicks(stepper, dtype), h, "learned kicks", label, dtype=dtype)
+                one = _timed(case, CompiledKicks(stepper, dtype), h, "learned kicks", label, dtype)
                 one.point.update(evaluations_per_time=count / h, flops_per_time=count * 70 / h)
                 found.append(one)
     case.seconds["kicks"] = time.process_time() - began

@@ -1,15 +1,14 @@
-"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER] [--json]`.
+"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER]`.
 
 Each system is drawn from (SEED, index): potential, friction, inputs, step, noise and number of recordings. `herglotz
 fit` runs with its default flags in a process of its own, and is judged by free runs over the unseen third of its
 recordings and over three recordings from unseen starts, in multiples of the noise. Beside it: SINDy, and the true
-equation with its numbers fitted. Rows are kept in FOLDER and are not measured again at the same commit.
+equation with its numbers fitted. Rows are kept in FOLDER (runs/zoo), with the table beside them, and are not measured
+again at the same commit.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import shutil
 import sys
@@ -21,15 +20,13 @@ from typing import Any
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks.harness import commit
+from benchmarks import harness
 from benchmarks.zoo_systems.drawing import draw
-from benchmarks.zoo_systems.judging import Predictions, outcome, relative, score
 from benchmarks.zoo_systems.ours import fit_ours, plain
+from benchmarks.zoo_systems.peers import fit_sindy
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
-from benchmarks.zoo_systems.report import report, shares, shown
-from benchmarks.zoo_systems.sindy import fit_sindy
+from benchmarks.zoo_systems.report import Predictions, outcome, relative, report, score, shown
 from benchmarks.zoo_systems.systems import ZooSystem
-from herglotz.data.files import write_atomically
 
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
 
@@ -71,36 +68,28 @@ def line(row: dict[str, Any]) -> str:
     return f"{row['index']:3d}  {row['outcome']:<15} {errors}  {row['ours']['cpu_s']:5.0f} s  {row['name']}"
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def main(argv: list[str] | None = None) -> None:
+    parser = harness.parser(__doc__)
     parser.add_argument("--draw", type=int, default=1, metavar="SEED", help="which zoo (default %(default)s)")
     parser.add_argument("--count", type=int, default=30, metavar="N", help="systems 0 to N - 1 (default %(default)s)")
     parser.add_argument("--only", type=int, nargs="+", metavar="I", help="these systems alone")
     parser.add_argument("--limit", type=float, default=300, metavar="S", help="processor time of a fit (default 300 s)")
-    parser.add_argument("--out", type=Path, default=Path("runs/zoo"), help="rows and runs (default %(default)s)")
-    parser.add_argument("--report", type=Path, metavar="FILE", help="write the table there (.md)")
     parser.add_argument("--again", action="store_true", help="keep rows of other commits too")
-    parser.add_argument("--json", action="store_true", help="print the rows and shares as JSON")
-    arguments = parser.parse_args()
+    parser.set_defaults(out=harness.ROOT / "runs" / "zoo")
+    arguments = parser.parse_args(argv)
     warnings.filterwarnings("ignore", category=RuntimeWarning)  # a peer that diverges overflows
-    out: Path = arguments.out
-    path, at = out / f"draw_{arguments.draw}.json", commit()
-    rows = {int(k): row for k, row in json.loads(path.read_text()).items()} if path.is_file() else {}
-    wanted = arguments.only or range(arguments.count)
+    path, at = harness.json_file(arguments, f"draw_{arguments.draw}"), harness.commit()
+    rows = harness.load(path, {})
+    wanted = [str(index) for index in arguments.only or range(arguments.count)]
     for index in wanted:
-        if index in rows and (arguments.again or rows[index]["commit"] == at):
-            continue
-        folder = out / f"draw_{arguments.draw}" / str(index)
-        shutil.rmtree(folder, ignore_errors=True)
-        rows[index] = {**measure(draw(arguments.draw, index), folder, arguments.limit), "commit": at}
-        out.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, json.dumps(rows, indent=1).encode() + b"\n")
-        print(line(rows[index]), file=sys.stderr, flush=True)
-    chosen = [rows[index] for index in wanted]
-    text = report(chosen, arguments.draw, arguments.limit)
-    if arguments.report:
-        write_atomically(arguments.report, text.encode())
-    print(json.dumps({"shares": shares(chosen), "rows": chosen}, indent=1) if arguments.json else text)
+        if not (index in rows and (arguments.again or rows[index]["commit"] == at)):
+            folder = path.with_suffix("") / index
+            shutil.rmtree(folder, ignore_errors=True)
+            rows[index] = {**measure(draw(arguments.draw, int(index)), folder, arguments.limit), "commit": at}
+            print(line(rows[index]), file=sys.stderr, flush=True)
+        measured = [rows[k] for k in wanted if k in rows]
+        harness.store(path, rows, report(measured, arguments.draw, arguments.limit))
+    print(path.with_suffix(".md").read_text())
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@
 
 # %%
 from herglotz.plots import plot_fall, plot_printed_map
-from herglotz.plots.parachute_motion import physical_fall, printed_map
+from herglotz.plots.parachute import physical_fall, printed_map
 
 plot_printed_map(printed_map()[1])
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import ast
-import random
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 
 Change = tuple[int, str, str]  # where in the text, what stands there, what stands there instead
+Alike = tuple[str, str, int, str]  # file, line without its indent, column in it, what stands there instead
 
 BINARY = {ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*")}
 COMPARE = {
@@ -86,11 +87,19 @@ def _changes(node: ast.AST, where: _Text) -> Iterator[Change]:
             yield where.change(end - len(".mT"), ".mT", "")
 
 
-def sample(src: Path, room: str, number: int, seed: int) -> list[tuple[str, int, str, str]]:
-    """A draw of `number` mutants of a room: (file, place, old, new); the same for a seed and sources."""
-    every = [
-        (str(path.relative_to(src)), *change)
-        for path in sorted((src / room).rglob("*.py"))
-        for change in changes(path.read_text(encoding="utf-8"))
-    ]
-    return sorted(random.Random(f"{seed} {room}").sample(every, min(number, len(every))))
+def sample(src: Path, room: str, number: int, seed: int, alike: set[Alike]) -> list[tuple[str, int, str, str]]:
+    """A draw of `number` mutants of a room: (file, place, old, new), without those `alike` the program.
+
+    What decides is a hash of the seed and the mutated line: an edit elsewhere leaves the draw as it was.
+    """
+    every: list[tuple[str, tuple[str, int, str, str]]] = []
+    for path in sorted((src / room).rglob("*.py")):
+        name, text = str(path.relative_to(src)), path.read_text(encoding="utf-8")
+        for at, old, new in changes(text):
+            start = text.rfind("\n", 0, at) + 1
+            line = text[start:].split("\n", 1)[0].strip()
+            place = at - start - (len(text[start:]) - len(text[start:].lstrip(" ")))
+            if (name, line, place, new) not in alike:
+                rank = hashlib.sha256(f"{seed} {name} {line} {place} {new}".encode()).hexdigest()
+                every.append((rank, (name, at, old, new)))
+    return sorted(mutant for _, mutant in sorted(every)[:number])

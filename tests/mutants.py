@@ -1,9 +1,10 @@
 """Break the package on purpose, one place at a time, and see whether the tests of that room notice: `make mutants`.
 
-Two kinds of mutants: those of `mutant_list.py`, written by hand, and a sample of all that `mutant_operators.py` finds
-(`--sampled`). First the tests of the rooms run on the sound sources, which says what each test costs and which
-functions it calls; then each mutant, on a copy of the sources, meets the tests of its own room that call its function,
-the cheapest first, until one fails. All of it forks from one process that has torch loaded.
+Two kinds of mutants: those of `mutant_list.py`, written by hand, and a sample of all that `mutant_operators.py` finds,
+which fills every room up to `--least` mutants. First the tests of the rooms run on the sound sources, which says what
+each test costs and which functions it calls; then each mutant, on a copy of the sources, meets the tests of its own
+room that call its function, the cheapest first, until one fails. All of it forks from one process that has torch
+loaded.
 
 What was found is kept in `runs/mutants`: a run that was stopped goes on where it stopped, and only what changed since
 (the mutated file, a test file, for a survivor) is tried again. `--shard 2/4` takes every fourth mutant.
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 import ast
 import hashlib
+import inspect
 import json
 import os
 import resource
@@ -27,10 +29,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
+# What takes a second to load is loaded once, before the forks.
+import matplotlib.pyplot  # noqa: F401
 import pytest
-import torch  # noqa: F401  loaded once, before the forks
+import torch
 
-from mutant_list import MUTANTS
+from mutant_list import ALIKE, MUTANTS
 from mutant_operators import sample
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -39,6 +43,7 @@ ROOMS = {  # room → where its tests are
     "mechanics": ["tests/unit/mechanics"],
     "theory": ["tests/unit/theory", "tests/verification"],
     "verify": ["tests/unit/verify", "tests/verification"],
+    "plots": ["tests/unit/plots", "tests/verification"],
     "scenes": ["tests/unit/scenes"],
     "models": ["tests/unit/models", "tests/contracts"],
     "stepping": ["tests/unit/stepping"],
@@ -46,11 +51,13 @@ ROOMS = {  # room → where its tests are
     "export": ["tests/unit/export"],
     "data": ["tests/unit/data"],
     "cli": ["tests/unit/cli"],
+    "tune": ["tests/unit/tune"],
 }
 SURVEY_SECONDS = 150  # of processor time for the sound run of a test file; tests beyond are not used
-MUTANT_SECONDS = 60  # of processor time for all tests of a mutant; what has not noticed by then, has not
+MUTANT_SECONDS = 30  # of processor time for all tests of a mutant; what has not noticed by then, has not
 C_WRITER = "export/c_header.py"  # whose tests meet the mutants of the C runtime
 MOST_SECONDS = 900  # by the clock, for a child that blocks
+SHARED = ""  # the name of what the tests of a file share: its import, and fixtures that are set up once
 PATIENCE = 5  # a test that takes so many times what it took on the sound sources, and 10 s more, has noticed
 
 
@@ -79,12 +86,19 @@ def _digest(*parts: str) -> str:
     return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:24]
 
 
-def written(only: str = "") -> list[Mutant]:
-    """The mutants of the list whose file has `only` in its name; one whose line is gone is an error of the list."""
+def everything(least: int, seed: int) -> list[Mutant]:
+    """The mutants of the list, and drawn ones of the rooms of which it has fewer than `least`."""
+    found, alike = written(), {same[:4] for same in ALIKE}
+    for room in ROOMS:
+        missing = max(0, least - sum(m.room == room for m in found))
+        found += [Mutant(*m) for m in sample(ROOT / "src" / "herglotz", room, missing, seed, alike)]
+    return found
+
+
+def written() -> list[Mutant]:
+    """The mutants of the list; one whose line is gone is an error of the list."""
     found = []
     for name, old, new in MUTANTS:
-        if only not in name:
-            continue
         at = source(name).find(old)
         if at < 0:
             raise SystemExit(f"{name}: no line with {old!r}; the list of mutants is out of date")
@@ -107,18 +121,22 @@ def function_of(mutant: Mutant) -> int | None:
 
 
 class Survey:
-    """A pytest plugin: seconds of every passing test, and the functions of the package that it calls."""
+    """A pytest plugin: seconds of every passing test, and the functions of the package that it calls.
+
+    What is called while the file is imported or a wider fixture is set up, in whichever test, stands under `SHARED`.
+    """
 
     pipe: int
 
     def __init__(self, src: Path):
-        self.src, self.found, self.failed, self.spent = f"{src}/", {}, set(), time.process_time()
+        self.src, self.failed, self.spent = f"{src}/", set(), time.process_time()
         self.calls: set[tuple[str, int]] = set()
+        self.found: dict[str, dict[str, Any]] = {SHARED: {"seconds": 0.0, "calls": []}}
 
     def _tracer(self, frame: Any, *_: Any) -> None:
         code = frame.f_code
         if code.co_filename.startswith(self.src):
-            self.calls.add((code.co_filename, code.co_firstlineno))
+            self.calls.add((code.co_filename.removeprefix(self.src), code.co_firstlineno))
 
     @pytest.hookimpl(hookwrapper=True)
     def pytest_runtest_protocol(self, item: Any) -> Iterator[None]:
@@ -126,8 +144,28 @@ class Survey:
         sys.settrace(self._tracer)
         yield
         sys.settrace(None)
-        calls = sorted((name.removeprefix(self.src), line) for name, line in self.calls)
-        self.found[item.nodeid] = {"seconds": time.process_time() - start, "calls": calls}
+        self.found[item.nodeid] = {"seconds": time.process_time() - start, "calls": sorted(self.calls)}
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_collection(self) -> Iterator[None]:
+        sys.settrace(self._tracer)
+        yield from self._share()
+        sys.settrace(None)
+
+    @pytest.hookimpl(hookwrapper=True)
+    def pytest_fixture_setup(self, fixturedef: Any) -> Iterator[None]:
+        if fixturedef.scope == "function":
+            yield
+        else:
+            yield from self._share()
+
+    def _share(self) -> Iterator[None]:
+        before, self.calls, start = self.calls, set(), time.process_time()
+        yield
+        shared = self.found[SHARED]
+        shared["calls"] = sorted({*shared["calls"], *self.calls})
+        shared["seconds"] += time.process_time() - start
+        self.calls |= before
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         if not report.passed:
@@ -144,7 +182,7 @@ class Survey:
 
 
 class Killer:
-    """A pytest plugin: the first test that fails, or hangs; the cheapest test goes first."""
+    """A pytest plugin: the first test that fails, or hangs; the tests go in the order in which they are given."""
 
     pipe: int
 
@@ -174,7 +212,8 @@ class Killer:
 
     @pytest.hookimpl(trylast=True)
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
-        items.sort(key=lambda item: self.seconds.get(item.nodeid, 1e9))
+        first = {name: k for k, name in enumerate(self.seconds)}
+        items.sort(key=lambda item: first.get(item.nodeid, len(first)))
 
 
 def in_fork(tree: Path, plugin: Any, tests: list[str]) -> tuple[int, int]:
@@ -251,7 +290,7 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
     for path in [p for folder in folders for p in sorted((ROOT / folder).rglob("test_*.py"))]:
         name = str(path.relative_to(ROOT))
         kept = KEPT / f"survey-{name.replace('/', '-')}.json"
-        key = _digest(sources, path.read_text(encoding="utf-8"))
+        key = _digest(sources, inspect.getsource(Survey), path.read_text(encoding="utf-8"))
         before: dict[str, Any] = json.loads(kept.read_text()) if kept.exists() else {"key": "", "tests": {}}
         if before["key"] == key:
             found[name] = before["tests"]
@@ -259,9 +298,12 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
 
         def end(_: Path, answer: Any, name: str = name, kept: Path = kept, key: str = key) -> None:
             found[name] = answer or {}
+            if len(found[name]) < 2:
+                print(f"nothing   passes in {name}; run it alone", flush=True)
+                return
             kept.write_text(json.dumps({"key": key, "tests": found[name]}))
             spent = sum(row["seconds"] for row in found[name].values())
-            print(f"sound     {name}: {len(found[name])} tests, {spent:.0f} s", flush=True)
+            print(f"sound     {name}: {max(0, len(found[name]) - 1)} tests, {spent:.0f} s", flush=True)
 
         workers.start(lambda tree, name=name: in_fork(tree, Survey(tree / "src" / "herglotz"), [name]), end)
     while workers.busy:
@@ -270,17 +312,28 @@ def survey(workers: Workers, rooms: set[str]) -> dict[str, dict[str, Any]]:
 
 
 def tests_of(mutant: Mutant, found: dict[str, dict[str, Any]]) -> dict[str, float]:
-    """The tests of the mutant's room that call its function, and what each costs, the cheapest first."""
+    """The tests of the mutant's room that call its function, and what each costs, the cheapest first.
+
+    Last come those of files whose tests share what it makes. The cost has what is shared: any test may pay for it.
+    """
     line, files, python = function_of(mutant), ROOMS[mutant.room], mutant.name.endswith(".py")
-    chosen: dict[str, float] = {}
+    chosen: list[tuple[bool, float, str, float]] = []
     for name, tests in found.items():
-        if not any(name.startswith(folder + "/") for folder in files):
+        if not tests or not any(name.startswith(folder + "/") for folder in files):
             continue
-        for test, row in tests.items():
-            called = [at for file, at in row["calls"] if file == (mutant.name if python else C_WRITER)]
-            if called if line is None else line in called:
-                chosen[test] = row["seconds"]
-    return dict(sorted(chosen.items(), key=lambda pair: pair[1]))
+        calling = {
+            test
+            for test, row in tests.items()
+            for file, at in row["calls"]
+            if file == (mutant.name if python else C_WRITER) and line in (None, at)
+        }
+        shared = tests[SHARED]["seconds"]
+        chosen += [
+            (test not in calling, row["seconds"], test, row["seconds"] + shared)
+            for test, row in tests.items()
+            if test != SHARED and (test in calling or SHARED in calling)
+        ]
+    return {test: most for *_, test, most in sorted(chosen)}
 
 
 def attempt(workers: Workers, mutant: Mutant, seconds: dict[str, float], end: Callable[[str | None], None]) -> None:
@@ -302,22 +355,37 @@ def attempt(workers: Workers, mutant: Mutant, seconds: dict[str, float], end: Ca
     workers.start(begin, restore)
 
 
+def table(chosen: list[Mutant], survivors: list[Mutant]) -> str:
+    """Tried and killed, a line a room."""
+    lines = [f"{'room':<10} {'tried':>5} {'killed':>6} {'%':>4}"]
+    for room in (*sorted({m.room for m in chosen}), ""):
+        tried, alive = (sum(m.room == room or not room for m in each) for each in (chosen, survivors))
+        lines.append(f"{room or 'all':<10} {tried:>5} {tried - alive:>6} {100 * (tried - alive) / (tried or 1):>4.0f}")
+    return "\n".join(lines)
+
+
 def main() -> int:
     """Run the mutants that are chosen and print a line each."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="mutants whose file name contains this")
-    parser.add_argument("--sampled", type=int, default=0, metavar="N", help="beside the list, N drawn mutants a room")
+    parser.add_argument(
+        "--least",
+        type=int,
+        default=25,
+        metavar="N",
+        help="mutants a room; where the list has fewer, others are drawn (default: 25)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="of the draw (default: 0)")
     parser.add_argument("--shard", default="1/1", metavar="K/N", help="every N-th mutant, from the K-th")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="at the same time (default: cores)")
     arguments = parser.parse_args()
-    src, number = ROOT / "src" / "herglotz", arguments.sampled
-    drawn = [Mutant(*m) for room in ROOMS for m in sample(src, room, number, arguments.seed)]
+    chosen = [m for m in everything(arguments.least, arguments.seed) if arguments.only in m.name]
     k, n = map(int, arguments.shard.split("/"))
-    chosen = (written(arguments.only) + [m for m in drawn if arguments.only in m.name])[k - 1 :: n]
+    chosen = chosen[k - 1 :: n]
     KEPT.mkdir(parents=True, exist_ok=True)
     kept = KEPT / "killed.json"
     killed: dict[str, str] = json.loads(kept.read_text()) if kept.exists() else {}
+    torch.func.jvp(torch.sin, (torch.ones(()),), (torch.ones(()),))  # the first one takes half a second
     survivors: list[Mutant] = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         workers = Workers(arguments.workers, Path(folder))
@@ -342,7 +410,7 @@ def main() -> int:
                 attempt(workers, mutant, tests_of(mutant, found), end)
         while workers.busy:
             workers.wait()
-    print(f"{len(chosen) - len(survivors)} of {len(chosen)} mutants killed")
+    print(table(chosen, survivors))
     return 1 if survivors else 0
 
 

@@ -19,8 +19,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.plots import save_figure
-from herglotz.plots.parachute import plot_fall, plot_printed_map
-from herglotz.plots.parachute_motion import physical_fall, printed_map
+from herglotz.plots.parachute import physical_fall, plot_fall, plot_printed_map, printed_map
 
 
 def main() -> int:

@@ -14,11 +14,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.random import Generator
 
-from benchmarks.zoo_systems.judging import score
-from benchmarks.zoo_systems.known import fit_known
-from benchmarks.zoo_systems.mechanisms import Array, Mechanism, Values
-from benchmarks.zoo_systems.motion import exact_motion
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism, Values, exact_motion
+from benchmarks.zoo_systems.peers import fit_known
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions
+from benchmarks.zoo_systems.report import score
 from benchmarks.zoo_systems.systems import Recording, ZooSystem
 
 KINDS = {

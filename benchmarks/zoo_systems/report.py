@@ -1,12 +1,50 @@
-"""The table of a zoo: shares, medians, and what failed without saying so."""
+"""One number for a free run, the four words for a fit, and the table of a zoo."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from benchmarks.zoo_systems.judging import OUTCOMES, SILENT
+import numpy as np
+
+from benchmarks.harness import table
+from benchmarks.zoo_systems.mechanisms import Array
+from benchmarks.zoo_systems.systems import ZooSystem
+
+AT_NOISE = 1.5  # times the noise: RMS of the free run against noisy samples, where a perfect model has 1
+USABLE = 0.1  # of the size of the motion
+AT, USE, SAID, SILENT = OUTCOMES = ("at the noise", "usable", "said it failed", "failed silently")
+
+Predictions = Mapping[str, tuple[Array, Array]]  # part → (prediction, data), each (N, n)
+
+
+def score(of: ZooSystem, found: Predictions) -> float:
+    """RMS error over the noise, the worse of the two parts; infinite where a sample was not reached."""
+    return _worst(found, of.floor)
+
+
+def relative(of: ZooSystem, found: Predictions) -> float:
+    """RMS error over the size of the motion, the worse of the two parts."""
+    return _worst(found, of.size)
+
+
+def outcome(score: float, relative: float, said: bool) -> str:
+    """One of `OUTCOMES`. `said`: whether the fit itself called its result a failure."""
+    if score <= AT_NOISE:
+        return AT
+    if relative <= USABLE:
+        return USE
+    return SAID if said else SILENT
+
+
+def _worst(found: Predictions, unit: Array) -> float:
+    parts = []
+    for prediction, data in found.values():
+        error = np.where(np.isfinite(prediction), prediction, np.inf) - data
+        parts.append(float(np.sqrt(np.mean(np.square(error / unit)))))
+    return max(parts)
+
 
 Row = dict[str, Any]
 METHODS = ("ours", "sindy", "known")
@@ -26,9 +64,7 @@ def shares(rows: Sequence[Row]) -> dict[str, float]:
 def report(rows: Sequence[Row], seed: int, limit: float) -> str:
     """Markdown."""
     commits = ", ".join(sorted({row["commit"] for row in rows}))
-    medians = {
-        name: statistics.median(_number(row[name]["score"]) for row in rows) for name in ("ours", "sindy", "known")
-    }
+    medians = {name: statistics.median(_number(row[name]["score"]) for row in rows) for name in METHODS}
     cpu = statistics.median(row["ours"]["cpu_s"] for row in rows)
     lines = [
         f"# The zoo: {len(rows)} systems drawn by seed {seed}",
@@ -40,26 +76,23 @@ def report(rows: Sequence[Row], seed: int, limit: float) -> str:
         "brackets: over the size of the motion. Known: the true equation with its numbers fitted. Time: of our fit,",
         "on one processor.",
         "",
-        "| share | " + " | ".join(shares(rows)) + " |",
-        "|---" * (len(shares(rows)) + 1) + "|",
-        f"| of {len(rows)} | " + " | ".join(f"{100 * x:.0f} %" for x in shares(rows).values()) + " |",
+        *table(("share", *shares(rows)), [(f"of {len(rows)}", *(f"{100 * x:.0f} %" for x in shares(rows).values()))]),
         "",
         "Medians: " + ", ".join(f"{name} {value:.3g}" for name, value in medians.items()) + f"; {cpu:.0f} s.",
         "",
-        "| | system | samples | outcome | ours | SINDy | known | time, s | what the fit said |",
-        "|---" * 9 + "|",
     ]
+    cells = []
     for row in rows:
         ours = row["ours"]
         how = "/".join(str(ours[name]) for name in ("level", "objective") if name in ours)
-        cells = [
+        cells.append([
             row["index"], row["name"], f"{row['trajectories']} × {row['samples'] // row['trajectories']}",
             f"**{row['outcome']}**" if row["outcome"] == SILENT else row["outcome"],
             *(f"{shown(row[name]['score'])} ({shown(row[name]['relative'])})" for name in METHODS),
             f"{ours['cpu_s']:.0f}", f"{how} {ours['said'] or ours.get('verdict') or ''}".strip().replace("|", "/"),
-        ]  # fmt: skip
-        lines.append(f"| {' | '.join(map(str, cells))} |")
-    return "\n".join([*lines, ""])
+        ])  # fmt: skip
+    head = ("", "system", "samples", "outcome", "ours", "SINDy", "known", "time, s", "what the fit said")
+    return "\n".join([*lines, *table(head, cells), ""])
 
 
 def _number(score: float | None) -> float:

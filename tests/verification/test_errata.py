@@ -144,6 +144,24 @@ def test_the_landing_to_fifteen_digits():
     assert abs(float(fall.velocity(*state)) / speed - 1) < 1e-15
 
 
+def test_what_the_figures_draw():
+    # fails if a curve starts at another k than its axis, a point is left out, or the fall goes on below the ground
+    found, orbit = parachute_motion.printed_map()
+    points = printed_orbit(8)
+    assert [len(x["points"]) for x in found.values()] == [9, 10]
+    for k in range(1, 7):
+        assert abs(orbit.q[k] / points[k - 1][0] - 1) < 2e-12
+        assert abs(orbit.p[k] / points[k - 1][1] - 1) < 2e-12
+        assert abs(orbit.dS_squared[k - 1] / orbit.p_squared[k] - 1) < 1e-12
+    assert len(orbit.q) == len(orbit.p) == 1 + len(orbit.dS)
+    numbers, fall = parachute_motion.physical_fall()
+    assert fall.t[0] == 0.0
+    assert fall.t[-1] < fall.landing_time < fall.t[-1] + 0.2
+    assert fall.q[0] == 100.0
+    assert fall.q.min() > 0.0
+    assert numbers["worst_hamilton_jacobi_residual_relative"] == fall.residual.max() > fall.residual.min()
+
+
 @pytest.fixture(scope="module")
 def run_of_the_script(tmp_path_factory):
     out = tmp_path_factory.mktemp("parachute")

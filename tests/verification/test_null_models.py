@@ -123,10 +123,24 @@ def test_an_L_d_without_discrete_Hamiltonians_is_verified_and_says_so():
     assert all(check.applies for check in whole.checks)
 
 
+def test_a_map_with_a_caustic_every_other_step_says_so():
+    # fails if Hamilton–Jacobi rows without a sample fail: of −q0·q1/h + V two steps are nearly q2 = −q0, whatever p is
+    def product(q0, q1, s0, h):
+        return -(q0 * q1).sum(-1) / h - 0.3 * h * torch.cos(q0).sum(-1) - 0.1 * h * s0
+
+    report = verify((product, states()), h=H, steps=8)
+    assert report.passed, report.table()
+    assert not report["left_hamilton_jacobi"].applies
+    assert report["left_equations"].applies
+    assert "beside a caustic" in report.table()
+
+
 def test_positions_far_from_their_origin_are_verified():
-    # fails if p of size 1 beside q of size 1e5, which rounds it by 2e-10, is held to 1e-11; a wrong p still fails
+    # fails if p of size 1 beside q of size 1e5, which rounds it by 2e-10, is held to 1e-11, or differences are taken
+    # over a share of q instead of its spread; a wrong p still fails
     def far(q0, q1, s0, h):
-        return OSCILLATOR(q0 - 1e5, q1 - 1e5, s0, h)
+        q0, q1 = q0 - 1e5, q1 - 1e5
+        return OSCILLATOR(q0, q1, s0, h) - 0.1 * h * torch.cos(3 * q0).sum(-1)
 
     q, p, s = states()
     assert verify((far, State(q + 1e5, p, s)), h=H, steps=3).passed

@@ -9,18 +9,23 @@ from __future__ import annotations
 
 import os
 import shlex
+import signal
 import sys
+import threading
 import traceback
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import herglotz
-from herglotz.cli.interrupts import orderly
 from herglotz.cli.parser import build_parser
 from herglotz.errors import InputError
 
+__all__ = ["main"]
+
+# The last one is what shells report of a process that SIGINT has ended, 128 + 2.
 OK, FAILED, WRONG_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -37,7 +42,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit code: 0, 1 (a check failed), 2 (wrong input), 70 (a fault of the package) or 130 (interrupted).
     """
     try:
-        with orderly(), _one_thread():
+        with _orderly(), _one_thread():
             arguments = build_parser().parse_args(argv)
             return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
@@ -94,4 +99,29 @@ def _say(message: str, code: int) -> int:
     return code
 
 
-__all__ = ["main"]
+@contextmanager
+def _orderly() -> Iterator[None]:
+    """Raise `KeyboardInterrupt` at the first signal, leave at the second; the handlers before come back at the end."""
+    if threading.current_thread() is not threading.main_thread():  # signals are the main thread's
+        yield
+        return
+    stopped = False
+
+    def stop(_number: int, _frame: object) -> None:
+        nonlocal stopped
+        stopped = True
+        for one in SIGNALS:
+            signal.signal(one, leave)
+        raise KeyboardInterrupt
+
+    def leave(_number: int, _frame: object) -> None:
+        os.write(2, b"herglotz: interrupted\n")
+        os._exit(INTERRUPTED)  # files are written whole or not at all, and locks end with their process
+
+    before = {one: signal.signal(one, stop) for one in SIGNALS}
+    try:
+        yield
+    finally:
+        if not stopped:  # else the process is about to end, and a signal on the way would print a traceback
+            for one, handler in before.items():
+                signal.signal(one, handler)

@@ -93,5 +93,5 @@ def _kicks(arguments: argparse.Namespace, kicks: Path) -> int:
         print_json({"file": str(arguments.out), "bytes": len(text), "kicks": True})
     else:
         print(f"{arguments.out}: {len(text) / 1024:.0f} KiB, the large step of kicks that tune chose")
-        print("Next: include it and call herglotz_kicks_step or herglotz_kicks_rollout, with cc -O3 -march=native")
+        print("Next: include it and call herglotz_kicks_step in a loop, with cc -O3 -march=native")
     return 0

@@ -186,8 +186,6 @@ def _check_header(path: Path, header: list[str], trajectories: Trajectories) -> 
     """Raise unless `read_csv` would give every column of this header its present role."""
     line = ",".join(header)
     try:
-        if "\n" in line or "\r" in line:
-            raise InputError("a line break in it")
         back = assign(_cells(line), "header")
         same = [back.names[i] for i in back.q] == list(trajectories.names) and len(back.names) == len(header)
         units = tuple(back.units[i] for i in back.q) == trajectories.units

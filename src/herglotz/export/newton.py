@@ -2,7 +2,9 @@
 
 The unknown is Δ = q1 − q0, because the difference q1 − q0 would round a small step away; where dry friction can hold a
 coordinate it is the z of `herglotz.stepping.stick_slip`. The rules of acceptance are those of
-`herglotz.stepping.newton`.
+`herglotz.mechanics.newton`, whose loop a file cannot hold: that loop decides in Python, for all samples at once,
+whether the last Jacobian still serves and whether a trial was refused at all. Without these decisions it takes 1.3 to
+1.6 times as long for 16 samples and 1.6 to 1.9 times for 1024 (n = 2, 16×2, levels linear, affine and full).
 """
 
 from __future__ import annotations

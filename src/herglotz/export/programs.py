@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import logging
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
+from herglotz.data.files import PathLike, write_atomically
 from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
+from herglotz.export.metadata import describe
 from herglotz.export.module import InitModule, RolloutModule, StepModule
+from herglotz.export.newton import ITERATIONS
 from herglotz.export.step import StepGraphs
+from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
 
 EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
@@ -82,3 +87,26 @@ def quiet() -> Iterator[None]:
     finally:
         for log, level in zip(logs, levels, strict=True):
             log.setLevel(level)
+
+
+def writes(content: Callable[[ContactLagrangian, dict[str, Any]], bytes]):
+    """Make of a function (model, metadata) → content of a file, sealed, the function that writes the file."""
+
+    def export(
+        model: ContactLagrangian,
+        path: PathLike,
+        *,
+        h: float,
+        box: Mapping[str, Sequence[float]] | None = None,
+        units: Sequence[str] = (),
+        metadata: Mapping[str, Any] | None = None,
+        newton_iterations: int = ITERATIONS,
+    ) -> Path:
+        made = content(model, describe(model, h, box, units, newton_iterations, metadata or {}))
+        write_atomically(path, made)
+        remember(made)
+        return Path(path)
+
+    for name in ("__module__", "__name__", "__qualname__", "__doc__"):
+        setattr(export, name, getattr(content, name))
+    return export

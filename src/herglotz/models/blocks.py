@@ -17,47 +17,33 @@ def affine_partials(
     force: Forces | None,
 ) -> Partials:
     """Return the blocks of an L_d that is affine in s0: D3 = c − 1."""
-    n = L.tangents // 2
-    gradient = L.gradient.movedim(0, -1)
     D3 = s0.new_zeros(()) if g is None else torch.expm1(g.value if isinstance(g, Jet) else g)
     D3 = D3.expand(s0.shape)
-    D1, D2 = gradient[..., :n], gradient[..., n:]
+    gradient = L.gradient.movedim(0, -1)
     if L.order == 1:
-        return Partials(L.value, D1, D2, D3, force=force)
+        return _partials(L, gradient, D3, None, force)
     H = L.hessian().movedim((0, 1), (-2, -1))
     dc = c.gradient.movedim(0, -1) if isinstance(c, Jet) else torch.zeros_like(gradient)
-    return Partials(
-        L.value,
-        D1,
-        D2,
-        D3,
-        D11=H[..., :n, :n],
-        D12=H[..., :n, n:],
-        D22=H[..., n:, n:],
-        D13=dc[..., :n],
-        D23=dc[..., n:],
-        D33=torch.zeros_like(D3),
-        force=force,
-    )
+    return _partials(L, gradient, D3, (H, dc, torch.zeros_like(D3)), force)
 
 
 def action_partials(L: Jet) -> Partials:
     """Return the blocks of an L that is a jet over the 2n + 1 variables (q0, q1, s0)."""
-    n = L.tangents // 2
     gradient = L.gradient.movedim(0, -1)
-    D1, D2, D3 = gradient[..., :n], gradient[..., n:-1], gradient[..., -1]
     if L.order == 1:
-        return Partials(L.value, D1, D2, D3)
+        return _partials(L, gradient[..., :-1], gradient[..., -1], None)
     H = L.hessian().movedim((0, 1), (-2, -1))
-    return Partials(
-        L.value,
-        D1,
-        D2,
-        D3,
-        D11=H[..., :n, :n],
-        D12=H[..., :n, n:-1],
-        D22=H[..., n:-1, n:-1],
-        D13=H[..., :n, -1],
-        D23=H[..., n:-1, -1],
-        D33=H[..., -1, -1],
-    )
+    return _partials(L, gradient[..., :-1], gradient[..., -1], (H[..., :-1, :-1], H[..., :-1, -1], H[..., -1, -1]))
+
+
+def _partials(
+    L: Jet, by_q: Tensor, D3: Tensor, second: tuple[Tensor, Tensor, Tensor] | None, force: Forces | None = None
+) -> Partials:
+    """From the gradient by (q0, q1), D3, and the second derivatives by (q0, q1) twice, mixed with s0, and by s0."""
+    n = by_q.shape[-1] // 2
+    first = (L.value, by_q[..., :n], by_q[..., n:], D3)
+    if second is None:
+        return Partials(*first, force=force)
+    H, mixed, D33 = second
+    blocks = {"D11": H[..., :n, :n], "D12": H[..., :n, n:], "D22": H[..., n:, n:]}
+    return Partials(*first, **blocks, D13=mixed[..., :n], D23=mixed[..., n:], D33=D33, force=force)

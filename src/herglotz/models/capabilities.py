@@ -19,7 +19,6 @@ class Capabilities:
     known_damping: bool  # the damping, if any, is one rate γ or the affine level's g(q̄, v)
     correction: bool  # a network N of (q̄, v)
     action_flow: bool  # the full level: the map of s is nonlinear
-    position_features: bool  # named features in the potential
     friction: bool  # forces F⁻, F⁺ of friction and inputs
     nonlinear_force: bool  # dry friction, or another force that is not linear in v
     sticking: bool  # dry friction is set-valued

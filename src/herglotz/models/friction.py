@@ -1,4 +1,4 @@
-"""Forces that one scalar s cannot express (trap 4): friction of each joint, and inputs."""
+"""Forces that one scalar s cannot express (trap 4): friction of each joint and between joints, and inputs."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from torch import Tensor, nn
 from herglotz.errors import InputError
 from herglotz.mechanics import Forces
 from herglotz.models.config import ModelConfig
-from herglotz.models.jet import Jet
+from herglotz.models.jet import Jet, pairs
+from herglotz.models.term import Term
 
 SMOOTH, STRIBECK = 0.02, 0.2  # starting widths v_s and v_st of dry friction, in typical speeds
 SHARPEST = 0.001  # least width, in typical speeds: without a bound sticking would make a step arbitrarily stiff
@@ -118,3 +119,29 @@ class Friction(nn.Module):
     def offset(self) -> Tensor:
         """Return the force of inputs that are recorded as 0: −G u₀, (n,)."""
         return self.applied(self.input_map.new_zeros(self.inputs))
+
+
+class CoupledFriction(Term):
+    """f_i = −Σ_{j≠i} b_ij v_j with b symmetric, beside the b_ii of `Friction`: F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
+
+    Two links with angles from the vertical and viscous hinges b have b₁₁ = 2b, b₂₂ = b and b₁₂ = −b, which one number a
+    coordinate cannot say. The entries are plain parameters that start at 0; b is positive semidefinite where the data
+    say so, not by construction.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__(config)
+        self.viscous = nn.Parameter(torch.zeros(self.dof * (self.dof - 1) // 2, dtype=torch.float64))
+
+    def matrix(self) -> Tensor:
+        """Return the matrix b without its diagonal, (n, n)."""
+        b = self.viscous
+        i, j = pairs(self.dof, b.device)
+        off = i != j
+        upper = b.new_zeros(self.dof, self.dof).index_put((i[off], j[off]), b)
+        return upper + upper.T
+
+    def force(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """Return f = −b v and −b."""
+        b = self.matrix()
+        return -v @ b, -b

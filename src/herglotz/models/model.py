@@ -13,10 +13,9 @@ from herglotz.models.action import ActionFlow
 from herglotz.models.blocks import action_partials, affine_partials
 from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
-from herglotz.models.coupling import CoupledFriction
 from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import kinetic_term
-from herglotz.models.friction import Friction
+from herglotz.models.friction import CoupledFriction, Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.order4 import Slope, missing
@@ -114,7 +113,6 @@ class ContactLagrangian(nn.Module):
             known_damping=type(self.damping) in (LinearDamping, AffineDamping, type(None)),
             correction=self.correction is not None,
             action_flow=self.action is not None,
-            position_features=self.potential.features is not None,
             friction=self.friction is not None,
             nonlinear_force=(self.friction is not None and not self.friction.linear)
             or self.drag is not None

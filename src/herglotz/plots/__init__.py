@@ -12,8 +12,7 @@ from herglotz.plots.bands import plot_bands
 from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.learned import plot_learned
 from herglotz.plots.motion import plot_data, plot_trajectory
-from herglotz.plots.parachute import plot_fall, plot_printed_map
-from herglotz.plots.parachute_motion import physical_fall, printed_map
+from herglotz.plots.parachute import physical_fall, plot_fall, plot_printed_map, printed_map
 from herglotz.plots.phase import plot_phase_portrait
 from herglotz.plots.plan import plot_plan
 from herglotz.plots.selection import plot_selection

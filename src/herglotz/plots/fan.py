@@ -29,7 +29,6 @@ class Fan:
     start: State  # (F, n), (F, n), (F,)
     h: float
     momentum_unit: str = ""
-    action_unit: str = ""
 
     def generating_function(self, k: int, start: State | None = None) -> GeneratingFunction:
         """Return S^k and its derivatives along every solution of the fan, k >= 1 steps from its start."""
@@ -63,7 +62,7 @@ def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
     start = State(start.q[finite], start.p[finite], start.s[finite])
     if not len(start.s):
         raise InputError("the run has no finite state to start from; fit it again")
-    return Fan(source.model, start, source.h if h is None else h, *units(source))
+    return Fan(source.model, start, source.h if h is None else h, momentum_unit(source))
 
 
 def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
@@ -72,7 +71,7 @@ def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
     The point is one of the data of a run, or of the states that `spread_fan` starts from.
     """
     if _is_run(source):
-        whole = Fan(source.model, source.states, source.h if h is None else h, *units(source))
+        whole = Fan(source.model, source.states, source.h if h is None else h, momentum_unit(source))
     else:
         whole = spread_fan(source, 64, h)
     states = whole.start
@@ -93,16 +92,14 @@ def _is_run(source: Any) -> bool:
     return hasattr(source, "states") and hasattr(source, "model")
 
 
-def units(run: Run) -> tuple[str, str]:
-    """Return the units of p and s: with the first mass fixed at 1, p is a velocity and s a length² over a time."""
+def momentum_unit(run: Run) -> str:
+    """Return the unit of p: with the first mass fixed at 1, p is a velocity."""
     length, time = run.data.units[0], run.data.time_unit
     if len(set(run.data.units)) > 1:
-        return "", ""
+        return ""
     per_time = "" if time in ("", "1") else f"/{time}"
     length = "" if length in ("", "1") else length
-    momentum = f"{length or '1'}{per_time}" if length or per_time else ""
-    action = f"{length + '²' if length else '1'}{per_time}" if length or per_time else ""
-    return momentum, action
+    return f"{length or '1'}{per_time}" if length or per_time else ""
 
 
 def _typical_step(source: Any) -> float | None:

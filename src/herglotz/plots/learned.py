@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from herglotz.models.terms import LinearDamping
-from herglotz.plots.fan import units
+from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
 from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, styled, with_unit
 from herglotz.stepping.field import FieldOf
@@ -43,7 +43,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     columns = min(run.data.dof, MOST_COLUMNS)
     rubs, entries = run.model.friction is not None, _moving_masses(run)
     rows = 2 + rubs + bool(entries)
-    momentum, _ = units(run)
+    momentum = momentum_unit(run)
     force = momentum + "²" if momentum and run.data.time_unit not in ("", "1") else ""  # rad/s, rad/s²
     with styled():
         figure = new_figure(1.2 + 3.9 * columns, 2.3 * rows + 0.5, "What the model has learned, mass 1")

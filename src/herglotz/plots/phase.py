@@ -10,7 +10,7 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from herglotz.plots.fan import units
+from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, styled, with_unit
 from herglotz.stepping import Rollout, State, Stepper
@@ -41,7 +41,7 @@ def plot_phase_portrait(run: Run) -> Figure:
 
 
 def _draw_panel(run: Run, i: int, ax: Axes) -> None:
-    data, unit = run.data, units(run)[0]
+    data, unit = run.data, momentum_unit(run)
     q, p = (x[:, i].detach().double().cpu().numpy() for x in (run.states.q, run.states.p))
     fine = np.isfinite(q) & np.isfinite(p)
     (q_low, q_high), (p_low, p_high) = _limits(q[fine], data.angles[i]), _limits(p[fine])

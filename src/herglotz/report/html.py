@@ -1,4 +1,4 @@
-"""A report as one HTML file: styles, pictures and the script of the slider are inside; nothing is fetched."""
+"""A report as one HTML file, which fetches nothing: styles, pictures and script are inside; and as Markdown."""
 
 from __future__ import annotations
 
@@ -76,3 +76,22 @@ def _slider(slider: Slider) -> str:
         f'aria-label="time"><output></output><script type="application/json">{values}</script>'
         f"<figcaption>{escape(slider.caption)}</figcaption></figure>"
     )
+
+
+def as_markdown(document: Document) -> str:
+    """Return the words, tables and code; the pictures are in the HTML file."""
+    parts = [f"# {document.title}", f"**{document.verdict.split(':')[0]}.** {document.meaning}", document.verdict]
+    for section in document.sections:
+        parts += [f"## {section.title}", *filter(None, map(_text_of, section.blocks))]
+    return "\n\n".join(parts) + "\n"
+
+
+def _text_of(block: Block) -> str:
+    if isinstance(block, Code):
+        return f"```\n{block.text}\n```"
+    if isinstance(block, Table):
+        rows = [block.head, ("---",) * len(block.head), *block.rows]
+        return "\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in rows)
+    if isinstance(block, (Picture, Slider)):
+        return f"*(picture in the HTML file: {block.caption})*"
+    return block

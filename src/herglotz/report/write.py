@@ -15,8 +15,7 @@ from herglotz.data.units import common_unit
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
-from herglotz.report.html import as_html
-from herglotz.report.markdown import as_markdown
+from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 from herglotz.stepping import Stepper
 from herglotz.threads import one_thread

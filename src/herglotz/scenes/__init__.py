@@ -16,11 +16,10 @@ from herglotz.scenes.motion import Motion, herglotz_motion, lagrangian_motion
 from herglotz.scenes.nonlinear_action import nonlinear_action
 from herglotz.scenes.oscillator import ExactOscillator, damped_oscillator
 from herglotz.scenes.parachute import ExactParachute, parachute
-from herglotz.scenes.path import path_action
 from herglotz.scenes.pendulum import damped_pendulum
 from herglotz.scenes.printed_parachute import PrintedParachute
 from herglotz.scenes.quadratic_drag import quadratic_drag
-from herglotz.scenes.reference import ReferenceSolution, reference_flow, reference_solve
+from herglotz.scenes.reference import ReferenceSolution, path_action, reference_flow, reference_solve
 from herglotz.scenes.registry import scene, scene_names
 from herglotz.scenes.rigid_body import rigid_body
 from herglotz.scenes.rules import (

@@ -15,8 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Forced
-from herglotz.scenes.forced import External, ForcedRule
-from herglotz.scenes.natural import Natural, natural_scene
+from herglotz.scenes.natural import External, ForcedRule, Natural, natural_scene
 from herglotz.scenes.rules import RULES, strang
 from herglotz.scenes.scene import Scene, State
 

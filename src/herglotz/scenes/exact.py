@@ -16,8 +16,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import Partials
-from herglotz.scenes.collocation import Collocation, End
-from herglotz.scenes.lobatto import lobatto
+from herglotz.scenes.collocation import Collocation, End, lobatto
 from herglotz.scenes.motion import Motion, lagrangian_motion
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step

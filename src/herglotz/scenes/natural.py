@@ -1,4 +1,9 @@
-"""Short forms of a scene: one without a closed form, and of these the one of a constant mass and one damping rate."""
+"""Short forms of a scene: one without a closed form, and of these the one of a constant mass and one damping rate.
+
+A scene may have a force beside the Lagrangian's own, which no L(q, v, s) of one action s says, such as friction of one
+joint: ṗ = L_q + L_s p + f(q, v) (Lagrange–d'Alembert–Herglotz). The motion is then no contact flow and has no exact
+discrete Lagrangian; its rules are discrete Lagrangians with discrete forces.
+"""
 
 from __future__ import annotations
 
@@ -11,11 +16,34 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.scenes.exact import exact_discrete_lagrangian
-from herglotz.scenes.forced import External, ForcedRule
 from herglotz.scenes.motion import constant_rate, herglotz_motion
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.rules import all_rules, strang
 from herglotz.scenes.scene import Scene, StateFunction
+from herglotz.scenes.special import as_step
+
+External = Callable[[Tensor, Tensor], Tensor]  # (q, v), (..., n) each → f, (..., n)
+
+
+@dataclass(frozen=True)
+class ForcedRule:
+    """A rule for L with the forces of the midpoint, F⁻ = F⁺ = (h/2) f((q0 + q1)/2, (q1 − q0)/h): of order 2 at c = 1.
+
+    Source: trap 4 of `docs/mathematics.md`, discrete forces.
+    """
+
+    rule: DiscreteLagrangian
+    external: External
+
+    def __call__(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
+        """Return L_d, shape (...)."""
+        return self.rule(q0, q1, s0, h)
+
+    def forces(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:  # noqa: ARG002
+        """F⁻ and F⁺, (..., n) each."""
+        step = as_step(h, q0)[..., None]
+        half = 0.5 * step * self.external(0.5 * (q0 + q1), (q1 - q0) / step)
+        return half, half
 
 
 @dataclass(frozen=True)

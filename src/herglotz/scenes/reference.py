@@ -1,7 +1,8 @@
 """A reference flow: any contact vector field integrated until two resolutions agree to near round-off.
 
 Gragg's modified midpoint rule, whose error is a series in the square of the step, extrapolated to order 12
-(Gragg–Bulirsch–Stoer), with the number of substeps doubled until a sample has converged. Always in float64.
+(Gragg–Bulirsch–Stoer), with the number of substeps doubled until a sample has converged. Always in float64. Herglotz's
+action of any smooth path, the continuous Cauchy problem that L_d discretises, is integrated by it.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.theory.continuous import Lagrangian
 
 VectorField = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 Derivative = Callable[[Tensor], Tensor]
@@ -164,3 +166,38 @@ def _modified_midpoints(f: Derivative, x: Tensor, h: Tensor) -> list[Tensor]:
             found.append(now[0])
             before, now, d = before[1:], now[1:], d[1:]
     return found
+
+
+Path = Callable[[Tensor], tuple[Tensor, Tensor]]  # t ↦ (q(t), q̇(t)), (...) → (..., n) twice
+
+
+def path_action(lagrangian: Lagrangian, path: Path, s0: Tensor, T: Tensor | float) -> Tensor:
+    """s(T) of ds/dt = L(q(t), q̇(t), s), s(0) = s0, along a path that need not be a motion; shape (...).
+
+    s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 it is stationary
+    exactly at the solutions of Herglotz's equations; there it is L_d(q(0), q(T), s0), the exact discrete Lagrangian.
+
+    Parameters
+    ----------
+    lagrangian
+        L(q, v, s).
+    path
+        t ↦ (q(t), q̇(t)), (...) → (..., n) and (..., n).
+    s0
+        (...) initial value.
+    T
+        Final time, () or (...).
+
+    Raises
+    ------
+    InputError
+        If the integration does not converge.
+
+    Source: Cauchy problem and Herglotz action of the paper.
+    """
+
+    def field(t: Tensor, _: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        return torch.ones_like(t), torch.zeros_like(t), lagrangian(*path(t[..., 0]), s)
+
+    zero = torch.zeros_like(s0)[..., None]
+    return reference_flow(field, zero, zero, s0, T)[2]

@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
-from herglotz.scenes.galerkin import lobatto4, lobatto6
-from herglotz.scenes.implicit import fixed_point
+from herglotz.scenes.galerkin import fixed_point, lobatto4, lobatto6
 from herglotz.scenes.special import as_step
 from herglotz.theory.continuous import Lagrangian
 

@@ -107,6 +107,21 @@ class Rollout:
         return ((self.status == Status.CONVERGED) | (self.status == Status.STOPPED)).all(-1)
 
 
+def check_batch(states: tuple[Tensor, Tensor, Tensor]) -> State:
+    """The states, one batch (B, n), (B, n), (B).
+
+    Raises
+    ------
+    InputError
+        If they are no tensors, or of other shapes.
+    """
+    q, p, s = states
+    check_arguments(q, p, s, ("q", "p", "s"))
+    if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
+        raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
+    return State(q, p, s)
+
+
 def check_state(
     state: State, L_d: Any = None, names: tuple[str, str, str] = ("q", "p", "s"), finite: bool = False
 ) -> State:

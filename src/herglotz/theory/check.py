@@ -20,7 +20,6 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.partials import DiscreteLagrangian
 from herglotz.stepping import State, Stepper
-from herglotz.stepping.state import Status
 from herglotz.theory.function_germ import Function, germ
 from herglotz.theory.generating import hamilton_jacobi_residual, left_hamilton_jacobi_residual
 from herglotz.theory.hamilton_jacobi import commutation_defect
@@ -112,16 +111,9 @@ def check(
     Source: Theorems 2 and 3 of the paper; errata E5 to E7 and E10.
     """
     _check_open(q)
-    stepper = Stepper(L_d)
-
-    def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        step = stepper.step(State(q, p, s), h)
-        nan = torch.where(step.status == Status.CONVERGED, 0.0, torch.nan).to(q)
-        return step.state.q + nan[..., None], step.state.p, step.state.s
-
     with torch.no_grad():
         at0 = germ(S0, q)
-        q1, p1, s1 = flow(q, at0.dS, at0.S)
+        q1, p1, s1 = Stepper(L_d).step(State(q, at0.dS, at0.S), h).state
         found = torch.isfinite(q1).all(-1)
         q1 = torch.where(found[..., None], q1, q)  # S1 may refuse what is not finite
         at1 = germ(S1, q1)

@@ -38,6 +38,7 @@ from torch import Tensor
 from herglotz.errors import InputError
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
 from herglotz.stepping import State, Status, Stepper
+from herglotz.stepping.state import check_batch
 from herglotz.theory.symmetry_words import formula, name_of
 
 # Of drift, for an L_d that is known: its symmetries leave 1e-16 to 1e-13 (float32: 1e-6), and one that is broken by
@@ -103,7 +104,8 @@ class Symmetries:
     def __str__(self) -> str:
         lines = [f"affine point symmetries: {len(self) or 'none'}"]
         for i, name in enumerate(self.names):
-            J = formula((self.A[i], self.b[i], self.a[i]), (self.k[i], self.w[i], self.B[i]), self.coordinates)
+            generator, boundary = (self.A[i], self.b[i], self.a[i]), (self.k[i], self.w[i], self.B[i])
+            J = formula(generator, boundary, self.coordinates, float(self.drift[i]))
             lines.append(f"  {name}: J = {J}, drift {float(self.drift[i]):.1e}")
         rest = self.spectrum[len(self) :]
         lines.append(f"  a symmetry keeps J_k = σ_k J_0 within {self.precision:.1e} of p·ξ")
@@ -152,17 +154,15 @@ def symmetries(
     InputError
         If the shapes do not fit, or no motion could be stepped.
     """
-    q, p, s = states
-    if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
-        raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
-    n = q.shape[-1]
+    state = check_batch(states)
+    n = state.q.shape[-1]
     names = tuple(coordinates) or tuple(f"q{i + 1}" for i in range(n))
     for what, given in (("angles", angles), ("coordinates", names)):
         if len(given) not in (0, n):
             raise InputError(f"{what} needs one entry a coordinate ({n}), got {len(given)}")
     straight = [i for i in range(n) if not (angles and angles[i])]
-    most = PRECISION.get(q.dtype, 1e-4) if precision is None else precision
-    return _null_space(_columns(L_d, State(q, p, s), h, steps, straight), most, names)
+    most = PRECISION.get(state.q.dtype, 1e-4) if precision is None else precision
+    return _null_space(_columns(L_d, state, h, steps, straight), most, names)
 
 
 @dataclass(frozen=True)

@@ -46,8 +46,13 @@ def _plane(A: Tensor) -> list[int]:
     return turned[0] if len(turned) == 2 and bool((A * A.mT).sum() < 0) else []
 
 
-def formula(generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates: Sequence[str]) -> str:
-    """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ; small entries are left out."""
+def formula(
+    generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates: Sequence[str], drift: float = 0.0
+) -> str:
+    """J = p·(A q + b) − a s − χ(q) as text, from (A, b, a) and the (k, w, B) of χ.
+
+    Entries below ten drifts of the largest are left out: a learned χ has terms of that size that mean nothing.
+    """
     (A, b, a), (k, w, B) = generator, boundary
     terms = []
     for i, name in enumerate(coordinates):
@@ -59,12 +64,12 @@ def formula(generator: Sequence[Tensor], boundary: Sequence[Tensor], coordinates
         for j in range(i, len(coordinates)):
             text = f"{name}²" if i == j else f"{name} {coordinates[j]}"
             chi.append((-float(B[i, j]) * (0.5 if i == j else 1.0), text))
-    return _sum([*terms, *chi, (-float(k), "")])
+    return _sum([*terms, *chi, (-float(k), "")], min(max(SMALL, 10 * drift), 0.1))
 
 
-def _sum(terms: list[tuple[float, str]]) -> str:
+def _sum(terms: list[tuple[float, str]], small: float = SMALL) -> str:
     """Return `2 x − y + 3` for [(2, "x"), (−1, "y"), (3, "")]."""
-    least = SMALL * max(abs(x) for x, _ in terms)
+    least = small * max(abs(x) for x, _ in terms)
     terms = [(x, what) for x, what in terms if abs(x) > least]
     first = next((i for i, (x, _) in enumerate(terms) if x > 0), 0)
     text = ""

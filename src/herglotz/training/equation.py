@@ -22,6 +22,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
+from herglotz.models.terms import Kinetic
 from herglotz.models.translations import across_in_words
 
 
@@ -90,9 +91,8 @@ class Equation:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""
-        terms = [asdict(term) for term in self.terms]
         rest = {"lefts": list(self.lefts), "units": self.units, "network": self.network}
-        return {"text": str(self), "terms": terms, **rest}
+        return {"text": str(self), "terms": [asdict(term) for term in self.terms], **rest}
 
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Equation:
@@ -148,15 +148,15 @@ def _lefts(run: Run) -> list[str]:
 
 
 def _kinetic(run: Run) -> list[Term]:
-    """½ vᵀ M v where L is printed as one function and M is constant; the first entry of M is 1."""
-    if _newtonian(run.model) or not run.model.capabilities.constant_mass or not run.model.config.baseline:
+    """½ vᵀ M v with the constant M that named products of speeds add to, where L is printed as one function."""
+    kinetic = getattr(run.model.kinetic, "base", run.model.kinetic)
+    if _newtonian(run.model) or not isinstance(kinetic, Kinetic) or not run.model.config.baseline:
         return []
-    mass, names = run.model.kinetic.mass().detach(), run.data.names  # type: ignore[operator]
-    n = range(len(names))
+    mass, names = kinetic.mass().detach(), run.data.names
     return [
         Term("L", f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′", value, None, "")
-        for i in n
-        for j in n[i:]
+        for i in range(len(names))
+        for j in range(i, len(names))
         if (value := float(mass[i, j]) * (0.5 if i == j else 1.0)) != 0.0
     ]
 
@@ -192,10 +192,9 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
     texts = expand(config.features, config.angles)
     offset = 2 * n if config.order == 4 and not config.alike else 0
     still = [text for text in texts if not parse(text, config.angles)[0].velocities]
-    moving = [text for text in texts if text not in still]
     for g, text in enumerate(still):
         yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
-    for g, text in enumerate(moving):
+    for g, text in enumerate(text for text in texts if text not in still):
         yield "L", _named(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
 
 
@@ -296,7 +295,8 @@ def _named(text: str, names) -> str:
     """A feature's text with the names of the coordinates."""
     for i, name in reversed(list(enumerate(names, 1))):
         text = text.replace(f"1q{i}", f"q{i}").replace(f"q{i}", name).replace(f"v{i}", f"{name}′")
-    return text.replace("-", "−").replace("*", " ")
+    text = text.replace("-", "−").replace("*", " ")
+    return f"({text})" if " − " in text and "(" not in text else text  # x y′ − y x′ has one coefficient
 
 
 def _raised(base: str, power: int) -> str:

@@ -83,7 +83,7 @@ def _repeated(calls: list[Callable[[], None]], times: int) -> Callable[[], None]
 def _native(stepper: Any, few: State, h: float, steps: int) -> list[Callable[[], None]]:
     """Return calls of the C loop with arguments made beforehand: checks in Python would take longer than the steps."""
     if isinstance(stepper, CompiledKicks):
-        return [stepper.call(few, steps, [torch.empty(len(few.s), steps + 1, dtype=stepper.dtype) for _ in range(3)])]
+        return [stepper.prepared(few, steps)[0]]
     library: CLibrary = stepper.loop
     h_all = torch.full((1, 1), h, dtype=library.dtype).expand(1, steps)
     singles = [State(*(x[i : i + 1].to(library.dtype) for x in few)) for i in range(len(few.s))]

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,9 @@ from numpy.polynomial import polynomial as power
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
+from herglotz.export.c_header import runtime
 from herglotz.export.c_wrapper import build
+from herglotz.export.lower.c import as_scalars
 from herglotz.stepping import Rollout, State, Status
 from herglotz.tune.kick_composition import KickStepper
 
@@ -28,13 +31,14 @@ FINEST, COARSEST = {"float64": 1e-13, "float32": 3e-8}, 1e-4  # bounds of the er
 TYPES = {"float64": "double", "float32": "float"}
 
 HEADER = """/* One step of h = {h}: {kicks} kicks and drifts. Written by herglotz; C99, no dependency but <tgmath.h>.
-   The state is (q, p, s); c = {c} is the conformal factor of every step. */
+   The state is (q, p, s). */
 #ifndef HERGLOTZ_KICKS_H
 #define HERGLOTZ_KICKS_H
 #include <tgmath.h>
 typedef {real} herglotz_real;
 typedef struct {{ herglotz_real q, p, s; }} herglotz_kicks_state;
 #define HERGLOTZ_KICKS_H_STEP {h}
+#define HERGLOTZ_KICKS_FACTOR {c}
 
 static inline void herglotz_kicks_step(herglotz_kicks_state *x) {{
   herglotz_real q = x->q * {inverse}, p = {root} * x->p, s = {root} * x->s;
@@ -44,40 +48,60 @@ static inline void herglotz_kicks_step(herglotz_kicks_state *x) {{
   x->s = {root} * s + {offset};
 }}
 
-/* `steps` steps; entry k of each output, which may be null, is the state after k steps, entry 0 the start. Returns 0,
-   or 3 where the state is not finite at the end: the entries from the first such one on are then NaN. */
-static inline int herglotz_kicks_rollout(herglotz_kicks_state *x, long steps, herglotz_real *q, herglotz_real *p,
-    herglotz_real *s) {{
-  long k;
-  for (k = 0; k <= steps; k++) {{
-    if (k > 0) herglotz_kicks_step(x);
-    if (!(x->q - x->q == 0 && x->p - x->p == 0 && x->s - x->s == 0)) x->q = x->p = x->s = (herglotz_real)NAN;
-    if (q) q[k] = x->q;
-    if (p) p[k] = x->p;
-    if (s) s[k] = x->s;
-  }}
-  return x->q - x->q == 0 ? 0 : 3;
-}}
 #endif
 """
 
-LOOPS = """#include "stepper.h"
-typedef herglotz_real real;
-/* Outputs are (batch, steps + 1). Each motion waits for the one before, as in a loop of control. */
-int herglotz_kicks_rollouts(long batch, long steps, double wait, const real *q0, const real *p0, const real *s0,
-    real *q, real *p, real *s) {
-  long b;
-  int failed = 0;
-  herglotz_kicks_state x = {0, 0, 0};
-  for (b = 0; b < batch; b++) {
-    const long at = b * (steps + 1);
-    const real last = isfinite(x.q) ? (real)wait * x.q : 0;
-    x.q = q0[b] + last;
-    x.p = p0[b] + last;
-    x.s = s0[b];
-    failed |= herglotz_kicks_rollout(&x, steps, q + at, p ? p + at : 0, s ? s + at : 0);
+# What the loop over steps of the C runtime (`runtime/run.h`) asks of a step, and the loop over motions. Outputs are
+# (batch, steps + 1), statuses and residuals (batch, steps). Each motion waits for the one before, as in a control loop.
+RUNTIME = ("types.h", "numbers.h", "checks.h")
+DEFINED = """#include "stepper.h"
+#define hz_N 1
+#define hz_M 0
+#define hz_INPUTS 0
+#define hz_BOXED 0
+#define hz_WIDE 0
+#define hz_SINGLE {single}
+typedef herglotz_real hz_real;
+static const hz_real hz_h_low = HERGLOTZ_KICKS_H_STEP, hz_h_high = HERGLOTZ_KICKS_H_STEP;
+"""
+STEP = """
+typedef int hz_track; /* nothing is carried along */
+static inline void hz_track_start(const hz_state *x, hz_track *track) { *track = x != 0; }
+static inline void hz_get(const hz_state *x, int w, hz_state *one) { *one = x[w]; }
+static inline void hz_set(hz_state *x, int w, const hz_state *one) { x[w] = *one; }
+static inline void hz_take(hz_state *x, hz_track *track, const hz_real h[1], int status[1], hz_real residual[1]) {
+  herglotz_kicks_state now = {x->q[0], x->p[0], x->s};
+  (void)track;
+  (void)h;
+  residual[0] = 0;
+  if (status[0]) return;
+  herglotz_kicks_step(&now);
+  if (!hz_finite((now.q + now.p) + now.s)) {
+    status[0] = hz_DIVERGED;
+    return;
   }
-  return failed;
+  x->q[0] = now.q;
+  x->p[0] = now.p;
+  x->s = now.s;
+  x->sigma *= HERGLOTZ_KICKS_FACTOR;
+}
+"""
+BATCH = """
+void herglotz_kicks_rollouts(long batch, long steps, double wait, const hz_real *q0, const hz_real *p0,
+    const hz_real *s0, hz_real *q, hz_real *p, hz_real *s, hz_real *sigma, unsigned char *status, hz_real *residual) {
+  const hz_real h = HERGLOTZ_KICKS_H_STEP;
+  const hz_job job = {steps, 1, &h, 0, 0, q, p, s, sigma, residual, status};
+  hz_state x = {{0}, {0}, 0, 1};
+  long b;
+  for (b = 0; b < batch; b++) {
+    const hz_real last = (hz_real)wait * x.q[0];
+    int failed = hz_CONVERGED;
+    x.q[0] = q0[b] + last;
+    x.p[0] = p0[b] + last;
+    x.s = s0[b];
+    x.sigma = 1;
+    hz_run(&x, b, 1, &job, &failed, 0);
+  }
 }
 """
 
@@ -114,8 +138,9 @@ class CompiledKicks:
     """A `KickStepper` compiled: `rollout` as there."""
 
     def __init__(self, stepper: KickStepper, dtype: str = "float64"):
-        self.h, self.rate, self.dtype = stepper.h, stepper.rate, getattr(torch, dtype)
-        self.library = build(kicks_c(stepper, dtype), LOOPS)
+        self.h, self.dtype = stepper.h, getattr(torch, dtype)
+        parts = [DEFINED.format(single=int(dtype == "float32")), *map(runtime, RUNTIME)]
+        self.library = build(kicks_c(stepper, dtype), "".join([*parts, STEP, as_scalars(runtime("run.h")), BATCH]))
 
     def rollout(
         self, q: torch.Tensor, p: torch.Tensor, s: torch.Tensor | None = None, *, h: torch.Tensor | float, steps: int
@@ -123,25 +148,21 @@ class CompiledKicks:
         """K equal steps from (q, p, s) with shapes (B, 1), (B, 1), (B)."""
         if not abs(float(h) - self.h) <= 1e-6 * self.h:
             raise InputError(f"this stepper was fitted to h = {self.h:g}, got {float(h):g}")
-        start = State(q, p, torch.zeros_like(q[..., 0]) if s is None else s)
-        outputs = [torch.empty(len(q), steps + 1, dtype=self.dtype) for _ in range(3)]
-        self.call(start, steps, outputs)()
-        finite = torch.isfinite(outputs[0])
-        sigma = torch.exp(-self.rate * self.h * torch.arange(steps + 1, dtype=self.dtype)).expand(finite.shape)
-        status = torch.where(finite[:, 1:], Status.CONVERGED, Status.DIVERGED).to(torch.uint8)
-        q, p, s = outputs
-        return Rollout(q[..., None], p[..., None], s, sigma + 0 * q, status, torch.zeros_like(q[:, 1:]))
+        s = torch.zeros_like(q[..., 0]) if s is None else s
+        run, (q, p, s, sigma, status, left) = self.prepared(State(q, p, s), steps)
+        run()
+        return Rollout(q[..., None], p[..., None], s, sigma, status, left)
 
-    def call(self, start: State, steps: int, outputs: list[torch.Tensor]) -> Any:
-        """The call of the loop in C, with its arguments made beforehand."""
+    def prepared(self, start: State, steps: int) -> tuple[Callable[[], None], list[torch.Tensor]]:
+        """The call of the loop in C with its arguments made beforehand, and the tensors that the loop writes."""
         arrays = [x.to(self.dtype).reshape(-1).contiguous() for x in start]
+        count = len(arrays[0])
+        outputs = [torch.full((count, steps + 1), torch.nan, dtype=self.dtype) for _ in range(4)]
+        outputs += [torch.full((count, steps), int(Status.DIVERGED), dtype=torch.uint8)]
+        outputs += [torch.full((count, steps), torch.nan, dtype=self.dtype)]
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*arrays, *outputs)]
-        function, sizes = self.library.herglotz_kicks_rollouts, (ctypes.c_long(len(arrays[0])), ctypes.c_long(steps))
-
-        def run(keep: Any = (arrays, outputs)) -> None:  # noqa: ARG001
-            function(*sizes, ctypes.c_double(0.0), *pointers)
-
-        return run
+        function, sizes = self.library.herglotz_kicks_rollouts, (ctypes.c_long(count), ctypes.c_long(steps))
+        return lambda keep=(arrays, outputs): function(*sizes, ctypes.c_double(0.0), *pointers), outputs  # noqa: ARG005
 
 
 def _number(dtype: str) -> Any:

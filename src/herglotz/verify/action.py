@@ -35,6 +35,8 @@ OPENING = 0.1  # standard deviation of p̂0 within a fan, in standard deviations
 CAUSTIC = 1e-2  # S^k is not used where the spread of a fan is below this share of k times the spread after one step
 FOLD = 1e-3  # H⁺ and H⁻ are not used where their `scaled_margin` is below this (steps do not need them: E4)
 
+ALTERNATES = "one of S^k and S^(k+1) is beside a caustic, for all k that were tried"
+
 
 @dataclass(frozen=True)
 class Fan:
@@ -45,6 +47,16 @@ class Fan:
     sigma: dict[int, Tensor]  # (F) by k, as the stepper reports c
     keep: dict[int, Tensor]  # (F) bool by k: away from a caustic
     failed: int = 0  # solutions dropped because a step failed or has no finite derivative
+
+    @property
+    def pairs(self) -> list[int]:
+        """Every k with S^k and S^{k+1}."""
+        return [k for k in self.S if k + 1 in self.S]
+
+    def alternates(self) -> bool:
+        """Whether some S^k is away from caustics, no step failed, and never S^k and S^{k+1} at once."""
+        some = any(bool(keep.any()) for keep in self.keep.values()) and not self.failed
+        return some and not any(bool((self.keep[k] & self.keep[k + 1]).any()) for k in self.pairs)
 
     def left_out(self) -> str:
         """Say how many solutions the checks leave out."""
@@ -116,6 +128,8 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
         residual = hamilton_jacobi_residual(after.S, before.S, after.D2, after.q, H)
         return residual, (after.D2 * after.q).sum(-1), H
 
+    if f.alternates():
+        return Check.without_object("hamilton_jacobi", RIGHT, ALTERNATES)
     note = "no L_d in the file: H⁺ rebuilt as p1·q1 − (s1 − s0)" if subject.L_d is None else ""
     value, notes = _on_fan(subject, f, side, lambda P: P.D22, "a fold of H⁺ (det D2D2 L_d = 0)")
     return Check.at_most("hamilton_jacobi", RIGHT, value, bound, "; ".join([*notes, note] if note else notes))
@@ -134,6 +148,8 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
         residual = left_hamilton_jacobi_residual(after.S, before.S, before.D2, before.q, H)
         return residual, (before.D2 * before.q).sum(-1), H
 
+    if f.alternates():
+        return Check.without_object("left_hamilton_jacobi", LEFT, ALTERNATES)
     value, notes = _on_fan(subject, f, side, left_hessian, "a fold of H⁻ (det D1D1 L⁻ = 0)")
     return Check.at_most("left_hamilton_jacobi", LEFT, value, bound, "; ".join(notes))
 
@@ -143,7 +159,7 @@ def _on_fan(
 ) -> tuple[float, list[str]]:
     """The largest residual over the largest sum of its terms, from S^k and S^{k+1} where the Hamiltonian exists."""
     residuals, sizes, folds = [], [], 0
-    for k in [k for k in f.S if k + 1 in f.S]:
+    for k in f.pairs:
         before, after = f.S[k], f.S[k + 1]
         keep = f.keep[k] & f.keep[k + 1]
         with torch.no_grad():

@@ -27,12 +27,12 @@ def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Ge
     if isinstance(L_d, ContactLagrangian):
         scale, speed = (torch.tensor(x, dtype=torch.float64) for x in (L_d.config.scale, L_d.config.speed))
         dtype = next(L_d.parameters()).dtype
-        return _finite(_state(L_d, scale.to(dtype), speed.to(dtype), h, samples, make))
+        return _state(L_d, scale.to(dtype), speed.to(dtype), h, samples, make)
     refused = ""
     for n in range(1, MOST + 1):
         one = torch.ones(n, dtype=torch.float64)
         try:
-            return _finite(_state(L_d, one, one, h, samples, make))
+            return _state(L_d, one, one, h, samples, make)
         except (IndexError, RuntimeError, ValueError) as error:
             if isinstance(error, InputError):
                 raise
@@ -50,11 +50,8 @@ def _state(
     s = (2 * torch.rand(samples, generator=make, dtype=torch.float64) - 1).to(scale) * (scale * speed).sum()
     with torch.no_grad():
         P = partials(L_d, q, q + h * v, s, h)
-    return State(q, momentum_minus(P), s)
-
-
-def _finite(state: State) -> State:
-    good = torch.isfinite(state.p).all(-1)
+    p = momentum_minus(P)
+    good = torch.isfinite(P.L) & torch.isfinite(p).all(-1)
     if not bool(good.any()):
         raise InputError("L_d has no finite momentum at q, q̇ of size 1; give states: (L_d, (q, p, s))")
-    return State(*(x[good] for x in state))
+    return State(q[good], p[good], s[good])

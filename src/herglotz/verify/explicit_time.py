@@ -40,7 +40,7 @@ def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bo
         rows = [
             check(members[k], replace(fan, S={j: fan.S[j] for j in (k, k + 1)}), bound) for k in fan.S if k + 1 in fan.S
         ]
-        checks.append(max(rows, key=lambda row: (row.value != row.value, row.value)))
+        checks.append(max(rows, key=lambda row: (row.applies, row.value != row.value, row.value)))
     return checks
 
 

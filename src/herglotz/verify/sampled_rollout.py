@@ -66,7 +66,9 @@ class _Held(Map):
         return Step(state, torch.where(good, step.c, 1.0), status, step.residual, step.iterations)
 
 
-ROUNDINGS = 8.0  # of q in one step; the oscillator moved to q = 1e5 leaves a third of one, D2S^k half of one
+# Of q in one step. The worst of 90 far away (a quartic oscillator, two coupled masses and Kepler, q about 1e5 and 1e7,
+# h = 0.01, 0.1, 0.5, five seeds): 13 for a step, 54 for D1S^k over eight.
+ROUNDINGS = 100.0
 BLIND = 1e-4  # no bound is raised beyond this: null models exceed 1e-3
 
 

@@ -19,6 +19,7 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
 from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
+from herglotz.stepping.state import check_batch
 from herglotz.training import Run, load_run
 from herglotz.verify.draw import drawn_states
 
@@ -143,10 +144,7 @@ def _pair(source: Any, states: Any, h: float | None) -> Subject:
     """Return the subject of an L_d, or of anything with `step(state, h) -> Step`, and given states (q, p, s)."""
     if h is None:
         raise InputError("h must be given with a pair (L_d or stepper, states), e.g. h=0.1")
-    q, p, s = states
-    if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
-        raise InputError(f"states need shapes (B, n), (B, n), (B,); got {[tuple(x.shape) for x in (q, p, s)]}")
-    state, size = State(q.detach(), p.detach(), s.detach()), _step_size(h, h)
+    state, size = State(*(x.detach() for x in check_batch(states))), _step_size(h, h)
     if hasattr(source, "step"):
         return Subject(type(source).__name__, "stepper", source.step, state, size, getattr(source, "L_d", None))
     return Subject(getattr(source, "__name__", type(source).__name__), "L_d", _stepper(source), state, size, source)

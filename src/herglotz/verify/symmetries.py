@@ -10,6 +10,7 @@ from herglotz.errors import InputError
 from herglotz.stepping import State
 from herglotz.theory import Symmetries
 from herglotz.theory import symmetries as of_lagrangian
+from herglotz.theory.symmetries import PRECISION
 from herglotz.threads import one_thread
 from herglotz.training import Run
 from herglotz.verify.subject import subject
@@ -40,7 +41,7 @@ def symmetries(
     precision
         Largest drift of a symmetry. By default 1e-9 for an L_d that is known, and for a run three times the RMS
         error of its free run over the unseen part (of the training part where nothing is unseen), relative to the RMS
-        size of the motion.
+        size of the motion, where that is more.
 
     Returns
     -------
@@ -63,7 +64,8 @@ def symmetries(
         angles, names = known.scene.angles, known.scene.coordinates
     if known.run is not None:
         angles, names = known.run.data.angles, known.run.data.names
-        length, precision = _unseen_steps(known.run), precision or _precision(known.run)
+        length = _unseen_steps(known.run)
+        precision = precision or max(_precision(known.run), PRECISION[states.q.dtype])
         states = _opened(states, torch.Generator().manual_seed(seed))
     return of_lagrangian(
         known.L_d,

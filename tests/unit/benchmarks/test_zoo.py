@@ -8,14 +8,11 @@ import pytest
 
 from benchmarks.zoo import beyond, line, numbers
 from benchmarks.zoo_systems.drawing import KINDS, draw, draw_mechanism
-from benchmarks.zoo_systems.judging import AT, AT_NOISE, SAID, SILENT, USE, outcome, relative, score
-from benchmarks.zoo_systems.known import fit_known
-from benchmarks.zoo_systems.mechanisms import Mechanism
-from benchmarks.zoo_systems.motion import exact_motion
+from benchmarks.zoo_systems.mechanisms import Mechanism, exact_motion
 from benchmarks.zoo_systems.ours import complaint, trajectories
+from benchmarks.zoo_systems.peers import fit_known, fit_sindy
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
-from benchmarks.zoo_systems.report import report, shares
-from benchmarks.zoo_systems.sindy import fit_sindy
+from benchmarks.zoo_systems.report import AT, AT_NOISE, SAID, SILENT, USE, outcome, relative, report, score, shares
 
 VALUES, SAMPLE = {"g": 1.0, "o0": 0.260806, "d0": 0.012981}, 2.5362090384317573  # of system 1 of zoo 1
 

@@ -51,6 +51,10 @@ def test_other_weights_do_not_agree_however_close_the_motion(tiny_run, monkeypat
         monkeypatch.setattr("herglotz.export.compare", lambda *_, same=same, **__: {**close, "same_weights": same})
         agreement = _agreement(file, Namespace(against=tiny_run, h=None, seed=0))
         assert agreement["passed"] is (same is not False)
+    off = {**close, "p": 1.0, "same_weights": True}  # fails if three of q, p, s and c are enough
+    monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: off)
+    assert _agreement(file, Namespace(against=tiny_run, h=None, seed=0))["passed"] is False
+    monkeypatch.setattr("herglotz.export.compare", lambda *_, **__: {**close, "same_weights": True})
     said["level"] = "forced"
     assert _agreement(file, Namespace(against=tiny_run, h=None, seed=0))["passed"] is False  # rows would be left out
 

@@ -6,8 +6,7 @@ import re
 import pytest
 
 from herglotz.cli import main
-from herglotz.report.html import as_html
-from herglotz.report.markdown import as_markdown
+from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Code, Document, Section, Slider, Table
 
 

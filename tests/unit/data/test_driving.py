@@ -1,10 +1,12 @@
 """Times and recorded inputs of a rollout."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from herglotz.data import Trajectories, save
-from herglotz.data.driving import driven, even_times, recorded
+from herglotz.data.driving import CLOSE, driven, even_times, recorded
 from herglotz.errors import InputError
 
 T = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.5], dtype=torch.float64)
@@ -22,6 +24,15 @@ def test_inputs_act_when_they_were_recorded():  # fails if the first K inputs ar
     u, t = driven(RECORDING, 0.1, 2, 0.15)  # 0.1–0.25: 2 for 0.1, 4 for 0.05; 0.25–0.4: 4
     torch.testing.assert_close(u[:, 0], torch.tensor([2 * 2 / 3 + 4 / 3, 4.0]).double())
     torch.testing.assert_close(t, torch.tensor([0.1, 0.25, 0.4]).double())
+    u, _ = driven(RECORDING, 0.0, 5, 0.1)  # the whole recording, both ends included
+    torch.testing.assert_close(u[:, 0], torch.tensor([1.0, 2, 4, 4, 8]).double())
+
+
+def test_the_last_input_acts_in_no_step():
+    # fails if a run that ends a rounding after the last sample takes its input, which holds for a step never recorded
+    found = replace(RECORDING, u=torch.tensor([1.0, 2.0, 4.0, 8.0, 1e12], dtype=torch.float64)[:, None])
+    u, _ = driven(found, 0.4, 1, 0.1 * (1 + CLOSE / 2))
+    assert u.item() == pytest.approx(8.0)
 
 
 @pytest.mark.parametrize(

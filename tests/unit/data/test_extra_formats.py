@@ -77,6 +77,42 @@ def test_matlab(tmp_path, monkeypatch, as_csv):  # fails if a matrix is not cut 
     np.testing.assert_array_equal(found.u, as_csv.u)
 
 
+class Dataset(np.ndarray):
+    """What the reader asks a dataset of h5py for."""
+
+    attrs: dict
+
+
+class File(dict):
+    """What the reader asks a file of h5py for: a group is in the way of its datasets."""
+
+    def __init__(self, *_):
+        super().__init__({"run": None})
+        for name, x in {**COLUMNS, "note": np.array(["by hand"]), "date": np.array(2026.0)}.items():
+            own, _, unit = name.partition("[")
+            self[f"run/{own}"] = x.view(Dataset)
+            self[f"run/{own}"].attrs = {"units": unit.rstrip("]").encode()} if unit else {}
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def visititems(self, take):
+        for name, item in self.items():
+            take(name, item)
+
+
+def test_what_is_no_column_of_hdf5(tmp_path, monkeypatch, as_csv):
+    # fails if a group, a text or a single number beside the datasets is taken for a column
+    stand_in = types.ModuleType("h5py")
+    stand_in.Dataset, stand_in.File = Dataset, File  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "h5py", stand_in)
+    (tmp_path / "a.h5").write_bytes(b"HDF")
+    same(load(tmp_path / "a.h5", show=False), as_csv)
+
+
 @pytest.mark.skipif(not have("h5py"), reason="h5py is an extra")
 @pytest.mark.parametrize("suffix", ["h5", "hdf5", "mat"])
 def test_hdf5(tmp_path, as_csv, suffix):  # fails if units are lost, a group is not opened, or 7.3's transpose stays

@@ -1,4 +1,4 @@
-"""What inputs do between samples: values, thinning, files, and the hold that explains recorded steps."""
+"""What inputs do between samples: values, thinning and files."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,10 +6,8 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.data import Trajectories, load, save, simulate
+from herglotz.data import Trajectories, load, save
 from herglotz.errors import InputError
-from herglotz.scenes import scene
-from herglotz.training.hold import with_arrival
 
 
 def recorded(hold="", count=40) -> Any:
@@ -60,19 +58,3 @@ def test_an_unknown_hold_is_refused(tmp_path):
     (tmp_path / "a.csv").write_text("# hold: frist\nt,x,u\n0,0,1\n1,1,1\n2,2,1\n")
     with pytest.raises(InputError, match="unknown hold 'frist' of the inputs; choose one of zero, first, smooth"):
         load(tmp_path / "a.csv")
-
-
-def test_the_hold_of_a_recording_is_found():
-    # fails if the wrong samples are compared: inputs held over steps, and a smooth input of the exact motion
-    held = replace(simulate(scene("driven_pendulum"), trajectories=2, steps=60, h=0.1, seed=1), hold="")
-    assert with_arrival(held, held)[1] == ("zero", 0.0, 0.0)
-    t = torch.arange(200, dtype=torch.float64) / 5
-    waves = torch.tensor([0.7, 2.0, 4.1], dtype=torch.float64)
-    phase = waves * t[:, None]
-    c, s = phase.cos(), phase.sin()
-    gain, loss = 1 - waves**2, 0.2 * waves  # of q'' + 0.2 q' + q = u, driven by cosines
-    q = ((gain * c + loss * s) / (gain**2 + loss**2)).sum(1)
-    smooth = Trajectories.of(t, q, u=c.sum(1))
-    assert with_arrival(smooth, smooth)[1].hold == "smooth"
-    smooth = replace(smooth, hold="first")
-    assert with_arrival(smooth, smooth)[1].hold == "first"

@@ -53,6 +53,7 @@ def test_arrays_alone_are_enough(tmp_path):  # fails if metadata or lengths are 
         ({}, r"d.npz: there is no array 't', only none"),
         ({"t": T3, "q": np.array([{}, 1, 2])}, r"d.npz: array 'q' holds Python objects, which are never loaded"),
         ({"t": T3, "q": Q3 + 1j}, r"d.npz: array 'q' has dtype complex128; save it as float64"),
+        ({"t": T3, "q": np.array([-(2**60), 0, 1])}, r"d.npz: array 'q' has integers above 2\^53"),
         ({"t": T3, "q": np.array(["a", "b", "c"])}, r"d.npz: array 'q' has dtype <U1; save it as float64"),
         ({"t": T3, "q": Q3, "lengths": np.array([3.0])}, r"array 'lengths' must hold integers in one row, got float64"),
         ({"t": T3, "q": Q3, "lengths": np.array(3)}, r"array 'lengths' must hold integers in one row, got int64 \(\)"),

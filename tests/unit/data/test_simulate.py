@@ -24,6 +24,7 @@ class Rotation:
     q_range: tuple[float, float] = (-1.0, 1.0)
     v_range: tuple[float, float] = (-0.5, 0.5)
     blow_up: bool = False
+    lose: int | None = None  # the coordinate that becomes NaN
 
     def momentum(self, q, v, s):  # noqa: ARG002
         return v
@@ -33,6 +34,8 @@ class Rotation:
         assert h.dtype == q.dtype == torch.float64
         if self.blow_up:
             return q * 1e200, p, s
+        if self.lose is not None:
+            return q.index_fill(-1, torch.tensor(self.lose), math.nan), p, s
         return h.cos() * q + h.sin() * p, -h.sin() * q + h.cos() * p, s + h
 
 
@@ -145,6 +148,7 @@ def test_float32_is_the_float64_set_rounded():  # fails if dtype changes the dra
         ({"q_range": (1.0,)}, r"q_range must be \(low, high\), numbers or 2 numbers each, got \(1.0,\)"),
         ({"q_range": ([0.0, 0.0, 0.0], [1.0, 1.0, 1.0])}, r"q_range must be \(low, high\), numbers or 2 numbers each"),
         ({"scene": Rotation(blow_up=True)}, r"rotation: trajectory \d is not finite after step 2 of h=0.1; narrow"),
+        ({"scene": Rotation(lose=1)}, r"rotation: trajectory 0 is not finite after step 1"),
     ],
 )
 def test_every_mistake_has_its_message(changes, message):

@@ -61,8 +61,9 @@ def test_every_mth_sample():
     assert data.u is not None
     impulse = data.u[:2, 0] * data.t[:3].diff()
     assert impulse.tolist() == [1 + 2 + 2 * 3, 4 + 2 * 5 + 6]
-    with pytest.raises(InputError, match="whole number >= 1, got 0"):
-        data.thinned(0)
+    for wrong in (0, True, 2.5):
+        with pytest.raises(InputError, match=f"whole number >= 1, got {wrong}"):
+            data.thinned(wrong)  # type: ignore[arg-type]
     with pytest.raises(InputError, match="at least 3 are needed"):
         data.thinned(2)
 

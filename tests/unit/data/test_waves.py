@@ -27,5 +27,7 @@ def test_waves():
         with_waves(data, (1.0, 7.0))
     with pytest.raises(InputError, match="holds inputs u, and frequencies would be inputs, too"):
         with_waves(Trajectories.of(t, t, u=t), (2.0,))
+    with pytest.raises(InputError, match="holds inputs u"):  # as many columns, of other numbers
+        with_waves(Trajectories.of(t, t, u=torch.ones(3, 2, dtype=F64)), (2.0,))
     with pytest.raises(InputError, match=r"must be positive numbers, got \(-1.0,\)"):
         with_waves(data, (-1.0,))

@@ -1,10 +1,12 @@
 """The one Newton iteration: samples apart, bad starts, singular Jacobians, and its twin in plain numbers."""
 
+import math
+
 import pytest
 import torch
 
 from herglotz.mechanics.newton import Point, Rules, attached, find_root, largest, newton
-from herglotz.mechanics.newton_one import newton_one
+from herglotz.mechanics.newton_one import _eliminate, newton_one
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -65,3 +67,16 @@ def test_a_solution_gets_its_derivative():
     torch.testing.assert_close(x, torch.tensor([2.0**0.5], dtype=torch.float64), rtol=0, atol=EPS)
     (slope,) = torch.autograd.grad(x.sum(), a)
     torch.testing.assert_close(slope, 0.5 / x.detach(), rtol=0, atol=EPS)
+
+
+@pytest.mark.parametrize("matrix", [[2.0, 1.0, -3.0, 0.5], [0.0, 1.0, 2.0, 5.0], [1.0, 2.0, 4.0, 9.0]])
+def test_two_equations_are_solved_by_hand(matrix):
+    # fails if a row is not exchanged with its right side, or a factor has another sign; small whole numbers are exact
+    J = torch.tensor(matrix, dtype=torch.float64).reshape(2, 2)
+    move = torch.tensor(_eliminate(*[*matrix, 3.0, -1.0]), dtype=torch.float64)
+    torch.testing.assert_close(J @ move, torch.tensor([-3.0, 1.0], dtype=torch.float64), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("matrix", [[0.0, 1.0, 0.0, 2.0], [1.0, 2.0, 2.0, 4.0]])
+def test_two_singular_equations_move_nowhere(matrix):  # fails if a division by zero is raised
+    assert all(math.isnan(x) for x in _eliminate(*[*matrix, 3.0, -1.0]))

@@ -86,3 +86,16 @@ def test_errors_of_a_root_are_in_units_of_its_size():
     assert bool(found.converged[0])
     assert float(found.error[0]) < 1e-12
     assert float(found.x[0, 0]) == pytest.approx(1e9, rel=1e-15)
+
+
+def test_the_report_names_sample_and_condition():
+    # fails if a condition that holds is told, one that fails is not, or the sample is another
+    def L_d(q0, q1, s0, h):  # c = 1 − q0 is 0 for the second sample, D1D1 L⁻ and D2D2 L_d for both
+        return (q0 * q1).sum(-1) - q0.sum(-1) * s0 + 0 * h
+
+    found = regularity(L_d, tensor([0.5], [1.0]), tensor([0.2], [0.2]), tensor(0.0, 0.0), tensor(0.1, 0.25))
+    assert "sample (1,), h = 0.25: c = 0: FL⁻ is not defined" in found.report()
+    assert not any(line.startswith("sample (0,), h = 0.1: c = 0") for line in found.report())
+    assert found.lost("H_plus").tolist() == [True, True]
+    one = regularity(L_d, tensor(1.0), tensor(0.2), tensor(0.0)[0], 0.25)
+    assert one.report()[0].startswith("h = 0.25: c = 0")

@@ -89,6 +89,7 @@ def test_damping_does_not_see_it_either():
         ({"translations": ("q1 - q1",)}, "is no direction; name what moves together"),
         ({"translations": ("q1 + q2",), "angles": (True, False)}, "an angle is translated alone"),
         ({"translations": ("q1 + q2",), "features": ("r^-1",)}, "changes under the translation"),
+        ({"translations": ("q1 + q2", "q1 - q2"), "features": ("(q1 - q2)^2",)}, "changes under the translation"),
         ({"translations": ("q1",), "known": ("q1^2",)}, "feature 'q1\\^2': changes under the translation"),
         ({"translations": ("q1",), "mass_width": 3}, "a mass that depends on position would see them"),
         ({"translations": ("q1",), "level": "full"}, "the level full would see them"),

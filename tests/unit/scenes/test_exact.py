@@ -14,6 +14,7 @@ from herglotz.scenes import (
     scene,
     scene_names,
 )
+from herglotz.scenes.collocation import lobatto
 from herglotz.scenes.motion import constant_rate
 from herglotz.stepping import State, Status, Stepper
 
@@ -141,6 +142,25 @@ def test_beyond_a_conjugate_point_is_nan_with_a_reason():
     assert shot.P.L.isnan().tolist() == shot.P.D12.isnan()[:, 0, 0].tolist() == [False, True, True, True]
     assert shot.p0.isnan()[:, 0].tolist() == [False, True, True, True]
     torch.testing.assert_close(shot.P.L[0], system.L_d(q, q + 0.3, f64(0.0), h)[0])
+
+
+def test_rest_is_judged_within_the_pieces():
+    # fails if only the joints between pieces are judged: few nodes resolve rest, two pieces have conjugate points
+    # at h = 7, and the joint is past both (ω = 1)
+    L_d = exact_discrete_lagrangian(scene("damped_oscillator").lagrangian)
+    rest = torch.zeros(2, 1, dtype=torch.float64)
+    assert L_d.shoot(rest, rest, rest[:, 0], f64(3.0, 7.0)).reason.tolist() == [Reason.NONE, Reason.CONJUGATE]
+
+
+@pytest.mark.parametrize("count", [3, 5, 8, 9])
+def test_polynomials_through_lobattos_nodes(count):
+    # fails if a weight or the norm of a Legendre polynomial is wrong: degree k − 1 is integrated exactly to every node
+    nodes, integral, finer = lobatto(count)
+    for m in range(count):
+        torch.testing.assert_close(integral @ nodes**m, nodes ** (m + 1) / (m + 1), rtol=0, atol=1e-15)
+        if len(finer):
+            torch.testing.assert_close(finer @ nodes**m, lobatto(2 * count - 1)[0] ** m, rtol=0, atol=3e-15)
+    assert len(finer) == (2 * count - 1 if count % 2 else 0)
 
 
 def test_a_turning_motion_has_its_conjugate_point_where_it_is():

@@ -102,6 +102,32 @@ def test_a_state_off_the_constraint_starts_no_step():
     assert bool(nothing.consistent(x, h).q.isnan().all())
 
 
+def test_the_kernel_of_M_need_not_be_a_coordinate():
+    # fails if rows of V are taken for its columns: the state moves along the stage x, here in the direction (3, 1, 2)
+    toward = torch.linalg.qr(torch.tensor([[3.0, 1.0, 0.0], [1.0, 0.0, 1.0], [2.0, 1.0, 1.0]]).double())[0]
+
+    def turned(q0, q1, s0, h):  # beside the drift, a third coordinate that is an oscillator of its own
+        x0, x1 = q0 @ toward, q1 @ toward
+        z = 0.5 * ((x1 - x0)[..., 2] / h) ** 2 - 0.5 * x0[..., 2] ** 2
+        return drift(x0, x1, s0, h) + h * z
+
+    x, h, z = drift_start(), 0.1, torch.tensor([[0.3], [-0.2]]).double()
+    q, p = (torch.cat([y, z], -1) @ toward.mT for y in (x.q, x.p))
+    start = LegendrianStepper(turned).consistent(State(q, p, x.s), h)
+    expected = LegendrianStepper(drift).consistent(x, h)
+    torch.testing.assert_close((start.q @ toward)[:, :2], expected.q, rtol=0, atol=1e-12)
+    torch.testing.assert_close((start.q @ toward)[:, 2:], z, rtol=0, atol=1e-12)
+
+
+def test_a_step_without_a_number_or_without_c_says_so():
+    # fails if NaN counts as a state off the constraint, or a step with c = 0, which forgets s0 and p0, as a step
+    x, h = drift_start(), 0.1
+    lost = LegendrianStepper(lambda q0, q1, s0, h: drift(q0, q1, s0, h) * torch.nan).step(x, h)
+    assert lost.status.tolist() == [Status.DIVERGED] * 2
+    forgets = lambda q0, q1, s0, h: 0.5 * ((q1 - q0) ** 2).sum(-1) / h - s0  # noqa: E731
+    assert LegendrianStepper(forgets, ahead=0).step(x, h).status.tolist() == [Status.SINGULAR] * 2
+
+
 def test_without_looking_ahead_the_open_direction_stays_at_the_guess():
     # fails if `ahead` has no effect: the test above would then say nothing
     stepper = LegendrianStepper(drift, ahead=0)

@@ -185,10 +185,25 @@ def test_a_double_caustic_of_a_turning_family_is_seen():
     assert int(before.status) == Status.CONVERGED
     assert int(after.status) == Status.SINGULAR
     assert int(after.curve.opening.crossed) == 12
+    again = hopf_lax(larmor, S, tensor([0.3, 0.4]), h=0.1, steps=40, beyond=True)  # past the next one at 3π/2.5 = 3.77
+    assert int(again.curve.opening.crossed) == 12  # the first
     # a point source opens a step later than it starts, and focuses at π/1.25 = 2.513 (midpoint rule: 2.52)
     source = PointSource(larmor, tensor([0.3, 0.4]), tensor(0.0), 0.1)
     before, after = (hopf_lax(larmor, source, tensor([0.3, 0.5]), h=0.1, steps=N) for N in (24, 25))
     assert (int(before.status), int(after.status)) == (Status.CONVERGED, Status.SINGULAR)
+
+
+def test_a_step_of_more_than_half_a_turn_of_a_charge_is_no_caustic():
+    # fails if −D12, which the field has turned by Bh/2 > π/2, is taken for a negative kinetic term: the exact L_d of a
+    # free charge, B = 1, valid to h = 2π; a family with dS = q focuses at tan(h/2) = −1/2, h = 5.36
+    def charge(q0, q1, s0, h):
+        d = q1 - q0
+        area = q0[..., 0] * q1[..., 1] - q0[..., 1] * q1[..., 0]
+        return (d * d).sum(-1) / (4 * torch.tan(h / 2)) + 0.5 * area + 0 * s0
+
+    S = Quadratic(torch.eye(2).double(), tensor([0.0, 0.0]), tensor(0.0))
+    for h in (1.0, 3.0, 3.5, 4.5):
+        assert int(hopf_lax(charge, S, tensor([0.3, 0.4]), h=h).status) == Status.CONVERGED
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])

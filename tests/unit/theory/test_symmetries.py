@@ -25,6 +25,11 @@ def lagrangian(V, gamma=0.0, masses: float | torch.Tensor = 1.0, magnetic=None):
     return L_d
 
 
+def regauged(L_d, F):
+    """The same motions with the action s + F(q)."""
+    return lambda q0, q1, s0, h: L_d(q0, q1, s0 - F(q0), h) + F(q1) - F(q0)
+
+
 def nothing(q):
     return 0.0 * q.sum(-1)
 
@@ -52,6 +57,11 @@ SCALING = "scaling of q, and of s by its square"
 PLANE = "rotation in the plane (q1, q2)"
 CASES = {  # name → L_d, coordinates, what there is to find
     "free chain with damping": (lagrangian(springs, 0.3), 4, {"translation of q1, q2, q3 and q4 together"}),
+    "the same with s + 0.7 q1²": (  # χ = 1.4 q1 beside a c that is not 1
+        regauged(lagrangian(springs, 0.3), lambda q: 0.7 * q[..., 0] ** 2),
+        4,
+        {"translation of q1, q2, q3 and q4 together"},
+    ),
     "free chain": (lagrangian(springs), 3, {"translation of q1, q2 and q3 together"}),
     "chain at a wall": (lagrangian(lambda q: springs(q) + 0.5 * q[..., 0] ** 2 + q[..., 0] ** 4, 0.3), 3, set()),
     "charged particle": (
@@ -222,6 +232,9 @@ def test_what_is_printed():
     B = torch.tensor([[2.0, 0.3], [0.3, 0.0]], dtype=F64)
     J = formula((turn, zero, torch.tensor(2.0)), (torch.tensor(-4.0), torch.tensor([0.5, 0.0]), B), names)
     assert J == "x p_y − y p_x − 2 s − 0.5 x − x² − 0.3 x y + 4"
+    noisy = ((0 * one, one[0], torch.tensor(0.0)), (torch.tensor(0.0), torch.tensor([2e-3, -0.4]), 0 * one), names)
+    assert formula(*noisy) == "p_x − 0.002 x + 0.4 y"
+    assert formula(*noisy, drift=3e-4) == "p_x + 0.4 y"  # fails if terms below the drift of J are written
 
 
 @pytest.mark.parametrize(

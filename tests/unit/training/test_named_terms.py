@@ -108,6 +108,15 @@ def test_a_lagrangian_has_its_kinetic_energy():
     t = torch.arange(5, dtype=torch.float64)
     data = Trajectories.of(t, torch.stack([t, t], 1), names=("a", "b"))
     assert str(equation_of(SimpleNamespace(model=model, data=data))).startswith("L = 0.5 a′² + 0.5 b′²")  # pyright: ignore
+    config = ModelConfig(
+        (False, False), "linear", two, two, (0.0, 0.0), (0.0, 0.0), potential_width=0, features=("q1 v2 - q2 v1",)
+    )
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        model.get_parameter("kinetic.sum.coefficient").fill_(0.85)
+    # fails if ½ vᵀ M v is lost beside a product of speeds, or the second of its products without the coefficient
+    text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
+    assert text.startswith("L = 0.5 a′² + 0.5 b′² + 0.85 (a b′ − b a′)")
 
 
 def test_an_equation_is_never_empty():

@@ -4,6 +4,8 @@ import json
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -86,6 +88,15 @@ def test_a_plan_that_is_given_back_repeats_the_fit(noise, settings):
     assert again.metrics["plan"] == first.metrics["plan"]
     one, other = (torch.nn.utils.parameters_to_vector(run.model.parameters()) for run in (first, again))
     torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-9)  # equal but for the last bits of long sums
+
+
+def test_the_noise_that_the_first_stage_assumes():
+    # fails if the error of q2 − 2 q1 + q0 is taken for the noise, or multiplied by √6: 6 times the noise of 0.01
+    found, config = seen(0.01, level="linear")
+    for enough in (True, False):
+        probe: Any = SimpleNamespace(**vars(found.probe), enough=enough)
+        sigma = choose(replace(found, probe=probe), config).sigma
+        assert sigma == (pytest.approx(0.01, rel=0.5) if enough else None)
 
 
 def test_a_plan_overrules_the_choice():

@@ -1,19 +1,24 @@
 """The least-squares problems: exact derivatives, gauge invariance, optimisers, cross-validation, checkpoints."""
 
 import math
+from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
+from herglotz.mechanics.legendre import momentum_jacobian, momentum_plus
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, ResidualProblem, ShootingProblem, adam, fit, levenberg_marquardt
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors, simplest_not_beaten
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.one_step import MANY
 from herglotz.training.solvers import lifted_newton
 from herglotz.training.solvers.lifted_newton import solve_path
 from herglotz.training.stages import Stages
@@ -373,3 +378,41 @@ def test_wrong_settings_are_named(settings, message):
     # fails if a wrong setting is found only after an hour of training
     with pytest.raises(InputError, match=message):
         FitConfig(**settings)
+
+
+def test_noise_is_assumed_in_the_unit_of_each_coordinate():
+    # fails if a coordinate recorded in kilometres is given the noise of its metres
+    data = data_of(2)
+    small = replace(data, q=data.q * torch.tensor([1.0, 1e-3], dtype=data.q.dtype))
+    one, other = (ShootingProblem(model_of("linear", 2), d, segment_grid(d, 10, 0.3), sigma=0.1) for d in (data, small))
+    torch.testing.assert_close(other.deviations, one.deviations * torch.tensor([1.0, 1e-3], dtype=data.q.dtype))
+
+
+@pytest.mark.parametrize("inputs", [0, 1])
+def test_many_coordinates_have_the_derivative_of_the_residual(inputs):
+    # fails if inputs of the two steps are lost, or J⁻¹ ∂R/∂θ is not that of R: MANY coordinates take another way to it
+    model = model_of("forced", MANY, inputs=inputs)
+    make = torch.Generator().manual_seed(1)
+    t = torch.arange(8, dtype=torch.float64) * 0.1
+    q, u = (torch.randn(8, k, generator=make, dtype=torch.float64) for k in (MANY, 1))
+    data = Trajectories.of(t, 0.1 * q, u=u if inputs else None)
+    ours, raw = (ResidualProblem(model, data, metric=metric) for metric in ("position", "raw"))
+    x, every = ours.start(), torch.arange(6)
+    assert ours.many
+    rows: Any = ours._rows(every, None)
+    q0, q1, q2, s0, h0, h1, u0, u1 = rows
+    p = momentum_plus(ours.parameters.partials(x, q0, q1, s0, h0, 1, u0))
+    J = momentum_jacobian(ours.parameters.partials(x, q1, q2, s0, h1, 2, u1), p)
+    found, wanted = (problem._linearised(x, every, None)[1] for problem in (ours, raw))
+    torch.testing.assert_close(J @ (found * data.balance[:, None]), wanted, rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["viscous", "coulomb", "log"])
+def test_one_standard_deviation_of_friction_is_a_residual_of_one(name):
+    # fails if a spread multiplies, the speed of dry friction's is forgotten, or one kind is measured by another's
+    model = model_of("forced", 1, coulomb=True)
+    prior, start = prior_of(model, data_of()), ParameterVector(model).get()
+    moved = {"viscous": 0.1, "coulomb": 0.1 * 1.2, "log": 0.5}[name]  # spreads in the class's own words
+    theta = start.index_add(0, prior._index(f"friction.{name}")[:1], torch.tensor([moved], dtype=start.dtype))
+    change = prior.residuals(theta) - prior.residuals(start)
+    assert change[change != 0].tolist() == pytest.approx([1.0])

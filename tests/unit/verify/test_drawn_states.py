@@ -32,15 +32,33 @@ def test_an_L_d_alone_is_verified(L_d, n):
     assert report.passed, report.table()
     states = subject(L_d, 0.05, 16, 0).states
     assert states.q.shape == (16, n)
-    if n == 2:
+    if n == 1:
+        assert 0.5 < float(states.p.std()) < 2.0  # fails if q1 = q0 + q̇ instead of q0 + h q̇: p is then 20 times larger
+    else:
         assert float(states.p[:, 0].std()) > 100 * float(states.p[:, 1].std())
 
 
+def test_momenta_and_actions_belong_to_the_drawn_velocities():
+    # fails if p is −FL⁻, or s0 is 0: a gauge, 50 (q1 − q0), makes p = v + 50
+    states = subject(lambda q0, q1, s0, h: pendulum(q0, q1, s0, h) + 50.0 * (q1 - q0).sum(-1), 0.05, 64, 0).states
+    assert 45 < float(states.p.min()) < float(states.p.max()) < 55
+    assert 0.4 < float(states.s.std()) < 0.75  # uniform in [−1, 1]: 0.58
+
+
 def test_a_model_alone_has_its_own_sizes():
-    # fails if a learned model is verified at q of size 1 when its box is of size 1e-3
+    # fails if a learned model is verified at q of size 1 when its box is of size 1e-3, or at speeds of that size
     model = ContactLagrangian(ModelConfig(scale=(1e-3,), speed=(1e-2,)))
     states = subject(model, 0.02, 64, 0).states
     assert 3e-4 < float(states.q.std()) < 3e-3
+    assert 3e-3 < float(states.p.std()) < 3e-2  # a mass of 1
+
+
+def test_states_outside_L_d_are_left_out():
+    # fails if a state where L_d is NaN is verified: half of all q are outside log(q), whose slope is finite there
+    walled = lambda q0, q1, s0, h: ((q1 - q0) ** 2).sum(-1) / (2 * h) + h * torch.log(q0).sum(-1) - 0.02 * s0  # noqa: E731
+    states = subject(walled, 0.05, 64, 0).states
+    assert 20 < len(states.q) < 44
+    assert all(bool(torch.isfinite(x).all()) for x in states)
 
 
 @pytest.mark.parametrize(
@@ -51,6 +69,11 @@ def test_a_model_alone_has_its_own_sizes():
             lambda: verify(lambda q0, q1, s0, h: q0[..., 20] * q1[..., 0] + s0 * h, h=0.1),
             "up to 12 coordinates the function fails",
         ),
+        (
+            lambda: verify(lambda q0, q1, s0, h: torch.log(-(q0 * q1).square()).sum(-1) + s0 * h, h=0.1),
+            "^L_d has no finite",
+        ),
+        (lambda: verify((pendulum, (1.0, 0.5, 0.0)), h=0.1), "q must be a tensor, got a float; one coordinate is q = "),
         (lambda: verify(hz.Stepper(pendulum), h=0.1), "a stepper alone has no states"),
         (
             lambda: hz.simulate(pendulum, trajectories=2, steps=5, h=0.1),  # pyright: ignore

@@ -40,6 +40,18 @@ def test_verify_refuses_a_family_at_wrong_times():
     assert report["contact"].passed  # at a fixed time it is a contact map all the same
 
 
+class Hidden(TimeDependent):
+    """A family at the right times, which autograd does not see."""
+
+    def at(self, u):
+        return TimeDependent(self.L_d, u[..., 0].detach())
+
+
+def test_both_directions_of_time_are_judged():
+    # fails if the row looks at dh alone, which is right here
+    assert not verify(Hidden(pendulum, 0.7), h=0.3, samples=24, steps=5)["time"].passed
+
+
 def test_every_step_has_its_own_time():
     # fails if all steps of a motion begin at t0: from the third step on, at t = 1.3, this L_d is no number
     def until(q0, q1, s0, t0, h):

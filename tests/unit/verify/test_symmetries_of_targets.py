@@ -64,6 +64,8 @@ def test_a_learned_translation_is_found_within_the_error_of_the_free_run(run):
         precision=1e-9
     ).names  # a quadratic L_d is scaled; weak springs to the origin are learned, too
     assert [name for name in exact if not name.startswith("scaling")] == []
+    rounded = replace(run, metrics={**run.metrics, "extrapolation_rms": 1e-16})
+    assert rounded.symmetries().precision == 1e-9  # fails if a fit of exact data is held to less than rounding
     assert len(run.symmetries(steps=5, precision=1e9)) == len(found.spectrum)
     unseen = run.data.lengths[0] - run.train_lengths[0]
     assert unseen < 30

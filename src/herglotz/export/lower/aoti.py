@@ -16,8 +16,7 @@ from herglotz.errors import InputError
 from herglotz.export.compare import compare
 from herglotz.export.load import load_pt2
 from herglotz.export.metadata import AOTI, KEY, to_json
-from herglotz.export.programs import programs_of, quiet
-from herglotz.export.write import writes
+from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 

@@ -15,8 +15,7 @@ from herglotz.errors import InputError
 from herglotz.export.lower.onnx_table import write
 from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of
 from herglotz.export.metadata import KEY, to_json
-from herglotz.export.programs import programs_of, quiet
-from herglotz.export.write import writes
+from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
 
 OPSET = 20  # of 2023: onnxruntime 1.17 and later

@@ -7,8 +7,7 @@ from typing import Any
 
 from herglotz.data.seal import sealed_zip
 from herglotz.export.metadata import METADATA, to_json
-from herglotz.export.programs import programs_of, quiet
-from herglotz.export.write import writes
+from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
 
 

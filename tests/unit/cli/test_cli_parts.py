@@ -1,0 +1,81 @@
+"""Small parts of every command: tables, signals, what is said of a fault of the package's own."""
+
+import signal
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from herglotz.cli import _internal, main, rollout
+from herglotz.cli.common import print_table
+from herglotz.cli.interrupts import SIGNALS, orderly
+from herglotz.cli.tune import _whole
+from herglotz.errors import InputError
+
+
+def test_a_long_value_goes_on_below_itself(capsys):  # fails if its second line begins under the names
+    print_table([("a", "short"), ("name", " ".join(["word"] * 20))])
+    first, second, third = capsys.readouterr().out.splitlines()
+    assert first == "  a     short"
+    assert second.startswith("  name  word")
+    assert third.startswith(" " * 8 + "word")
+
+
+def test_an_internal_error_names_the_innermost_line():  # fails if another frame of the traceback is named
+    def inner():
+        raise ZeroDivisionError("two\nlines")
+
+    def outer():
+        inner()
+
+    with pytest.raises(ZeroDivisionError) as caught:
+        outer()
+    line = inner.__code__.co_firstlineno + 1
+    assert f"ZeroDivisionError: two lines (test_cli_parts.py:{line})" in _internal(caught.value, ["fit", "a b"])
+    assert "the command `herglotz fit 'a b'`" in _internal(caught.value, ["fit", "a b"])
+
+
+def test_a_program_that_calls_a_command_keeps_its_signals():
+    # fails if the handlers of a command outlive one that ended, or come back while an interrupted one ends
+    before = [signal.getsignal(one) for one in SIGNALS]
+    try:
+        with orderly():
+            assert all(signal.getsignal(one) not in before for one in SIGNALS)
+        assert [signal.getsignal(one) for one in SIGNALS] == before
+        with pytest.raises(KeyboardInterrupt), orderly():
+            signal.raise_signal(signal.SIGTERM)
+        assert all(signal.getsignal(one) not in before for one in SIGNALS)
+    finally:
+        for one, handler in zip(SIGNALS, before, strict=True):
+            signal.signal(one, handler)
+
+
+def test_whole_numbers():  # fails if `none` is a number, or a slip a traceback
+    assert (_whole("--widths", " none "), _whole("--widths", "1, 2")) == ((), (1, 2))
+    with pytest.raises(InputError, match=r"--widths needs whole numbers .*, got .1\.5."):
+        _whole("--widths", "1.5")
+
+
+@pytest.mark.parametrize(("step", "said"), [(0.1, False), (0.2, False), (0.0999, True), (0.2001, True)])
+def test_steps_beyond_those_of_the_fit_are_told(step, said, capsys):  # fails if a step at the end of the range is
+    source = SimpleNamespace(h_range=(0.1, 0.2), time_unit="s")
+    rollout._warn(source, step * torch.arange(4, dtype=torch.float64), None)  # type: ignore[arg-type]
+    assert ("are outside of 0.1 to 0.2" in capsys.readouterr().err) is said
+
+
+def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothing of its coordinates is not stepped
+    file = SimpleNamespace(metadata={"box": None}, dof=2, h=0.1, inputs=0, dtype=torch.float64)
+    monkeypatch.setattr("herglotz.export.load_exported", lambda *_, **__: file)
+    found = rollout.read_source(Path("a.onnx"), 0)
+    assert (found.names, found.units, found.angles, found.time_unit) == (("q0", "q1"), ("1", "1"), (False, False), "s")
+    file.metadata = {"box": None, "angles": [True, False]}
+    assert rollout.read_source(Path("a.onnx"), 0).units == ("rad", "1")
+
+
+def test_the_time_of_a_step_is_told(
+    tiny_run, tmp_path, monkeypatch, capsys
+):  # fails if it is not in µs, or of all steps
+    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=iter([1.0, 1.01]).__next__))
+    assert main(["rollout", str(tiny_run), "--steps", "5", "--out", str(tmp_path / "a.npz")]) == 0
+    assert "2000 µs each" in " ".join(capsys.readouterr().out.split())

@@ -1,0 +1,37 @@
+"""The hold of inputs that explains recorded steps."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.scenes import scene
+from herglotz.training.hold import with_arrival
+
+
+def test_the_hold_of_a_recording_is_found():
+    # fails if the wrong samples are compared: inputs held over steps, and a smooth input of the exact motion
+    held = replace(simulate(scene("driven_pendulum"), trajectories=2, steps=60, h=0.1, seed=1), hold="")
+    assert with_arrival(held, held)[1] == ("zero", 0.0, 0.0)
+    t = torch.arange(200, dtype=torch.float64) / 5
+    waves = torch.tensor([0.7, 2.0, 4.1], dtype=torch.float64)
+    phase = waves * t[:, None]
+    c, s = phase.cos(), phase.sin()
+    gain, loss = 1 - waves**2, 0.2 * waves  # of q'' + 0.2 q' + q = u, driven by cosines
+    q = ((gain * c + loss * s) / (gain**2 + loss**2)).sum(1)
+    smooth = Trajectories.of(t, q, u=c.sum(1))
+    assert with_arrival(smooth, smooth)[1].hold == "smooth"
+    smooth = replace(smooth, hold="first")
+    assert with_arrival(smooth, smooth)[1].hold == "first"
+
+
+@pytest.mark.parametrize("seed", [0, 3, 6, 7])
+def test_a_hold_that_explains_no_more_is_not_taken(seed):
+    # fails if the least error decides without its spread: these inputs move nothing, and "smooth" has the least
+    # error with these seeds, by 0 to 0.5 of two standard errors
+    make = torch.Generator().manual_seed(seed)
+    t = torch.arange(200, dtype=torch.float64) / 5
+    noise, u = torch.randn(2, 200, generator=make, dtype=torch.float64)
+    data = Trajectories.of(t, t.sin() + 0.01 * noise, u=u)
+    assert with_hold(data, "", data)[0].hold == "zero"

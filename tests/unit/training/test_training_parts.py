@@ -1,0 +1,82 @@
+"""Small decisions of a fit, each alone: units of parameters, what starts it, which features are tried."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.training import FitConfig
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.equation import _baseline
+from herglotz.training.quantities import DIMENSIONS, _unit
+from herglotz.training.structure import dictionary, start_of_features
+from herglotz.training.task import drag_starts_the_fit
+
+T = torch.arange(60, dtype=torch.float64) * 0.1
+
+
+def test_units_of_parameters():  # fails if a power of time or length is another: mass 1, forces are accelerations
+    run = SimpleNamespace(data=SimpleNamespace(units=("m", "rad"), dof=2, time_unit="s"))
+    found = {name: _unit(name, run, 0) for name in (*DIMENSIONS, "kinetic.log_mass")}  # type: ignore[arg-type]
+    assert found == {
+        "potential.stiffness": "1/s²",
+        "potential.tilt": "m/s²",
+        "damping.rate": "1/s",
+        "friction.viscous": "1/s",
+        "friction.coulomb": "m/s²",
+        "friction.breakaway": "m/s²",
+        "kinetic.log_mass": "",
+    }
+    assert _unit("potential.tilt", run, 1) == "rad/s²"  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("settings", "starts"),
+    [
+        ({}, True),
+        ({"level": "linear"}, False),
+        ({"features": ("cos(q1)",)}, False),
+        ({"known": ("cos(q1)",)}, False),
+        ({"objective": "raw"}, False),
+    ],
+)
+def test_drag_starts_the_fit_of_an_affine_model_alone(settings, starts):
+    # fails if drag is added to what the user names, or to a level whose s has no d·q̇
+    assert bool(drag_starts_the_fit(FitConfig(**{"level": "affine", **settings}))) is starts
+
+
+@pytest.mark.parametrize(("smallest", "unit", "tried"), [(1.0, "m", True), (0.0, "m", False), (1.0, "s", False)])
+def test_powers_of_the_distance(smallest, unit, tried):
+    # fails if r^-1 is tried where r passes 0, or where r is a sum of metres and seconds
+    q = torch.stack([smallest + T.sin().square(), 0 * T], 1)
+    data = Trajectories.of(T, q, units=("m", unit))
+    assert any(name.startswith("r^") for name in dictionary(data)) is tried
+    assert any(not name.startswith("r^") for name in dictionary(data))
+
+
+@pytest.mark.parametrize("settings", [{"mass_width": 2}, {"known": ("q1^5",)}, {"coulomb": True, "level": "forced"}])
+def test_features_beside_other_settings_do_not_start_the_fit(settings):
+    # fails if one linear problem starts a model that is another
+    data = Trajectories.of(T, 2 * T.cos())
+    base = estimate_baseline(data)
+    free = start_of_features(data, base, FitConfig(level="linear", features=("q1^4",)))
+    assert free is not base
+    assert start_of_features(data, base, FitConfig(**{"level": "linear", "features": ("q1^4",), **settings})) is base
+
+
+@pytest.mark.parametrize(
+    ("angle", "power", "in_L", "in_force"),
+    [
+        (True, 2, ("cos x", 3.0), ("sin x", -3.0)),  # V = k (1 − cos x), k = 3
+        (True, 1, ("sin x", -3.0), ("cos x", -3.0)),  # V = b sin x
+        (False, 2, ("x²", -1.5), ("x", -3.0)),  # V = k x² / 2
+        (False, 1, ("x", -3.0), ("", -3.0)),  # V = b x
+    ],
+)
+def test_the_baseline_in_words(angle, power, in_L, in_force):
+    # fails if L has +V, or the force +V′, or a factor 2 is lost between them
+    run = SimpleNamespace(data=SimpleNamespace(units=("m",), time_unit="s"))
+    for newton, wanted in ((False, in_L), (True, in_force)):
+        _, what, _, parts = _baseline(run, ["x″"], newton, 0, "x", angle, power, ("k", 0, 3.0))  # type: ignore[arg-type]
+        assert (what, parts) == (wanted[0], [("k", 0, wanted[1])])
