@@ -42,7 +42,7 @@ def lobatto(count: int) -> tuple[Tensor, Tensor, Tensor]:
     x[1:-1] = inner
     degrees = np.arange(count)
     P = np.polynomial.legendre.legvander(x, count)
-    norm = np.append(2 / (2 * degrees[:-1] + 1), 2 / (count - 1))  # of P_k in the discrete product of these nodes
+    norm = 2 / (2 * degrees + 1)  # of P_k; that of the last is of no account, as its integral is 0 at every node
     weights = 2 / (count * (count - 1) * P[:, count - 1] ** 2)
     series = (P[:, :-1] * weights[:, None] / norm).T  # (degree, j) coefficients of l_j
     integral = np.empty((count, count))  # (i, degree) of P_k from −1 to x_i

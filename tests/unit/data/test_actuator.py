@@ -46,7 +46,7 @@ def stepped_finely(t, u, hold, delay, lag, fine=2000):
 def test_inputs_act_late_and_lagged(hold, delay, lag):
     # fails if a piece starts from the wrong value, a trajectory remembers the one before, or means are samples
     data = recorded(hold=hold, delay=delay, lag=lag)
-    acts = acting(data)
+    acts: Any = acting(data)
     for first, length in zip(data.offsets, data.lengths, strict=True):
         rows = slice(first, first + length)
         fine, every = stepped_finely(data.t[rows].contiguous(), data.u[rows], hold, delay, lag)
@@ -55,7 +55,8 @@ def test_inputs_act_late_and_lagged(hold, delay, lag):
         # fine steps of 1/2000 meet a jump of 2 by half a fine step: below 1e-3
         torch.testing.assert_close(acts.u[rows], wanted, rtol=0, atol=2e-3)
     assert acts.arrival == (hold, 0.0, 0.0)
-    assert torch.equal(acting(acts, Arrival("first", 1.0, 1.0)).u, acts.u)
+    again: Any = acting(acts, Arrival("first", 1.0, 1.0))
+    assert torch.equal(again.u, acts.u)
 
 
 def test_a_delayed_mean_is_split_at_the_jump():
@@ -150,7 +151,7 @@ def test_a_delay_and_a_lag_are_told_apart():
     assert abs((delay + lag) / H - 2.5) < 0.1
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1])
+@pytest.mark.parametrize("noise", [0.0, 0.01, 0.1, 1.0])
 def test_nothing_is_found_where_there_is_nothing(noise):
     # fails if a gain that chance or the linear model's own error makes is taken for a delay
     data = oscillator(noise=noise, seed=3)

@@ -34,4 +34,4 @@ def test_a_hold_that_explains_no_more_is_not_taken(seed):
     t = torch.arange(200, dtype=torch.float64) / 5
     noise, u = torch.randn(2, 200, generator=make, dtype=torch.float64)
     data = Trajectories.of(t, t.sin() + 0.01 * noise, u=u)
-    assert with_arrival(data, data)[1].hold == "zero"
+    assert with_arrival(data, data)[1] == ("zero", 0.0, 0.0)
