@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import contact_defect, flow_derivative
-from herglotz.plots import parachute
+from herglotz.plots import parachute as figures
 from herglotz.scenes import PrintedParachute, scene
 from herglotz.scenes.printed_parachute import MAP_START
 from herglotz.theory import contact_vector_field
@@ -135,8 +135,8 @@ def landing_reference():
 def test_the_landing_to_fifteen_digits():
     # fails if the closed form takes the other root, or the flow another velocity
     time, speed = landing_reference()
-    x, fall = parachute.start(), scene("parachute")
-    found = parachute.landing(100.0, float(fall.velocity(*x)))
+    x, fall = figures.start(), scene("parachute")
+    found = figures.landing(100.0, float(fall.velocity(*x)))
     assert abs(found[0] / time - 1) < 1e-15
     assert abs(found[1] / speed - 1) < 1e-15
     state = fall.flow(*x, time)
@@ -146,7 +146,7 @@ def test_the_landing_to_fifteen_digits():
 
 def test_what_the_figures_draw():
     # fails if a curve starts at another k than its axis, a point is left out, or the fall goes on below the ground
-    found, orbit = parachute.printed_map()
+    found, orbit = figures.printed_map()
     points = printed_orbit(8)
     assert [len(x["points"]) for x in found.values()] == [9, 10]
     for k in range(1, 7):
@@ -154,7 +154,7 @@ def test_what_the_figures_draw():
         assert abs(orbit.p[k] / points[k - 1][1] - 1) < 2e-12
         assert abs(orbit.dS_squared[k - 1] / orbit.p_squared[k] - 1) < 1e-12
     assert len(orbit.q) == len(orbit.p) == 1 + len(orbit.dS)
-    numbers, fall = parachute.physical_fall()
+    numbers, fall = figures.physical_fall()
     assert fall.t[0] == 0.0
     assert fall.t[-1] < fall.landing_time < fall.t[-1] + 0.2
     assert fall.q[0] == 100.0

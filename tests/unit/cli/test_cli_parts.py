@@ -7,9 +7,8 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from herglotz.cli import _internal, main, rollout
+from herglotz.cli import SIGNALS, _internal, _orderly, main, rollout
 from herglotz.cli.common import print_table
-from herglotz.cli import SIGNALS, _orderly
 from herglotz.cli.tune import _whole
 from herglotz.errors import InputError
 
