@@ -89,6 +89,8 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
             level=self.level, objective=self.objective, seed=self.seed, train_fraction=self.train_fraction
         )
         at_once = {"input_delay": 0.0, "actuator_lag": 0.0}  # rows of X act when they are given
+        if any((self.settings or {}).get(name) for name in at_once):
+            raise InputError("input_delay, actuator_lag: inputs act in the row of X that has them; use herglotz.fit")
         self.run_ = fit(data, config.changed({**(self.settings or {}), **at_once}), progress=False)
         self.n_features_in_, self._flat = X.shape[1], np.ndim(y) == 1
         return self

@@ -19,6 +19,7 @@ from herglotz.training.run import box_of
 
 INSTALLED = importlib.util.find_spec("sklearn") is not None
 H = 0.2
+AT_ONCE = {"input_delay": 0.0, "actuator_lag": 0.0}
 
 
 class Base:
@@ -52,7 +53,7 @@ def known(monkeypatch, regressor, model, motion):
     """Let `fit` find this model and this motion of it."""
 
     def fit(data, config, progress):
-        assert (config, progress) == (FitConfig(level="auto", seed=7, train_fraction=1.0), False)
+        assert (config, progress) == (FitConfig(level="auto", seed=7, train_fraction=1.0, **AT_ONCE), False)
         n = data.samples
         states = State(*(x[:n] for x in (motion.q, motion.p, motion.s)))
         torch.testing.assert_close(data.q, states.q)
@@ -94,6 +95,8 @@ def test_inputs_drive_the_prediction(regressor, monkeypatch):
         found.predict(X[[20, 30]])
     with pytest.raises(InputError, match="X has 1 columns"):
         found.predict(X[20:, :1])
+    with pytest.raises(InputError, match="input_delay, actuator_lag: inputs act in the row of X"):
+        regressor(settings={"input_delay": 0.1}).fit(X[:20], q[:20])
 
 
 @torch.no_grad()

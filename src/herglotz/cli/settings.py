@@ -193,8 +193,8 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
     for flag, what in (("--input-delay", "time by which inputs act later"), ("--actuator-lag", "their time constant")):
         _setting(
             parser, flag, type=_duration, metavar="T",
-            help=f"{what}, in the data's unit; none, or auto: what the file says or else what explains the data best "
-            "(default auto)",
+            help=f"{what}, in the data's unit; none, or auto, as without this flag: what the file says or else what "
+            "explains the data best",
         )  # fmt: skip
 
 
