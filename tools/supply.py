@@ -35,6 +35,7 @@ HERE = f"{platform.python_implementation()} {platform.python_version().rpartitio
 )
 ALLOWED = {"0BSD", "Apache-2.0", "BSD", "BSD License", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "MIT",
            "LLVM-exception", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Python Software Foundation License", "Zlib"}  # fmt: skip
+CUDA = ("nvidia-", "cuda-")  # proprietary parts of torch's CUDA builds, which herglotz does not need
 ONE_LINE = 60  # letters; a longer field holds the licence's text, not its name
 
 
@@ -138,7 +139,8 @@ def main() -> None:
         SBOM.parent.mkdir(exist_ok=True)
         SBOM.write_text(json.dumps(sbom(packages), indent=1) + "\n", encoding="utf-8")
         print(f"build/sbom.json: {len(packages)} packages")
-        if refused := [package.name for package in packages if not allowed(licence(package))]:
+        others = [package for package in packages if not canonicalize_name(package.name).startswith(CUDA)]
+        if refused := [package.name for package in others if not allowed(licence(package))]:
             sys.exit(f"licence missing or not allowed: {', '.join(refused)}")
     elif what == "licences":
         text = SECURITY.read_text(encoding="utf-8")
