@@ -116,7 +116,8 @@ def lock() -> str:
 def _resolve(*words: str) -> None:
     """Run `pip install` without installing; a package that is there already is fetched all the same."""
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--only-binary=:all:"]
-    subprocess.run([*pip, *words], check=True)
+    if code := subprocess.run([*pip, *words], check=False).returncode:
+        sys.exit(code)  # pip said why
 
 
 def check_lock() -> None:
