@@ -6,6 +6,7 @@ import sys
 import types
 from dataclasses import replace
 from importlib.machinery import ModuleSpec
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from herglotz.training.run import box_of
 
 INSTALLED = importlib.util.find_spec("sklearn") is not None
 H = 0.2
-AT_ONCE = {"input_delay": 0.0, "actuator_lag": 0.0}
+AT_ONCE: Any = {"input_delay": 0.0, "actuator_lag": 0.0}
 
 
 class Base:
