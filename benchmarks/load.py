@@ -37,6 +37,7 @@ def csv(path: Path, recordings: int, samples: int) -> Callable[[], Any]:
 
 
 def write(path: Path, recordings: int, samples: int) -> None:
+    """A file of two coordinates, by numpy."""
     t = np.tile(0.01 * np.arange(samples), recordings)
     values = [t, np.sin(t), np.cos(2 * t)]
     if recordings > 1:
@@ -50,6 +51,7 @@ def batch(make: Callable[[Any], Any]) -> Callable[[], Any]:
     return rolls(make(model), start(2, BATCH, torch.float64), STEPS)
 
 
+# Rows of the table.
 WORK: dict[str, tuple[Callable[[Path], Callable[[], Any]], str]] = {
     f"csv, {ROWS} rows": (lambda path: csv(path, 1, ROWS), "≤ 3 s, ≤ 200 MB"),
     f"csv, {MANY} trajectories of 100 rows": (lambda path: csv(path, MANY, 100), ""),

@@ -30,6 +30,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).resolve().parents[1]
 LOCK, SECURITY, SBOM = ROOT / "lock.txt", ROOT / "SECURITY.md", ROOT / "build" / "sbom.json"
 TABLE = re.compile(r"\| package \| licence \|\n(?:\|.*\n)+")
+# Python without its patch level, and the platform: what wheels are made for.
 HERE = f"{platform.python_implementation()} {platform.python_version().rpartition('.')[0]} " + (
     f"{platform.system()} {platform.machine()}"
 )
