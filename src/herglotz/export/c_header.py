@@ -14,6 +14,7 @@ from typing import Any
 import torch
 
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.holds import Arrival
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
@@ -244,7 +245,7 @@ def _identifier(stem: str) -> str:
 
 def _arrival(entries: Mapping[str, Any]) -> str:
     """What to do with recorded inputs before a step takes them; nothing where they act at once."""
-    _, delay, lag = (entries.get("arrival") or {"hold": "", "delay": 0.0, "lag": 0.0}).values()
+    delay, lag = Arrival(**entries.get("arrival", {})).late
     if not delay and not lag:
         return ""
     unit = entries.get("time_unit", "s")

@@ -12,31 +12,36 @@ BOX = {name + end: [sign * x] * n for name, n, x in SIZES for end, sign in (("_l
 SMALL = {key: [0.5 * x for x in values[:1]] for key, values in BOX.items()}
 
 
+def randomise(model, size, seed):
+    """Move every parameter by normal numbers of this size; where no gradient is kept."""
+    make = torch.Generator().manual_seed(seed)
+    for parameter in model.parameters():
+        parameter += size * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+
+
 def model_of(n, level, correction=0, dtype=torch.float64):
     """A model whose every parameter is random."""
-    ones, make = (1.0,) * n, torch.Generator().manual_seed(n)
+    ones = (1.0,) * n
     angles = tuple(i % 2 == 0 for i in range(n))
     config = ModelConfig(
         angles, level, ones, ones, ones, (0.0,) * n, potential_width=4, damping_width=4, correction_width=correction
     )
     model = ContactLagrangian(config)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.2 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.2, seed=n)
     return model.to(dtype)
 
 
 def damped(level, dtype, inputs=0):
     """One coordinate, and motions that die out at rate 0.3 (at all levels but the conservative one)."""
-    one, make = (1.0,), torch.Generator().manual_seed(1)
+    one = (1.0,)
     config = ModelConfig(
         (True,), level, one, one, one, (0.0,), rate=0.3, potential_width=4, damping_width=4, inputs=inputs,
         input_zero=inputs > 0,
     )  # fmt: skip
     model = ContactLagrangian(config)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.05, seed=1)
     return model.to(dtype)
 
 
@@ -73,10 +78,8 @@ def with_terms(case) -> Any:
     model = ContactLagrangian(
         ModelConfig(angles=angles, scale=ones, speed=ones, stiffness=ones, tilt=(0.0,) * n, **config)
     )
-    make = torch.Generator().manual_seed(2)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.05, seed=2)
         if model.drag is not None:  # so large that a missing force is seen
             model.drag.coefficient.abs_().add_(0.2)
         if model.friction is not None and model.friction.sticking:  # so strong that joints stop

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import torch
+from export_models import randomise
 
 from herglotz.errors import InputError
 from herglotz.export import compile_c
@@ -61,10 +62,8 @@ def damped(case):
     options = {"potential_width": 4, "potential_depth": 2, "damping_width": 4, **CASES[case]}
     config = ModelConfig((True, False), scale=sizes, speed=sizes, stiffness=sizes, tilt=(0.0, 0.0), **options)
     model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.05, seed=3)
         if model.friction is not None:
             model.friction.viscous.abs_()
             if model.friction.sticking:  # so strong that joints stop

@@ -5,6 +5,7 @@ from typing import Any
 
 import pytest
 import torch
+from export_models import randomise
 
 from herglotz.export import c_wrapper, compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
@@ -44,10 +45,8 @@ def problem(level, activation, mass, batch):
         correction_width=3, activation=activation, mass_width=mass, **LEVELS[level],
     )  # fmt: skip
     model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.05, seed=3)
         if model.friction is not None:
             model.friction.viscous.abs_()
         if model.action is not None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import torch
+from export_models import randomise
 
 from herglotz.export import export_c
 from herglotz.models import ContactLagrangian, ModelConfig
@@ -45,10 +46,8 @@ def model_of(dtype, **options):
         **{"potential_width": 4, "damping_width": 3, **options},
     )  # fmt: skip
     model = ContactLagrangian(config)
-    make = torch.Generator().manual_seed(3)
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.05 * torch.randn(parameter.shape, generator=make, dtype=torch.float64)
+        randomise(model, 0.05, seed=3)
         if model.friction is not None:
             model.friction.viscous.abs_()
             model.friction.coulomb.abs_()
