@@ -8,6 +8,7 @@ how large its force is.
 from __future__ import annotations
 
 import math
+import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -293,9 +294,8 @@ def _form(form: tuple[float, ...], names) -> str:
 
 def _named(text: str, names) -> str:
     """A feature's text with the names of the coordinates."""
-    for i, name in reversed(list(enumerate(names, 1))):
-        text = text.replace(f"1q{i}", f"q{i}").replace(f"q{i}", name).replace(f"v{i}", f"{name}′")
-    text = text.replace("-", "−").replace("*", " ")
+    text = re.sub(r"(?<![\d.])1(?=q)", "", text).replace("-", "−").replace("*", " ")
+    text = re.sub(r"([qv])(\d+)", lambda x: names[int(x[2]) - 1] + ("′" if x[1] == "v" else ""), text)
     return f"({text})" if " − " in text and "(" not in text else text  # x y′ − y x′ has one coefficient
 
 

@@ -95,6 +95,22 @@ def test_the_equation_has_the_names_of_the_file():
     assert "theta in rad, F in N, theta recorded in deg" in " ".join(text.split())
 
 
+@pytest.mark.parametrize("names", [("q0", "q1"), ("q2", "q1"), ("v1", "x")])
+def test_names_that_look_like_the_grammar_stay_apart(names):
+    # fails if names are put in one after the other: the first one's name is then taken for the second coordinate
+    one = (1.0, 1.0)
+    config = ModelConfig(
+        (False, False), "linear", one, one, one, (0.0, 0.0), potential_width=0, features=("q1 v2 - q2 v1",)
+    )
+    t = torch.arange(5, dtype=torch.float64)
+    data = Trajectories.of(t, torch.stack([t, t], -1), names=names)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        model.get_parameter("kinetic.sum.coefficient").fill_(0.7)
+    a, b = names
+    assert f"({a} {b}′ − {b} {a}′)" in " ".join(str(equation_of(SimpleNamespace(model=model, data=data))).split())  # pyright: ignore
+
+
 def test_signs_of_an_equation():  # fails if the first minus inside a line loses its blank
     line = Equation((Term("L", "a", 2.0, None, ""), Term("L", "b", -1.0, None, "")), ("L",), "m", None)
     assert str(line).splitlines()[0] == "L = 2 a − 1 b"
