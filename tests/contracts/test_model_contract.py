@@ -61,6 +61,12 @@ MODELS = {
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True
     ),
     "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3")),
+    "dampers and air": config(
+        2,
+        (False, False),
+        level="forced",
+        drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v"),
+    ),
     "drag of position, order four": config(
         2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True
     ),

@@ -94,8 +94,8 @@ def add_model_flags(parser: argparse._ActionsContainer) -> None:
     _setting(parser, "--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
     _setting(
         parser, "--drag", action="append", metavar="TEXT",
-        help="a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', 'v1^3', or a "
-        "constant one, 'load 1' (forced); may be given again",
+        help="a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', '(v1 - v2)' of a "
+        "damper between two, '|v| v' of air, or a constant one, 'load 1' (forced); may be given again",
     )  # fmt: skip
     _setting(parser, "--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
     _setting(parser, "--alike", action="store_true", help="one mass for all, a potential of features alone: chains")

@@ -1,10 +1,12 @@
-"""Named friction forces of one joint: |v| v, v³, q² v, and so on, with a learned coefficient each.
+"""Named friction forces of one joint or between two: |v| v, v³, q² v, and so on, with a learned coefficient each.
 
-The text of one is a product: a power of a length's position if any, |v|, and a power of the joint's own speed:
+The text of one is a product: a power of a length's position if any, |v|, and a power of the same speed v. That speed is
+a joint's own, or the one of two joints from one another, which a damper between them brakes:
 
-    |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        load 2
+    |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
 
-`load 2` is a constant force on coordinate 2: on an angle no potential has it.
+`load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v| v` brakes a body that moves in a
+plane or in space as air does: |v| is the length of the whole velocity.
 """
 
 from __future__ import annotations
@@ -21,20 +23,25 @@ from herglotz.mechanics import Forces
 from herglotz.models.term import with_force
 
 HIGHEST = 9  # power of a speed or a position
+_APART = r"v\d+ - v\d+"
 _TEXT = re.compile(
-    r"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|v(?P<w>\d+)\| )?v(?P<v>\d+)(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
+    rf"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
+    r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
 )
+AIR = "|v| v"
 
 
 @dataclass(frozen=True)
 class DragFeature:
-    """q_at^a |v_on|^b v_on^c, which brakes the coordinate `on`."""
+    """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`."""
 
     on: int
     at: int
     a: int
     b: int  # 0 or 1
     c: int  # 1 or more; 0: a constant force
+    of: int | None = None
+    air: bool = False  # |v| v of the whole velocity, on every coordinate
 
 
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
@@ -45,42 +52,50 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     InputError
         If it is none, or names a coordinate that the model has not.
     """
-    match, n = _TEXT.fullmatch(" ".join(text.split())), len(angles)
+    plain, n = " ".join(text.split()), len(angles)
+    if plain == AIR:
+        refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
+        return DragFeature(0, 0, 0, 1, 1, air=True)
+    match = _TEXT.fullmatch(plain)
     if match is None:
-        raise InputError(f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1' or 'load 1'")
-    number = {name: int(digits) for name, digits in match.groupdict().items() if digits}
-    on = number["v" if "v" in number else "load"]
-    at, c = number.get("q", on), 0 if "load" in number else number.get("c", 1)
-    a = number.get("a", 1) if "q" in number else 0
-    powers = "v" not in number or (a <= HIGHEST and 1 <= c <= HIGHEST)
+        raise InputError(f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v' or 'load 1'")
+    found = match.groupdict()
+    speed = found["v"] or found["apart"]
+    on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"]))
+    at, c = int(found["q"] or on), 0 if speed is None else int(found["c"] or 1)
+    a = int(found["a"] or 1) if found["q"] else 0
     refuse({
-        f"drag '{text}': the coordinates are numbered 1 … {n}": not (1 <= on <= n and 1 <= at <= n),
-        f"drag '{text}': |v| and v are the speed of one joint; write '|v{on}| v{on}'": number.get("w", on) != on,
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at, *of)),
+        f"drag '{text}': v{on} - v{on} is 0; name two coordinates": of == [on],
+        f"drag '{text}': |v| and v are one speed; write '|{speed}|' before it": found["size"] not in (None, speed),
         f"drag '{text}': a power of an angle is not periodic; leave q{at} out": a and any(angles[at - 1 : at]),
-        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not powers,
+        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": speed and not (a <= HIGHEST >= c >= 1),
     })  # fmt: skip
-    return DragFeature(on - 1, at - 1, a, int("w" in number), c)
+    return DragFeature(on - 1, at - 1, a, int(found["size"] is not None), c, of[0] - 1 if of else None)
 
 
 class Drag(nn.Module):
-    """f_i = −Σ_g θ_g q̄_j^a |v_i|^b v_i^c of each joint i, with F⁻ = c (h/2) f, F⁺ = (h/2) f, v = Δ/h.
+    """f = −Σ_g θ_g e q̄_j^a |v|^b v^c of the speeds v = e·Δ/h, with F⁻ = c (h/2) f and F⁺ = (h/2) f.
 
-    The coefficients θ are plain parameters that start at 0; van der Pol's oscillator has viscous friction of negative
-    sign and one of q² v.
+    e has a 1 at a joint, and a −1 at another where v is the speed of the two from one another; drag through air is
+    f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters that start at 0; van der Pol's
+    oscillator has viscous friction of negative sign and one of q² v.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
         super().__init__()
         self.features = tuple(features)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
-        eye = torch.eye(dof, dtype=torch.float64)
-        for name, rows in (("on", [f.on for f in features]), ("at", [f.at for f in features])):
-            self.register_buffer(name, eye[rows], persistent=False)
+        eye = torch.eye(dof + 1, dof, dtype=torch.float64)  # its last row is 0: no other joint
+        on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
+        self.air = [g for g, f in enumerate(features) if f.air]
+        self.register_buffer("on", eye[on] - eye[of], persistent=False)
+        self.register_buffer("at", eye[[f.at for f in features]], persistent=False)
         self.on: Tensor
         self.at: Tensor
 
     def terms(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g and its slopes by q̄_j and v_i, each (..., G)."""
+        """Return φ_g and its slopes by q̄_j and v, each (..., G)."""
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
@@ -96,8 +111,19 @@ class Drag(nn.Module):
     def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
         """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them."""
         value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v))
-        slope, by_position = -torch.diag_embed(by_v @ self.on), -(self.on.T @ (by_q[..., None] * self.at))
-        return with_force(own, -value @ self.on, slope, c, h, by_position)
+        slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))
+        f = -value @ self.on
+        if self.air:
+            through_air, bend = self._through_air(v)
+            f, slope = f + through_air, slope + bend
+        return with_force(own, f, slope, c, h, by_position)
+
+    def _through_air(self, v: Tensor) -> tuple[Tensor, Tensor]:
+        """−θ |v| v, (..., n), and its slope −θ (|v| I + v vᵀ/|v|), (..., n, n)."""
+        theta, eye = self.coefficient[self.air].sum(), torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
+        size = ((v * v).sum(-1, keepdim=True) + torch.finfo(v.dtype).tiny).sqrt()  # with a derivative at rest
+        bend = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
+        return -theta * size * v, -theta * bend
 
 
 def _power(x: Tensor, k: int) -> Tensor:

@@ -119,8 +119,8 @@ class FitConfig:
         Symmetries that L_d is to have, each named by what moves together: `"q1 + q2"`, or `"q1"` alone. Nothing that is
         learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
-        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "v1^3", "load 1"
-        (forced level). See `herglotz.models.drag`.
+        Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "|v| v" of a body
+        in air, "(v1 - v2)" of a damper between two coordinates, "load 1" (forced level). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.

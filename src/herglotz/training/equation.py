@@ -8,7 +8,6 @@ how large its force is.
 from __future__ import annotations
 
 import math
-import re
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -20,11 +19,11 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import parse_drag
-from herglotz.models.feature_grammar import Product
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
 from herglotz.models.terms import Kinetic
 from herglotz.models.translations import across_in_words
+from herglotz.training.equation_words import drag_in_words, feature_in_words, number, raised, slope, unit_of
 
 
 class Run(Protocol):
@@ -42,8 +41,6 @@ class Run(Protocol):
 
 
 WIDTH = 78  # two blanks stand before each line on screen
-RELATIVE = 1e-12  # smaller deviations are rounding
-_RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
 @dataclass(frozen=True)
@@ -63,7 +60,7 @@ class Term:
 
     def __str__(self) -> str:
         sign = "−" if self.value < 0 else "+"
-        return f"{sign} {_number(abs(self.value), self.deviation)} {self.what}".rstrip()
+        return f"{sign} {number(abs(self.value), self.deviation)} {self.what}".rstrip()
 
 
 @dataclass(frozen=True)
@@ -196,7 +193,7 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
     for g, text in enumerate(still):
         yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
     for g, text in enumerate(text for text in texts if text not in still):
-        yield "L", _named(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
+        yield "L", feature_in_words(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
 
 
 def _springs(run: Run, i: int, angle: bool) -> list[tuple[int, tuple[str, int, float]]]:
@@ -216,22 +213,20 @@ def _friction(
     parts = [("damping.rate", 0, -1.0)] if "damping.rate" in named and (newton and i == 0) else []
     parts += [("friction.viscous", i, -1.0)] if "friction.viscous" in named else []
     if parts:
-        yield left, f"{name}′", _unit(unit, 0, time, 1), parts
+        yield left, f"{name}′", unit_of(unit, 0, time, 1), parts
     for g, text in enumerate(config.drag):
         f = parse_drag(text, config.angles)
-        if f.on == i:
-            of = [_raised(run.data.names[f.at], f.a)] if f.a else []
-            of += [f"|{name}′|"] if f.b else []
-            of += [_raised(f"{name}′", f.c)] if f.c else []
-            powers = 1 - f.a - f.b - f.c
-            yield left, " ".join(of), _unit(unit, powers, time, 2 - f.b - f.c), [("drag.coefficient", g, -1.0)]
+        if f.air or i in (f.on, f.of):
+            what, by = drag_in_words(f, i, run.data.names), 1.0 if f.of == i else -1.0
+            size = unit_of(unit, 1 - f.a - f.b - f.c, time, 2 - f.b - f.c)
+            yield left, what, size, [("drag.coefficient", g, by)]
     if config.coulomb:
-        yield left, f"sgn({name}′)", _unit(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
+        yield left, f"sgn({name}′)", unit_of(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
         friction = run.model.friction
         assert friction is not None  # dry friction is part of it
         width = (friction.sharpest + friction.log_stribeck.exp()).detach()
         shape = f"exp(−({name}′/{float(width[i]):.3g})²) sgn({name}′)"
-        yield left, shape, _unit(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
+        yield left, shape, unit_of(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
     if "friction.input_map" in named:
         for j in range(config.inputs):
             at = i * config.inputs + j
@@ -253,9 +248,9 @@ def _baseline(
     parameter, entry, by = part
     if newton:
         what = (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else "")
-        size = _unit(unit, 1 if angle else 2 - power, time, 2)
+        size = unit_of(unit, 1 if angle else 2 - power, time, 2)
         return lefts[i], what, size, [(parameter, entry, -by)]
-    what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else _raised(name, power)
+    what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else raised(name, power)
     factor = (by if power == 2 else -by) if angle else (-by / 2 if power == 2 else -by)
     return "L", what, "", [(parameter, entry, factor)]
 
@@ -266,62 +261,13 @@ def _feature(
     """A feature of the potential: its force on each coordinate, or its part of L."""
     names, units, time = run.data.names, run.data.units, run.data.time_unit
     if not newton:
-        yield "L", _named(text, names), "", [(*at, -1.0)]
+        yield "L", feature_in_words(text, names), "", [(*at, -1.0)]
         return
     for i in range(len(names)):
         for product in parse(text, run.model.config.angles):
             if product.function == "radius" or product.form[i]:
-                what, by, power = _slope(product, i, names)
-                yield lefts[i], what, _unit(units[i], power, time, 2), [(*at, -by)]
-
-
-def _slope(p: Product, i: int, names) -> tuple[str, float, int]:
-    """∂/∂q_i of a product without velocities: its text, its factor, and the power of length in the unit of a force."""
-    if p.function == "radius":
-        return f"{_raised('r', p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
-    form, w = _form(p.form, names), p.form[i]
-    if p.function == "power":
-        inner = form if sum(1 for x in p.form if x) == 1 else f"({form})"
-        return (_raised(inner, p.power - 1) if p.power > 1 else ""), p.factor * p.power * w, 2 - p.power
-    return (f"sin({form})", -p.factor * w, 1) if p.function == "cos" else (f"cos({form})", p.factor * w, 1)
-
-
-def _form(form: tuple[float, ...], names) -> str:
-    parts = [(w, name) for w, name in zip(form, names, strict=True) if w]
-    text = " ".join(f"{'−' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for w, name in parts)
-    return text.removeprefix("+ ")
-
-
-def _named(text: str, names) -> str:
-    """A feature's text with the names of the coordinates."""
-    text = re.sub(r"(?<![\d.])1(?=q)", "", text).replace("-", "−").replace("*", " ")
-    text = re.sub(r"([qv])(\d+)", lambda x: names[int(x[2]) - 1] + ("′" if x[1] == "v" else ""), text)
-    return f"({text})" if " − " in text and "(" not in text else text  # x y′ − y x′ has one coefficient
-
-
-def _raised(base: str, power: int) -> str:
-    return base if power == 1 else "" if power == 0 else base + str(power).translate(_RAISED)
-
-
-def _unit(unit: str, power: int, time: str, per: int) -> str:
-    """Power of the coordinate's unit over a power of the unit of time."""
-    top = "" if unit == "1" else _raised(unit, power)
-    bottom = "" if time == "1" or not per else f"{time}{str(per).translate(_RAISED) if per > 1 else ''}"
-    return (f"{top or '1'}/{bottom}" if bottom else top) or "1"
-
-
-def _number(value: float, deviation: float | None) -> str:
-    """A value with its standard deviation in units of its last digit: 25.0(3)."""
-    if deviation is None or not math.isfinite(deviation) or deviation <= RELATIVE * value:
-        return f"{value:.4g}"
-    digits = -math.floor(math.log10(deviation))
-    last = round(deviation * 10.0**digits)
-    digits, last = (digits + 1, round(deviation * 10.0 ** (digits + 1))) if last == 1 else (digits, last)
-    if digits > 12 or digits < -6:
-        return f"{value:.6g} ± {deviation:.1g}"
-    return (
-        f"{value:.{digits}f}({last})" if digits > 0 else f"{round(value, digits):.0f}({round(deviation, digits):.0f})"
-    )
+                what, by, power = slope(product, i, names)
+                yield lefts[i], what, unit_of(units[i], power, time, 2), [(*at, -by)]
 
 
 def network_of(run: Run) -> str | None:

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.models.drag import AIR
 from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
@@ -56,6 +58,9 @@ def candidates(data: Trajectories) -> NamedTerms:
     drag = []
     for i, angle in enumerate(angles, 1):
         drag += [f"|v{i}| v{i}", f"load {i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
+    if not any(angles):  # friction between joints is part of their model
+        drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(n), 2)]
+        drag += [AIR] if n > 1 and len(set(data.units)) == 1 else []
     return NamedTerms(tuple(features), tuple(drag), True)
 
 

@@ -64,7 +64,7 @@ TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "m(q)": (2, {"mass_width": 3}),
     "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
     "coupled": (2, {"level": "forced", "coupled": True, "coulomb": True}),
-    "drag": (2, {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "v2^3", "load 1")}),
+    "drag": (3, {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
     "sticking, two joints": (2, {"level": "forced", "coulomb": True, "sticking": True, "coupled": True}),
 }

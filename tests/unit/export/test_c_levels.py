@@ -32,7 +32,7 @@ CASES: dict[str, dict[str, Any]] = {
     "mass": {"level": "linear", "mass_width": 4, "activation": "softplus"},
     "motors": {"level": "forced", "coulomb": True, "inputs": 3},
     "coupled": {"level": "forced", "coupled": True},
-    "drag": {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "v2^3", "load 1"), "potential_width": 2},
+    "drag": {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "load 1"), "potential_width": 2},
     "sticking": {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1, "potential_width": 2},
     "velocities": {"level": "linear", "features": ("cos(q1) v1 v2", "q2^2 v2^2")},
     "order 4": {"level": "linear", "order": 4, "potential_width": 0, "features": ("q2^4", "cos(q1) v1 v2")},

@@ -111,6 +111,27 @@ def test_names_that_look_like_the_grammar_stay_apart(names):
     assert f"({a} {b}′ − {b} {a}′)" in " ".join(str(equation_of(SimpleNamespace(model=model, data=data))).split())  # pyright: ignore
 
 
+def test_a_damper_between_two_bodies_is_found():
+    # fails if no damper between coordinates is offered, or it pushes one body alone: friction of each body by itself
+    # cannot do what it does, and the search ended in masses and rates that were 400 times too large
+    K = torch.tensor([[12.0, -2.0], [-2.0, 2.0]], dtype=torch.float64)
+    C = torch.tensor([[0.15, -0.1], [-0.1, 0.1]], dtype=torch.float64)
+    weight, eye = torch.tensor([[1.0], [0.3]], dtype=torch.float64), torch.eye(2, dtype=torch.float64)
+    A = torch.cat([torch.cat([0 * eye, eye], 1), torch.cat([-K / weight, -C / weight], 1)])
+    x = torch.tensor([[0.5, 0.0, 0.0, 0.0], [0.0, 0.4, 0.3, 0.0]], dtype=torch.float64)
+    x = torch.stack([x @ torch.linalg.matrix_exp(0.05 * k * A).mT for k in range(301)], 1)[..., :2].flatten(0, 1)
+    q = x + 1e-3 * torch.randn(x.shape, generator=torch.Generator().manual_seed(0), dtype=x.dtype)
+    t = 0.05 * torch.arange(301, dtype=torch.float64).repeat(2)
+    run = fit(Trajectories.of(t, q, (301, 301), names=("a", "b")), progress=False)
+    terms = {(term.left[-2:], term.what): term for term in run.equation().terms}
+    for left, by in (("a″", -0.1), ("b″", 0.1)):
+        found = terms[left, "(a′ − b′)"]
+        assert found.deviation is not None
+        assert found.deviation < 0.002  # measured: 0.0003
+        assert abs(found.value - by) < 5 * found.deviation
+    assert run.metrics["verdict"].startswith("fits to the noise")
+
+
 def test_signs_of_an_equation():  # fails if the first minus inside a line loses its blank
     line = Equation((Term("L", "a", 2.0, None, ""), Term("L", "b", -1.0, None, "")), ("L",), "m", None)
     assert str(line).splitlines()[0] == "L = 2 a − 1 b"
@@ -178,8 +199,9 @@ def test_a_recurrence_in_blocks_is_the_recurrence(K):
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [("q1 q1", "write"), ("|v2| v1", "speed of one joint"), ("v3", "numbered 1 … 2"), ("q1^2 v2", "not periodic"),
-     ("v1^10", "from 1 to 9")],
+    [("q1 q1", "write"), ("|v2| v1", "are one speed"), ("v3", "numbered 1 … 2"), ("q1^2 v2", "not periodic"),
+     ("v1^10", "from 1 to 9"), ("(v1 - v1)", "is 0"), ("(v1 - v3)", "numbered 1 … 2"), ("v1 - v2", "write"),
+     ("|v1| (v1 - v2)", "are one speed")],
 )  # fmt: skip
 def test_wrong_drag_is_an_input_error(text, says):
     # fails if a text is read as another force
