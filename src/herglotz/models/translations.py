@@ -9,6 +9,7 @@ J_{k+1} = c_k J_k to rounding at every step (`herglotz.theory.symmetries` finds 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -54,17 +55,35 @@ def check_translations(config: Any) -> None:
     sees = {
         "a mass that depends on position": config.mass_width > 0,
         "the level full": config.level == "full",
-        "order 4": config.order == 4,
         "terms by name": bool(config.terms),
         "drag that depends on position": any("q" in text for text in config.drag),
     }
     for what in (name for name, is_there in sees.items() if is_there):
         raise InputError(f"translations: {what} would see them; leave it out, or the translations")
     for text in expand((*config.features, *config.known), config.angles):
-        for product in parse(text, config.angles):
-            changes = product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) for d in moved)
-            if changes and (product.power or any(product.form)):
-                raise InputError(f"feature '{text}': changes under the translation; name one of differences")
+        if not unchanged(text, config.angles, moved):
+            raise InputError(f"feature '{text}': changes under the translation; name one of differences")
+
+
+def unchanged(text: str, angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> bool:
+    """Whether no product of a feature sees the position along any of the directions."""
+    return not any(
+        (product.power or any(product.form))
+        and (product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) > SAME for d in moved))
+        for product in parse(text, angles)
+    )
+
+
+def differences(angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> list[str]:
+    """The linear forms of two moved lengths that the directions leave alone, "(q1 - q2)"."""
+    found, columns = [], list(zip(*moved, strict=True))
+    for (i, a), (j, b) in combinations(enumerate(columns), 2):
+        together = all(abs(x * w - y * v) <= SAME for x, y in zip(a, b, strict=True) for v, w in zip(a, b, strict=True))
+        if any(a) and any(b) and together and not (angles[i] or angles[j]):
+            by = next(y / x for x, y in zip(a, b, strict=True) if x)
+            first = f"q{i + 1}" if by == 1 else f"{abs(by)!r}q{i + 1}"
+            found.append(f"({first} - q{j + 1})" if by > 0 else f"({first} + q{j + 1})")
+    return found
 
 
 def projection(translations: Sequence[str], angles: Sequence[bool]) -> Tensor | None:
