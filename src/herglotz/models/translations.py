@@ -75,13 +75,12 @@ def unchanged(text: str, angles: Sequence[bool], moved: Sequence[tuple[float, ..
 
 
 def differences(angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> list[str]:
-    """The linear forms of two moved lengths that the directions leave alone, "(q1 - q2)"."""
-    found, columns = [], list(zip(*moved, strict=True))
-    for (i, a), (j, b) in combinations(enumerate(columns), 2):
-        together = all(abs(x * w - y * v) <= SAME for x, y in zip(a, b, strict=True) for v, w in zip(a, b, strict=True))
-        if any(a) and any(b) and together and not (angles[i] or angles[j]):
-            by = next(y / x for x, y in zip(a, b, strict=True) if x)
-            first = f"q{i + 1}" if by == 1 else f"{abs(by)!r}q{i + 1}"
+    """Forms of two moved lengths, "(q1 - q2)", that the first direction in which both move leaves alone."""
+    found = []
+    for (i, a), (j, b) in combinations(enumerate(zip(*moved, strict=True)), 2):
+        by = next((y / x for x, y in zip(a, b, strict=True) if x and y), 0.0)
+        if by and not (angles[i] or angles[j]):
+            first = f"q{i + 1}" if abs(by) == 1 else f"{abs(by)!r}q{i + 1}"
             found.append(f"({first} - q{j + 1})" if by > 0 else f"({first} + q{j + 1})")
     return found
 
