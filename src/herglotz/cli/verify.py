@@ -89,7 +89,11 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _text(report: Any, found: Any, agreement: dict[str, Any] | None, arguments: argparse.Namespace) -> str:
     """The report, the symmetries that were found, and how a file compares with its run."""
-    parts = [report.table()] if found is None else [report.table(), str(found)]
+    alone = agreement is None and report.passed and Path(arguments.target).is_file()
+    verdict = "its identities hold; its numbers are not verified" if alone else ""
+    if agreement is not None and not agreement["passed"]:
+        verdict = "NOT verified"
+    parts = [report.table(verdict)] + ([] if found is None else [str(found)])
     if agreement is not None:
         parts.append(_table(agreement, arguments.against))
     elif Path(arguments.target).is_file():

@@ -159,7 +159,10 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
     check_arguments(q0, q1, s0)
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     shape = torch.broadcast_shapes(q0.shape[:-1], q1.shape[:-1], s0.shape, h.shape)
-    return checked(L_d, L_d(q0, q1, s0, h), torch.empty(shape, device="meta"))
+    L = checked(L_d, L_d(q0, q1, s0, h), torch.empty(shape, device="meta"))
+    if h.ndim:
+        _check_alone(L_d, L, q0.expand(*shape, -1), q1.expand(*shape, -1), s0.expand(shape), h)
+    return L
 
 
 def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
@@ -192,12 +195,30 @@ def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
     """
     if isinstance(L, Tensor) and L.shape == like.shape:
         return L
-    name = getattr(L_d, "__name__", type(L_d).__name__).replace("<lambda>", "the function")
+    name = _name(L_d)
     got = f"shape {tuple(L.shape)}" if isinstance(L, Tensor) else f"a {type(L).__name__}"
     raise InputError(
         f"{name} returned {got} where {tuple(like.shape)}, a number a sample, belongs; "
         "sum over coordinates with .sum(-1), and add 0 * s0 where nothing depends on a sample"
     )
+
+
+def _check_alone(L_d: Any, L: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> None:
+    """Refuse an L_d whose first sample alone is another number: (q1 − q0) / h pairs samples where h has a batch."""
+    if L.numel() < 2:
+        return
+    first = (slice(0, 1),) * L.ndim
+    alone = L_d(*(x.detach()[first] for x in (q0, q1, s0, h.expand(L.shape))))
+    one, other = float(L.detach()[first]), float(alone)
+    if abs(one - other) > torch.finfo(L.dtype).eps ** 0.5 * (abs(one) + abs(other)):
+        raise InputError(
+            f"{_name(L_d)} mixes samples: the first one alone gives {other:g}, in the batch {one:g}; "
+            "write h[..., None] beside positions, as in (q1 - q0) / h[..., None]"
+        )
+
+
+def _name(L_d: Any) -> str:
+    return getattr(L_d, "__name__", type(L_d).__name__).replace("<lambda>", "the function")
 
 
 def autograd_partials(
@@ -216,6 +237,8 @@ def autograd_partials(
         # `* 1` gives each argument a graph node of its own, so that views of one tensor differentiate separately.
         a, b, s = q0 * 1, q1 * 1, s0 * 1
         L = checked(L_d, L_d(a, b, s, h), s)
+        if h.ndim:
+            _check_alone(L_d, L, a, b, s, h)
         forces = L_d.forces(a, b, s, h) if isinstance(L_d, Forced) else None
         force = None if forces is None else _autograd_forces(forces, (a, b, s), order, keep_graph)
         D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)

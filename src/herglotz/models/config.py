@@ -167,8 +167,9 @@ class ModelConfig:
                 )
             if self.order == 4 and max(len(p.velocities) for p in feature) > 2:
                 raise InputError(f"feature '{text}': order 4 takes at most two velocities a product; set order=2")
-        if self.order == 4 and self.alike and all(feature[0].velocities for feature in products.values()):
-            raise InputError("order 4 with alike needs features of the position; name chain or sites, say")
+        alone = "alike" if self.alike else "translations" if self.translations else ""
+        if self.order == 4 and alone and all(feature[0].velocities for feature in products.values()):
+            raise InputError(f"order 4 with {alone} needs features of the position; name some, or set order=2")
 
     @property
     def dof(self) -> int:

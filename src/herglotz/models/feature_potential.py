@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -133,10 +134,15 @@ def baseline_features(
     return names, values
 
 
+def baseline_is_named(config: Any) -> bool:
+    """Whether the first 2n features of a model are its baseline's: at order 4, where nothing else says what V is."""
+    return config.order == 4 and not config.alike and not config.translations
+
+
 def named_potential(config: ModelConfig) -> FeaturePotential | None:
     """Return the features of the position that a model names, at order 4 its baseline's as well; None without any."""
     own, values = [], []
-    if config.order == 4 and not config.alike:
+    if baseline_is_named(config):
         own, values = baseline_features(config.angles, config.stiffness, config.tilt)
     learned = sorted_features((*own, *(x for x in config.features if x not in own)), config.angles)[0]
     known = sorted_features(config.known, config.angles)[0]

@@ -9,6 +9,7 @@ J_{k+1} = c_k J_k to rounding at every step (`herglotz.theory.symmetries` finds 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 import torch
@@ -54,17 +55,34 @@ def check_translations(config: Any) -> None:
     sees = {
         "a mass that depends on position": config.mass_width > 0,
         "the level full": config.level == "full",
-        "order 4": config.order == 4,
         "terms by name": bool(config.terms),
         "drag that depends on position": any("q" in text for text in config.drag),
     }
     for what in (name for name, is_there in sees.items() if is_there):
         raise InputError(f"translations: {what} would see them; leave it out, or the translations")
     for text in expand((*config.features, *config.known), config.angles):
-        for product in parse(text, config.angles):
-            changes = product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) for d in moved)
-            if changes and (product.power or any(product.form)):
-                raise InputError(f"feature '{text}': changes under the translation; name one of differences")
+        if not unchanged(text, config.angles, moved):
+            raise InputError(f"feature '{text}': changes under the translation; name one of differences")
+
+
+def unchanged(text: str, angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> bool:
+    """Whether no product of a feature sees the position along any of the directions."""
+    return not any(
+        (product.power or any(product.form))
+        and (product.function == "radius" or any(abs(sum(map(float.__mul__, product.form, d))) > SAME for d in moved))
+        for product in parse(text, angles)
+    )
+
+
+def differences(angles: Sequence[bool], moved: Sequence[tuple[float, ...]]) -> list[str]:
+    """Forms of two moved lengths, "(q1 - q2)", that the first direction in which both move leaves alone."""
+    found = []
+    for (i, a), (j, b) in combinations(enumerate(zip(*moved, strict=True)), 2):
+        by = next((y / x for x, y in zip(a, b, strict=True) if x and y), 0.0)
+        if by and not (angles[i] or angles[j]):
+            first = f"q{i + 1}" if abs(by) == 1 else f"{abs(by)!r}q{i + 1}"
+            found.append(f"({first} - q{j + 1})" if by > 0 else f"({first} + q{j + 1})")
+    return found
 
 
 def projection(translations: Sequence[str], angles: Sequence[bool]) -> Tensor | None:

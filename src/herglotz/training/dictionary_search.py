@@ -64,7 +64,7 @@ class DictionarySearch:
     def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False):
         self.data, self.base, self.config = data, base, config
         self.freedom = FREEDOM if outliers else None
-        self.all = candidates(data)
+        self.all = candidates(data, config.translations)
         self.own = own_terms(data.angles)
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
@@ -101,7 +101,8 @@ class DictionarySearch:
         if local is None:
             return None
         start = smoothed(self.data, local)
-        linear = linear_starts(self.data, self.base, (self.all, *chains(self.data)), local)
+        families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
+        linear = linear_starts(self.data, self.base, families, local)
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         found = found or self._grown(*self._bare(), 1, start)
         if found is None:
@@ -150,10 +151,11 @@ class DictionarySearch:
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
-        base, own = self.base, self.own
+        base, own, zero = self.base, self.own, (0.0,) * self.data.dof
+        base = base if self.all.springs else replace(base, stiffness=zero, tilt=zero)
         values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
         features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
-        return NamedTerms(tuple(own)), {**values, **features}
+        return self.all.only(tuple(own)), {**values, **features}
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""

@@ -19,6 +19,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import parse_drag
+from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.features import expand, parse
 from herglotz.models.jet import coordinates
 from herglotz.models.terms import Kinetic
@@ -188,7 +189,7 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
         for power, place in _springs(run, i, angle):
             yield _baseline(run, lefts, newton, i, name, angle, power, place)
     texts = expand(config.features, config.angles)
-    offset = 2 * n if config.order == 4 and not config.alike else 0
+    offset = 2 * n if baseline_is_named(config) else 0
     still = [text for text in texts if not parse(text, config.angles)[0].velocities]
     for g, text in enumerate(still):
         yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
@@ -201,7 +202,7 @@ def _springs(run: Run, i: int, angle: bool) -> list[tuple[int, tuple[str, int, f
     config, coefficient = run.model.config, "potential.features.sum.coefficient"
     if any(name == "potential.stiffness" for name, _ in run.model.named_parameters()):
         return [(2, ("potential.stiffness", i, 1.0)), (1, ("potential.tilt", i, 1.0))]
-    if config.order == 4 and not config.alike:  # −k, b of an angle; k/2, b of a length
+    if baseline_is_named(config):  # −k, b of an angle; k/2, b of a length
         return [(2, (coefficient, 2 * i, -1.0 if angle else 2.0)), (1, (coefficient, 2 * i + 1, 1.0))]
     return []
 
@@ -210,7 +211,11 @@ def _friction(
     run: Run, left: str, i: int, name: str, unit: str, newton: bool
 ) -> Iterator[tuple[str, str, str, list[Part]]]:
     config, named, time = run.model.config, dict(run.model.named_parameters()), run.data.time_unit
-    parts = [("damping.rate", 0, -1.0)] if "damping.rate" in named and (newton and i == 0) else []
+    parts = []
+    if "damping.rate" in named and newton:  # the contact form damps every momentum alike
+        parts.append(("damping.rate", 0, -float(run.model.kinetic.mass().detach()[i, i])))  # type: ignore[operator]
+    elif "damping.rate" in named and i == 0:
+        yield "L", "s", unit_of("1", 0, time, 1), [("damping.rate", 0, -1.0)]
     parts += [("friction.viscous", i, -1.0)] if "friction.viscous" in named else []
     if parts:
         yield left, f"{name}′", unit_of(unit, 0, time, 1), parts

@@ -19,6 +19,7 @@ from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, 
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
+SPRINGS = ("potential.stiffness", "potential.tilt")
 ENOUGH = 5  # residuals for each coefficient: fewer leave its smallest singular value to noise
 
 
@@ -86,7 +87,7 @@ class LinearTerms:
         if len(t) > ROWS:
             rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed, u)
+        forces = NamedForces(self.all.drag, self.base.speed if self.all.dry else (), u)
         return LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
 
     def _pruned(
@@ -129,12 +130,14 @@ class LinearTerms:
         return [x for x in self.all.features if "v" in x]
 
     def _columns(self, fit: LinearFit) -> Tensor:
-        """All columns for joints; no mass or friction between lengths."""
+        """All columns for joints; no mass or friction between lengths; no springs where the terms have none."""
+        springs = torch.tensor([self.all.springs or x not in SPRINGS for x in fit.names])
         if any(self.data.angles):
-            return torch.ones(len(fit.names), dtype=torch.bool)
+            return springs
         i, j = pairs(self.data.dof, torch.device("cpu"))
         diagonal = iter((i == j).tolist())
-        return torch.tensor([next(diagonal) if x == "mass" else x != "coupling.viscous" for x in fit.names])
+        between = torch.tensor([not next(diagonal) if x == "mass" else x == "coupling.viscous" for x in fit.names])
+        return springs & ~between
 
     def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
         """Columns of each term among those that are used, the first mass not counted."""

@@ -11,7 +11,9 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.models.drag import AIR
+from herglotz.models.feature_potential import baseline_features, baseline_is_named
 from herglotz.models.features import Product, lengths, parse, revolute
+from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.parameter_vector import ParameterVector
@@ -30,6 +32,7 @@ class NamedTerms:
     drag: tuple[str, ...] = ()
     dry: bool = False
     one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
+    springs: bool = True  # the baseline's own of every coordinate; translations leave them out
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -40,12 +43,14 @@ class NamedTerms:
         """Those of them that are among `names`."""
         return NamedTerms(
             tuple(x for x in self.features if x in names), tuple(x for x in self.drag if x in names),
-            self.dry and DRY in names, self.one_rate,
+            self.dry and DRY in names, self.one_rate, self.springs,
         )  # fmt: skip
 
 
-def candidates(data: Trajectories) -> NamedTerms:
-    """The terms that these coordinates are tried with."""
+def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTerms:
+    """The terms that these coordinates are tried with: with translations those of L that do not see them."""
+    if translations:
+        return _unmoved(data, directions(translations, data.angles))
     angles, n = data.angles, data.dof
     if n == 1:
         waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
@@ -62,6 +67,15 @@ def candidates(data: Trajectories) -> NamedTerms:
         drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(n), 2)]
         drag += [AIR] if n > 1 and len(set(data.units)) == 1 else []
     return NamedTerms(tuple(features), tuple(drag), True)
+
+
+def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:
+    """What the directions leave alone: no forces beside L, whose momenta along them would not be kept."""
+    zero = (0.0,) * data.dof
+    pairs = [f"{form}^{power}" for form in differences(data.angles, moved) for power in range(1, 5)]
+    every = (*baseline_features(data.angles, zero, zero)[0], *pairs, *candidates(data).features)
+    still = tuple(dict.fromkeys(text for text in every if unchanged(text, data.angles, moved)))
+    return NamedTerms(still, one_rate=True, springs=False)
 
 
 def chains(data: Trajectories) -> list[NamedTerms]:
@@ -105,7 +119,8 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     driven = data.u is not None and config.use_inputs
     forced = bool(terms.drag) or terms.dry or driven or (data.dof > 1 and not terms.one_rate)
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
-    order = order if still or data.dof > 1 else 2  # of a potential: without one it would add a spring
+    own = data.dof > 1 and not config.translations  # the baseline's potential
+    order = order if still or own else 2  # of a potential: without one it would add a spring
     joints = data.dof > 1 and not lengths
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
@@ -164,7 +179,7 @@ def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles:
     named = {name: tuple(x.reshape(-1).tolist()) for name, x in parameters.unflatten(theta).items()}
     values: dict[str, float | tuple[float, ...]] = {}
     still, n = named.pop(STILL, ()), len(angles)
-    if of.order == 4 and not of.alike:  # −k, b of each angle; k/2, b of the others
+    if baseline_is_named(of):  # −k, b of each angle; k/2, b of the others
         own, still = still[: 2 * n], still[2 * n :]
         turn = [-1.0 if angle else 2.0 for angle in angles]
         values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
@@ -178,7 +193,7 @@ def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles:
 def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
     config = parameters.model.config
-    still = parameters.index(STILL)[2 * config.dof if config.order == 4 and not config.alike else 0 :].tolist()
+    still = parameters.index(STILL)[2 * config.dof if baseline_is_named(config) else 0 :].tolist()
     at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
     at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
     at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)

@@ -75,9 +75,11 @@ def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
 
 
 def terms_are_free(data: Trajectories, user_settings: FitConfig) -> bool:
-    """Whether the terms of these data are left to `search`: one to three coordinates, nothing said."""
+    """Whether the terms of these data are left to `search`: one to three coordinates, nothing said but translations."""
     c = user_settings
-    return data.dof <= MOST and _nothing_named(c) and c.objective == "auto" and c.substeps == 1 and not c.input_map
+    few = (2 if c.translations else 1) <= data.dof <= MOST
+    alone = c.objective == "auto" and c.substeps == 1 and not c.input_map
+    return few and alone and _nothing_named(replace(c, translations=()))
 
 
 def _nothing_named(c: FitConfig) -> bool:

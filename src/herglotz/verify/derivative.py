@@ -21,7 +21,7 @@ OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 # Sound maps leave 5e-14 to 9e-12 in float64 (every scene, 32 samples). A potential that autograd does not see leaves
 # 0.1 at h = 0.1 and 0.001 at h = 0.001.
 AGREES = {torch.float64: 1e-6, torch.float32: 1e-2}
-NARROW = 0.1  # of the offset: second differences, where the first do not agree
+NARROW = (0.1, 1e-3)  # of the offset: further differences, where the first do not agree
 COARSE = 0.01  # that these must agree with the wide ones to: a jump is seen by a wide stencil only
 VARIES = 1e4  # roundings of a component: a smaller spread is that of one value
 MOST = 4096  # steps in all: the points are drawn from all rollouts, 170 of one coordinate, 48 of ten
@@ -43,9 +43,11 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
     bound = max(AGREES[x.dtype], rounded(0.0, w) / OFFSET[x.dtype])
     bent = (of_sample > bound).nonzero()[:, 0]
     if len(bent):
-        narrow, fine = _errors(subject, x[bent], D[bent], spread, NARROW * OFFSET[x.dtype])
-        narrow = torch.where(fine, torch.minimum(narrow, of_sample[bent]), of_sample[bent])
-        of_sample[bent] = torch.maximum(narrow, bound / COARSE * of_sample[bent])
+        least = of_sample[bent]
+        for share in NARROW:
+            narrow, fine = _errors(subject, x[bent], D[bent], spread, share * OFFSET[x.dtype])
+            least = torch.where(fine, torch.minimum(narrow, least), least)
+        of_sample[bent] = torch.maximum(least, bound / COARSE * of_sample[bent])
     of_sample = of_sample[sound]
     left_out = int((~sound).sum())
     note = f"{left_out} of {len(x)} samples left out: a step beside them failed" if left_out else ""

@@ -96,15 +96,15 @@ class Report:
     def _repr_html_(self) -> str:
         return f"<pre>{escape(self.table())}</pre>"
 
-    def table(self) -> str:
-        """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below."""
+    def table(self, verdict: str = "") -> str:
+        """Return an aligned table (claim, measured, bound, ok or FAIL) with its notes below, and a verdict above."""
         rows = [("claim", "measured", "bound", "")]
         notes = list(dict.fromkeys(check.note for check in self.checks if check.note))
         for check in self.checks:
             mark = f" [{notes.index(check.note) + 1}]" if check.note else ""
             rows.append((check.statement + mark, *check.verdict))
         widths = [max(_width(row[i]) for row in rows) for i in range(3)]
-        lines = [f"{self.target}: {'verified' if self.passed else 'NOT verified'}"]
+        lines = [f"{self.target}: {verdict or ('verified' if self.passed else 'NOT verified')}"]
         lines += [
             f"  {_pad(claim, widths[0])}  {value:>{widths[1]}}  {bound:<{widths[2]}}  {verdict}".rstrip()
             for claim, value, bound, verdict in rows

@@ -5,6 +5,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import partials
+from herglotz.mechanics.partials import value
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
     PointSource,
@@ -49,6 +50,21 @@ def test_a_forgotten_sum_is_refused(door):
     # fails if a shape that broadcasts steps to a number that is wrong, with CONVERGED
     with pytest.raises(InputError, match=r"forgetful returned shape \(1,.*where \(.*sum over coordinates with .sum"):
         DOORS[door]()
+
+
+def test_a_step_that_is_not_broadcast_is_refused():
+    # fails if (q1 − q0) / h with a step a sample pairs every sample with every h, and steps on with CONVERGED
+    def hasty(q0, q1, s0, h):
+        v = (q1 - q0) / h
+        return h * (0.5 * (v * v).sum(-1) - 0.02 * s0)
+
+    q, h = torch.linspace(0, 1, 8).double()[:, None], torch.full((8,), 0.1).double()
+    message = r"hasty mixes samples: the first one alone gives .* write h\[\.\.\., None\]"
+    with pytest.raises(InputError, match=message):
+        Stepper(hasty).step(State(q, q + 0.3, q[:, 0]), h)
+    with pytest.raises(InputError, match=message):
+        value(hasty, q, q + 0.1, q[:, 0], h)
+    assert int(Stepper(hasty).step(State(q, q + 0.3, q[:, 0]), 0.1).status.max()) == 0
 
 
 def test_a_number_instead_of_a_tensor_is_refused():

@@ -1,6 +1,7 @@
 """The terms that recordings of one coordinate need, found with nothing told, and the equation that is printed."""
 
 import json
+import math
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -153,7 +154,21 @@ def test_a_lagrangian_has_its_kinetic_energy():
         model.get_parameter("kinetic.sum.coefficient").fill_(0.85)
     # fails if ½ vᵀ M v is lost beside a product of speeds, or the second of its products without the coefficient
     text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
-    assert text.startswith("L = 0.5 a′² + 0.5 b′² + 0.85 (a b′ − b a′)")
+    assert text.startswith("L = 0.5 a′² + 0.5 b′² − 0.1 s + 0.85 (a b′ − b a′)")
+
+
+def test_the_contact_form_damps_every_coordinate():
+    # fails if the rate is printed for the first coordinate alone, without the mass, or left out of L
+    data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
+    settings = {"angles": (False, False), "scale": (1.0, 1.0), "speed": (1.0, 1.0), "tilt": (0.0, 0.0), "rate": 0.3}
+    settings |= {"stiffness": (4.0, 4.0), "potential_width": 0, "level": "linear"}
+    alone = ContactLagrangian(ModelConfig(**settings, diagonal=True))
+    with torch.no_grad():
+        alone.get_parameter("kinetic.log_diagonal").fill_(0.5 * math.log(2.0))
+    lines = str(equation_of(SimpleNamespace(model=alone, data=data))).splitlines()  # pyright: ignore
+    assert lines[:2] == ["a″ = −0.3 a′ − 4 a", "2 b″ = −0.6 b′ − 4 b"]
+    both = ContactLagrangian(ModelConfig(**settings))
+    assert "− 0.3 s" in str(equation_of(SimpleNamespace(model=both, data=data)))  # pyright: ignore
 
 
 def test_an_equation_is_never_empty():

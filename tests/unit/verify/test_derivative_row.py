@@ -57,6 +57,16 @@ def test_the_scale_of_the_sample_does_not_matter():
     assert verify((scaled, start), h=0.1, steps=2)["derivative"].value < 1e-10
 
 
+def test_a_force_that_bends_sharply_is_sound():
+    # fails if a kink of the stiffness inside a stencil is taken for a derivative that is none (3e-5 with two widths)
+    for power in (3.0, 2.5):
+
+        def hard(q0, q1, s0, h, power=power):
+            return kinetic(q0, q1, s0, h) - h * ((0.5 * (q0 + q1)).abs() ** power).sum(-1)
+
+        assert verify(hard, h=0.1).passed
+
+
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32])
 def test_sound_maps_pass(dtype):
     # fails if the bound is below the rounding of differences, or a stencil is not that of order 8
