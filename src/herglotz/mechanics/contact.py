@@ -5,7 +5,7 @@ Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's d
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import torch
 from torch import Tensor
@@ -37,16 +37,29 @@ def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[tuple[
     tuple
         ((q1, p1, s1), DΦ) with DΦ of shape (..., 2n+1, 2n+1).
     """
-    n = q.shape[-1]
+    return flow_derivatives([flow], q, p, s)[0]
+
+
+def flow_derivatives(
+    flows: Iterable[Flow],  # Φ_1, Φ_2, …
+    q: Tensor,
+    p: Tensor,
+    s: Tensor,
+) -> list[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
+    """Values and derivatives of Φ_1, Φ_2∘Φ_1, …, as `flow_derivative` has them, with every map evaluated once."""
+    n, found = q.shape[-1], []
     with torch.enable_grad():
         x = torch.cat([q, p, s[..., None]], -1).detach().requires_grad_()
-        q1, p1, s1 = flow(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
-        y = torch.cat([q1, p1, s1[..., None]], -1)
-        rows = [
-            torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
-            for i in range(2 * n + 1)
-        ]
-    return (q1.detach(), p1.detach(), s1.detach()), torch.stack(rows, -2)
+        q, p, s = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
+        for flow in flows:
+            q, p, s = flow(q, p, s)
+            y = torch.cat([q, p, s[..., None]], -1)
+            rows = [
+                torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
+                for i in range(2 * n + 1)
+            ]
+            found.append(((q.detach(), p.detach(), s.detach()), torch.stack(rows, -2)))
+    return found
 
 
 def contact_defect(

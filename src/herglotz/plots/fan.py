@@ -12,7 +12,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
-from herglotz.theory import GeneratingFunction, generating_function
+from herglotz.theory import GeneratingFunction, generating_functions
 from herglotz.verify.subject import subject
 
 if TYPE_CHECKING:
@@ -30,14 +30,14 @@ class Fan:
     h: float
     momentum_unit: str = ""
 
-    def generating_function(self, k: int, start: State | None = None) -> GeneratingFunction:
-        """Return S^k and its derivatives along every solution of the fan, k >= 1 steps from its start."""
+    def generating_functions(self, steps: int, start: State | None = None) -> list[GeneratingFunction]:
+        """Return S^1, S^2, … and their derivatives along every solution of the fan."""
         stepper = Stepper(self.L_d)
 
-        def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            return stepper.rollout(q, p, s, h=self.h, steps=k).final
+        def flow(*state: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            return stepper.step(State(*state), self.h).state
 
-        return generating_function(flow, *(self.start if start is None else start))
+        return generating_functions([flow] * steps, *(self.start if start is None else start))
 
 
 def regular(S: GeneratingFunction) -> Tensor:

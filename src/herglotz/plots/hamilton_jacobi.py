@@ -40,8 +40,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     """
     fan = spread_fan(source, 32, h)
     pairs, left_out = [], 0
-    for k in range(1, STEPS + 1):
-        S = fan.generating_function(k)
+    for S in fan.generating_functions(STEPS):
         fine = regular(S)
         left_out += int((~fine).sum())
         pairs.append(torch.stack([S.p[fine], S.D2[fine]]).flatten(1).double().cpu().numpy())
@@ -84,7 +83,7 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
         As for `plot_momentum_vs_generating_function`.
     """
     fan = point_fan(source, SIZE, h)
-    S = [fan.generating_function(k) for k in range(1, STEPS + 2)]
+    S = fan.generating_functions(STEPS + 1)
     rows = [_residual(fan, S[k], S[k + 1], S[k + 1]) for k in range(STEPS)]
     table = torch.stack(rows).double().cpu().numpy()
     distance, off_flow = _off_flow(fan, S)
@@ -120,11 +119,11 @@ def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.nda
     shift = torch.as_tensor(DISTANCES * width, dtype=p.dtype, device=p.device).repeat_interleave(len(s))
     moved = State(q.repeat(count, 1), p.repeat(count, 1) + shift[:, None], s.repeat(count))
     distances, residuals = [], []
+    off = fan.generating_functions(max(NULL_STEPS) + 1, moved)
     for k in NULL_STEPS:
         S0, S1 = (_repeated(x, count) for x in (S[k - 1], S[k]))
-        M = fan.generating_function(k + 1, moved)
-        distances.append((M.q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
-        residuals.append(_residual(fan, S0, M, S1).reshape(count, -1).nanmedian(1).values)
+        distances.append((off[k].q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
+        residuals.append(_residual(fan, S0, off[k], S1).reshape(count, -1).nanmedian(1).values)
     return torch.stack(distances).double().cpu().numpy(), torch.stack(residuals).double().cpu().numpy()
 
 

@@ -14,13 +14,12 @@ import numpy as np
 import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from torch import Tensor
 
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, number, styled
 from herglotz.scenes import scene
 from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
-from herglotz.theory import GeneratingFunction, generating_function, hamilton_jacobi_residual
+from herglotz.theory import generating_functions, hamilton_jacobi_residual
 
 FLOOR = 1e-18  # where a difference of exactly 0 is drawn
 
@@ -143,23 +142,12 @@ def start() -> State:
     return State(q[None], p[None], s)
 
 
-def printed_slopes(step: PrintedParachute, k: int) -> GeneratingFunction:
-    """Return S^k of k iterations of the printed map, differentiated along its orbit."""
-
-    def flow(q: Tensor, p: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        for _ in range(k):
-            q, p, s = step(q, p, s)
-        return q, p, s
-
-    return generating_function(flow, *start())
-
-
 def printed_map() -> tuple[dict, PrintedOrbit]:
     """Return the orbit as printed and with s², as far as floats go, and D2S^k of both."""
     found, momenta, slopes = {}, {}, {}
     for name, step in (("printed", PrintedParachute()), ("squared", PrintedParachute(squared=True))):
         (q, p, s), last = step.orbit(*start(), steps=SHOWN + 6)
-        slopes[name] = [float(printed_slopes(step, k).D2) for k in range(1, SHOWN + 1)]
+        slopes[name] = [float(S.D2) for S in generating_functions([step] * SHOWN, *start())]
         momenta[name] = p[: SHOWN + 1, 0].numpy()
         rows = range(min(last, 9) + 1)
         points = [{"k": k, "q": float(q[k, 0]), "p": float(p[k, 0]), "s": float(s[k])} for k in rows]
@@ -189,11 +177,7 @@ def physical_fall() -> tuple[dict, Fall]:
     stepper = Stepper(fall.L_d)
     solution = stepper.rollout(*x, h=H, steps=steps)
     event = stepper.rollout(*x, h=H, steps=steps + 1, events=[lambda state: state.q[..., 0]]).events[0]
-
-    def flow(k: int):
-        return lambda q, p, s: stepper.rollout(q, p, s, h=H, steps=k).final
-
-    S = [generating_function(flow(k), *x) for k in range(1, steps + 1)]
+    S = generating_functions([lambda *state: stepper.step(State(*state), H).state] * steps, *x)
     assert fall.H_plus is not None
     residuals = []
     for S0, S1 in pairwise(S):

@@ -13,6 +13,7 @@ from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolonga
 from herglotz.theory.generating import (
     GeneratingFunction,
     generating_function,
+    generating_functions,
     hamilton_jacobi_residual,
     left_generating_function,
     left_hamilton_jacobi_residual,
@@ -136,6 +137,7 @@ __all__ = [
     "fiber_inverse",
     "flat",
     "generating_function",
+    "generating_functions",
     "germ",
     "hamilton_jacobi_residual",
     "hat",

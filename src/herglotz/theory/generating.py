@@ -13,12 +13,13 @@ Everything below takes S through the flow, never through those identities, so th
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.contact import Flow, flow_derivative
+from herglotz.mechanics.contact import Flow, flow_derivative, flow_derivatives
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,17 @@ class GeneratingFunction:
     p: Tensor  # (..., n) p_k as the flow carries it
     s: Tensor  # (...) s_k
     spread: Tensor  # (...) smallest singular value of ∂q_k/∂p̂0; zero at a caustic, where S^k is not defined
+
+    @classmethod
+    def of(cls, s: Tensor, end: tuple[Tensor, Tensor, Tensor], D: Tensor) -> GeneratingFunction:
+        """S^k from ŝ0, (q_k, p_k, s_k) and the derivative of the map to it (`mechanics.flow_derivative`)."""
+        (q_k, p_k, s_k), n = end, end[0].shape[-1]
+        Y_q, Y_p, Y_s = D[..., :n, :n], D[..., :n, n : 2 * n], D[..., :n, 2 * n]
+        G_q, G_p, G_s = D[..., 2 * n, :n], D[..., 2 * n, n : 2 * n], D[..., 2 * n, 2 * n]
+        D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
+        D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
+        D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
+        return cls(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(Y_p))
 
 
 def generating_function(
@@ -53,14 +65,12 @@ def generating_function(
 
     Source: generating functions of the paper, with the sign of erratum E1.
     """
-    n = q.shape[-1]
-    (q_k, p_k, s_k), D = flow_derivative(flow_k, q, p, s)
-    Y_q, Y_p, Y_s = D[..., :n, :n], D[..., :n, n : 2 * n], D[..., :n, 2 * n]
-    G_q, G_p, G_s = D[..., 2 * n, :n], D[..., 2 * n, n : 2 * n], D[..., 2 * n, 2 * n]
-    D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
-    D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
-    D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
-    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(Y_p))
+    return GeneratingFunction.of(s, *flow_derivative(flow_k, q, p, s))
+
+
+def generating_functions(flows: Iterable[Flow], q: Tensor, p: Tensor, s: Tensor) -> list[GeneratingFunction]:
+    """Return `generating_function` of the first map, of the first two composed, …; each map is evaluated once."""
+    return [GeneratingFunction.of(s, *found) for found in flow_derivatives(flows, q, p, s)]
 
 
 def left_generating_function(flow_k: Flow, q: Tensor, p: Tensor, s: Tensor) -> GeneratingFunction:

@@ -8,17 +8,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.mechanics import Partials, flow_derivative, mixed_hessian, partials
+from herglotz.mechanics import Partials, mixed_hessian, partials
+from herglotz.mechanics.contact import flow_derivatives
 from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import State
 from herglotz.theory import (
     GeneratingFunction,
-    generating_function,
     hamilton_jacobi_residual,
     left_hamilton_jacobi_residual,
     left_hamiltonian,
@@ -80,15 +81,16 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
         momenta.flatten(0, 1),
         s[:, None].expand(momenta.shape[:-1]).flatten(),
     )
-    end, D = flow_derivative(subject.flow(steps), *start)
+    counts = sorted({1, 2, steps - 1, steps})
+    found = flow_derivatives([subject.flow(k - before) for before, k in pairwise([0, *counts])], *start)
+    end, D = found[-1]
     sound = torch.isfinite(D).all(-1).all(-1) & torch.isfinite(end[2])
-    failed = int((~sound).sum())
+    S = {k: _selected(GeneratingFunction.of(start.s, *x), sound) for k, x in zip(counts, found, strict=True)}
     start = State(*(x[sound] for x in start))
     with torch.no_grad():
         sigma = dict(enumerate(subject.rollout(start, steps).sigma.unbind(-1)))
-    S = {k: generating_function(subject.flow(k), *start) for k in sorted({1, 2, steps - 1, steps})}
     keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
-    return Fan(start, S, sigma, keep, failed)
+    return Fan(start, S, sigma, keep, int((~sound).sum()))
 
 
 def derivatives(f: Fan, bound: float, bound_of_c: float) -> list[Check]:
