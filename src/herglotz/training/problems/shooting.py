@@ -63,7 +63,7 @@ class ShootingProblem(StatesProblem):
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
-        self._slopes: tuple[Path, Tensor] | None = None  # `sensitivities` of a path, by the unknowns or the states alone
+        self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
 

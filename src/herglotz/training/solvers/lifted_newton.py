@@ -21,7 +21,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.mechanics.legendre import beyond
-from herglotz.stepping import Status, solve_step
+from herglotz.stepping import Status, solve, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
@@ -147,7 +147,7 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
         delta = beyond(rest.start, rest.bound)
         q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
     P = partials(L_d, q0, q1, s0, h, order=2)
-    dq = -torch.linalg.solve_ex(momentum_jacobian(P, p0), momentum_residual(P, p0)[..., None])[0]
+    dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))[..., None]
     if P.force is not None and P.force.held is not None:
         dq = torch.where((P.force.held > 0)[..., None], 0.0, dq)
     p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
