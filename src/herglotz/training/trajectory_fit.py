@@ -212,7 +212,8 @@ class SegmentStages:
         states = SegmentStages(self.task, self.model, frozen=True, label=f", states{self.label}")
         states.patient, states.hurried, self.patient = False, True, False
         before = states.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
-        found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=True)
+        near = not self.model.capabilities.sticking  # its kinks leave Newton's steps no descent
+        found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
         self.patient = True
         return None if found is None or found.noise > LOST * sigma else found
 
