@@ -1,4 +1,6 @@
-"""Much at once: a large batch, a long csv, many recordings; processor time and memory: `python -m benchmarks.load`.
+"""Much at once: a large batch, a long csv, many recordings or coordinates: `python -m benchmarks.load`.
+
+Processor time and memory.
 
 Every row runs in a process of its own, with one thread. Memory is the most that it held beyond what it held before the
 work: with the package imported and, for the batch, the stepper and the state made.
@@ -25,6 +27,7 @@ from herglotz.export import compile_c
 
 BATCH, STEPS = 65_536, 20  # of issue 16
 ROWS, MANY = 1_000_000, 1000  # samples of the csv; recordings of 100 samples each
+MASSES, SAMPLES = 20, 200  # of the chain that is fitted
 COLUMNS = ("t[s],theta[rad],x[m]", "trajectory,t[s],theta[rad],x[m]")
 
 
@@ -45,6 +48,16 @@ def write(path: Path, recordings: int, samples: int) -> None:
     np.savetxt(path, np.stack(values, 1), "%.9g", ",", header=COLUMNS[recordings > 1], comments="")
 
 
+def chain() -> Callable[[], Any]:
+    """Fit the motion of a chain of masses between two walls, a sum of damped normal modes."""
+    make, t = np.random.default_rng(0), 0.1 * np.arange(SAMPLES)[:, None]
+    stiffness = 2 * np.eye(MASSES) - np.eye(MASSES, k=1) - np.eye(MASSES, k=-1)
+    squares, modes = np.linalg.eigh(stiffness)
+    a, b, turned = make.standard_normal(MASSES), make.standard_normal(MASSES), t * squares**0.5
+    q = np.exp(-0.025 * t) * (a * np.cos(turned) + b * np.sin(turned)) @ modes.T
+    return lambda: hz.fit([q], h=0.1, progress=False)
+
+
 def batch(make: Callable[[Any], Any]) -> Callable[[], Any]:
     """Roll a batch of two coordinates out."""
     model = model_of(2)
@@ -55,6 +68,7 @@ def batch(make: Callable[[Any], Any]) -> Callable[[], Any]:
 WORK: dict[str, tuple[Callable[[Path], Callable[[], Any]], str]] = {
     f"csv, {ROWS} rows": (lambda path: csv(path, 1, ROWS), "≤ 3 s, ≤ 200 MB"),
     f"csv, {MANY} trajectories of 100 rows": (lambda path: csv(path, MANY, 100), ""),
+    f"fit, {MASSES} coordinates, {SAMPLES} samples": (lambda _: chain(), "≤ 60 s"),
     f"C, B = {BATCH}, {STEPS} steps": (lambda _: batch(lambda model: compile_c(model, h=0.1)), ""),
     f"eager, B = {BATCH}, {STEPS} steps": (lambda _: batch(hz.Stepper), ""),
 }

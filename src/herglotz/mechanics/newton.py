@@ -54,6 +54,11 @@ def solve(matrix: Tensor, vector: Tensor) -> Tensor:
     return torch.linalg.solve_ex(matrix, vector[..., None])[0][..., 0]
 
 
+def solve_columns(matrix: Tensor, columns: Tensor) -> Tensor:
+    """matrix⁻¹ columns, (..., n, k), likewise."""
+    return columns / matrix if matrix.shape[-1] == 1 else torch.linalg.solve_ex(matrix, columns)[0]
+
+
 def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:
     """Gauss with a row exchange, for n = 2."""
     (a, b), (c, d) = (row.unbind(-1) for row in matrix.unbind(-2))

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics.legendre import momentum_jacobian
+from herglotz.mechanics.newton import solve_columns
 from herglotz.mechanics.partials import Partials
 
 
@@ -36,7 +37,7 @@ def step_derivative(
     if P.force is not None and P.force.held is not None:  # Δ = q1 − q0 = 0 in place of F = 0
         rows = (P.force.held > 0)[..., None]
         F_q0, F_p0, F_s0 = torch.where(rows, -J, F_q0), torch.where(rows, 0.0, F_p0), torch.where(rows, 0.0, F_s0)
-    dq1 = -torch.linalg.solve_ex(J, torch.cat([F_q0, F_p0, F_s0], -1))[0]
+    dq1 = -solve_columns(J, torch.cat([F_q0, F_p0, F_s0], -1))
     zero = torch.zeros_like(F_p0)
     dp1 = p1_q1 @ dq1 + torch.cat([p1_q0, zero, p1_s0], -1)
     ds1 = (P.D2[..., None, :] @ dq1)[..., 0, :] + torch.cat([P.D1, zero[..., 0], P.c[..., None]], -1)

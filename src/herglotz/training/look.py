@@ -20,6 +20,7 @@ from herglotz.training.dry_friction import friction_holds
 from herglotz.training.hold import with_arrival
 from herglotz.training.one_step_fit import fit_one_step, one_step_problem
 from herglotz.training.plan import Plan
+from herglotz.training.problems.one_step import MANY
 from herglotz.training.smoothing_fit import SMOOTHED
 from herglotz.training.stages import Stages
 from herglotz.training.structure import (
@@ -198,6 +199,8 @@ def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
     more = c.features or c.known or c.terms or c.alike or c.mass_width or c.translations
     if c.objective not in ("auto", "residual") or more or c.supervision != "q" or task.data.u is not None:
         return None
+    if task.data.dof >= MANY:  # few motions fill no space of so many dimensions, and more take hours
+        return None
     model = task.build("correction")
     if model.correction is None or model.s_enters_motion:
         return None
@@ -209,6 +212,6 @@ def _baseline_motion(task: Task) -> tuple[Triples, float] | None:
 def _probe(task: Task) -> Probe:
     model = task.build("correction")
     problem = one_step_problem(task, model, task.exact, short=True)
-    _, rms = fit_one_step(task, problem, "one-step probe", PROBE)
+    _, rms = fit_one_step(replace(task, hurried=True), problem, "one-step probe", PROBE)
     residuals = len(task.data.triples(task.base.max_step)) * task.data.dof
     return Probe(model, rms, residuals, len(problem.start()))

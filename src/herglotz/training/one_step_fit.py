@@ -22,6 +22,8 @@ ITERATIONS_BEFORE_SELECTION = 30  # of each restart, at most a third of all iter
 SEED_STRIDE = 7919  # between the seeds of restarts: no seed below 7919 shares a draw with another
 ADAM_STEPS = 20  # steps of Adam for one iteration of Levenberg–Marquardt: Adam needs no Jacobian, and many more steps
 SHORT_ROWS = 10  # triples for each coefficient in a short fit
+RTOL, HURRIED = 1e-6, 1e-3  # least gains, relative, of iterations; of fits that only measure or decide
+UNLIKELIER = 0.01  # of log-likelihood, where σ is that of rounding: lower costs say nothing more about the model
 ROWS = 50  # residuals for each coefficient in a one-step fit of found features: more only cost time
 
 
@@ -52,7 +54,7 @@ def one_step_problem(
 def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tuple[OptimiserResult, float]:
     """Minimise a one-step objective, write the result into its model, and return it with the RMS error of q."""
     if task.config.optimiser == "lm":
-        total, optimise = iterations, _levenberg_marquardt(problem, iterations)
+        total, optimise = iterations, _levenberg_marquardt(task, problem, iterations)
     else:
         total = ADAM_STEPS * iterations
         optimise = _adam(task, problem, total)
@@ -62,11 +64,16 @@ def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tu
     return result, rms
 
 
-def _levenberg_marquardt(problem: OneStep, iterations: int) -> Callable[[Tensor, Callback], OptimiserResult]:
+def _levenberg_marquardt(
+    task: Task, problem: OneStep, iterations: int
+) -> Callable[[Tensor, Callback], OptimiserResult]:
     """Return the optimiser; it forms no matrix where there are too many parameters for one."""
     large = isinstance(problem, ResidualProblem) and not problem.carries_s and problem.P > DENSE
     target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
-    return lambda x, callback: levenberg_marquardt(target, x, max_iterations=iterations, callback=callback)
+    rtol, atol = HURRIED if task.hurried else RTOL, UNLIKELIER if problem.sigma <= task.exact else 0.0
+    return lambda x, callback: levenberg_marquardt(
+        target, x, max_iterations=iterations, rtol=rtol, atol=atol, callback=callback
+    )
 
 
 def _adam(task: Task, problem: OneStep, steps: int) -> Callable[[Tensor, Callback], OptimiserResult]:

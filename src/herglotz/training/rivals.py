@@ -62,7 +62,7 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
     """Error of the free run over the rest of the training part, and the fit to its first part, in plain values."""
     inner, silent = replace(config, train_fraction=INNER), Stages(False, None, "", resume=False)
     inside = look(seen.train.thinned(every), inner, silent, plan)
-    task = Task(inside.kept, inside.base, inside.settings, silent)
+    task = Task(inside.kept, inside.base, inside.settings, silent, hurried=True)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)
     found: dict[str, Any] = {"rms": free_run_rms(task, inside, fitted), "sigma": fitted.sigma}
     if fitted.notes.get("departure") is not None:

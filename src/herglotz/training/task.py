@@ -30,6 +30,7 @@ class Task:
     base: Baseline
     config: FitConfig
     stages: Stages
+    hurried: bool = False  # a fit that only decides among models: iterations that gain less than 1 % end it
 
     @property
     def size(self) -> float:

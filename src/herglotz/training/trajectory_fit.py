@@ -125,7 +125,7 @@ class SegmentStages:
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
         self.patient = True  # paths are stepped through where no other gives them
-        self.hurried = False  # stages before the last end where they gain less than 1 %
+        self.hurried = task.hurried  # stages before the last, and of states alone, end where they gain less than 1 %
 
     def fit(
         self,
@@ -135,10 +135,12 @@ class SegmentStages:
         before: TrajectoryFit | None,
         used: Tensor | None = None,
         begin: Trajectories | None = None,
+        *,
+        near: bool = False,
     ) -> TrajectoryFit | None:
         """Segments of one length, from the states of the stage before or read off `begin`; None where no path is found.
 
-        `begin` is the data or, less noisy, the same smoothed.
+        `begin` is the data or, less noisy, the same smoothed; `near`: see `optimise`.
         """
         task = self.task
         grid = segment_grid(task.data, length, task.base.model_step)
@@ -150,12 +152,12 @@ class SegmentStages:
             start = problem.parameters.get()
             states = first_states(problem, start, begin)
             problem.guess_from_states(states_of_pairs(self.model, begin or task.data))
-            problem.patient = self.patient
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
+        problem.patient = self.patient
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
-        return self.optimise(problem, start, states, name)
+        return self.optimise(problem, start, states, name, near=near)
 
     def optimise(
         self, problem: ShootingProblem, theta: Tensor, states: Tensor, name: str, *, near: bool = False
@@ -164,7 +166,7 @@ class SegmentStages:
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
         total, last = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
-        rtol, patience = (1e-2, 1) if self.hurried and not last else (1e-4, 3)
+        rtol, patience = (1e-2, 1) if self.hurried and (self.frozen or not last) else (1e-4, 3)
         result = self.task.stages.run(
             name + self.label, x, total,
             lambda x, callback: levenberg_marquardt(
@@ -203,9 +205,15 @@ class SegmentStages:
     def at_once(
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
     ) -> TrajectoryFit | None:
-        """Whole trajectories without shorter segments before; None where that misses far more than σ."""
-        self.patient = False
-        found = self.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        """Whole trajectories from parameters that are known; None where that misses far more than σ.
+
+        The states alone are fitted first: together with them, parameters would make up for poor starts.
+        """
+        states = SegmentStages(self.task, self.model, frozen=True, label=f", states{self.label}")
+        states.patient, states.hurried, self.patient = False, True, False
+        before = states.fit(self.lengths[-1], sigma, freedom, None, begin=begin)
+        near = not self.model.capabilities.sticking  # its kinks leave Newton's steps no descent
+        found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
         self.patient = True
         return None if found is None or found.noise > LOST * sigma else found
 

@@ -224,6 +224,27 @@ def test_levenberg_marquardt_finds_the_minimum():
     assert result.history == sorted(result.history, reverse=True)
 
 
+def test_nothing_is_computed_where_nothing_is_left_to_gain():
+    # fails if a search goes on that Newton's step says is over, or a damped step is taken for one
+    class Line(Rosenbrock):
+        asked = 0
+
+        def cost(self, x):
+            self.asked += 1
+            return x.square().sum() / 2 + 1.0
+
+        def normal_equations(self, x):
+            return self.cost(x), torch.eye(len(x), dtype=x.dtype), x
+
+    x = torch.tensor([1.0, 2.0], dtype=torch.float64)
+    for damping, asked in ((1e-8, 3), (1.0, 8)):  # start, step and its equations; damped steps have more to go
+        line = Line()
+        result = levenberg_marquardt(line, x, damping=damping)
+        assert result.reason == "converged"
+        assert float(result.x.abs().max()) < 1e-2
+        assert line.asked == asked if damping < 1 else line.asked > asked
+
+
 def test_levenberg_marquardt_is_scale_free():
     # fails without Marquardt's scaling: with the identity, a parameter in other units changes the path
     class Scaled(Rosenbrock):
@@ -252,6 +273,29 @@ def test_optimisers_survive_a_cliff():
     assert float(result.x[0]) < 0.5
     assert levenberg_marquardt(Cliff(), torch.ones(2, dtype=torch.float64)).reason == "not_finite"
     assert adam(Cliff(), torch.ones(2, dtype=torch.float64), max_iterations=5).reason == "not_finite"
+
+
+def test_gains_below_atol_are_quiet():
+    # fails if atol is not looked at: the valley is followed to its end
+    start = torch.tensor([-1.2, 1.0], dtype=torch.float64)
+    result = levenberg_marquardt(Rosenbrock(), start, atol=1.0, patience=2)
+    assert result.reason == "converged"
+    assert result.cost > 1e-3
+
+
+def test_sensitivities_are_made_once(monkeypatch):
+    # fails if held-out errors, or equations at the same place, compute again what the search's last step has computed
+    problem, x = shooting_problem("linear")
+    found, made = levenberg_marquardt(problem, x, max_iterations=3).x, []
+    plain = ShootingProblem.sensitivities
+    monkeypatch.setattr(ShootingProblem, "sensitivities", lambda *given, **how: made.append(1) or plain(*given, **how))
+    _, A, _ = problem.normal_equations(found)
+    assert problem.path is not None
+    held_out_errors(problem, problem.path, problem.unpack(found)[0], A)
+    assert made == []
+    problem.normal_equations(found, held=True)  # by other unknowns
+    problem.normal_equations(x)  # elsewhere
+    assert len(made) == 2
 
 
 class Weighted(ShootingProblem):
@@ -331,10 +375,10 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
 
     def optimise(x, callback):
         calls.append(callback.resumed)
-        return levenberg_marquardt(Rosenbrock(), x, max_iterations=60, callback=callback)
+        return levenberg_marquardt(Rosenbrock(), x, max_iterations=60, rtol=0.0, callback=callback)
 
     def broken(x, callback):
-        levenberg_marquardt(Rosenbrock(), x, max_iterations=26, callback=callback)
+        levenberg_marquardt(Rosenbrock(), x, max_iterations=26, rtol=0.0, callback=callback)
         raise KeyboardInterrupt
 
     first = Stages(False, checkpoint, "key", resume=False)
@@ -416,3 +460,13 @@ def test_one_standard_deviation_of_friction_is_a_residual_of_one(name):
     theta = start.index_add(0, prior._index(f"friction.{name}")[:1], torch.tensor([moved], dtype=start.dtype))
     change = prior.residuals(theta) - prior.residuals(start)
     assert change[change != 0].tolist() == pytest.approx([1.0])
+
+
+@pytest.mark.parametrize("level", ["linear", "affine", "forced"])
+def test_the_priors_equations_are_those_of_its_residuals(level):
+    # fails if a spread enters once in place of twice, a parameter is left out, or networks' departures are
+    model, data = model_of(level, 2, coulomb=level == "forced"), data_of(2)
+    prior, theta = prior_of(model, data), ParameterVector(model_of(level, 2, 1, coulomb=level == "forced")).get()
+    J, r = torch.func.jacrev(prior.residuals)(theta), prior.residuals(theta)
+    for found, wanted in zip(prior.normal_equations(theta), (r @ r / 2, J.T @ J, J.T @ r), strict=True):
+        torch.testing.assert_close(found, wanted, rtol=1e-12, atol=1e-12)

@@ -229,7 +229,7 @@ class ResidualProblem(OneStep):
     def _linearised(self, x: Tensor, part: Tensor, carried: Any) -> tuple[Tensor, Tensor]:
         theta, rows = x[: self.P], self._rows(part, carried)
         if self.many:
-            return self._local(theta, *rows), self._jacobian_of_many(theta, *rows)
+            return self._linearised_many(theta, *rows)
         r, J = super()._linearised(theta, part, carried)
         if carried is None:
             return r, J
@@ -249,8 +249,8 @@ class ResidualProblem(OneStep):
             return R
         return solve(momentum_jacobian(after, p), R) / self.data.balance
 
-    def _jacobian_of_many(self, theta: Tensor, *rows: Any) -> Tensor:
-        """J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
+    def _linearised_many(self, theta: Tensor, *rows: Any) -> tuple[Tensor, Tensor]:
+        """J⁻¹R and J⁻¹ ∂R/∂θ, (T, n, P): the derivative of J⁻¹R without that of J, which is of the size of R."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
 
         def residual(theta: Tensor, q0: Tensor, q1: Tensor, q2: Tensor, h0: Tensor, h1: Tensor, *u: Tensor) -> Tensor:
@@ -259,8 +259,10 @@ class ResidualProblem(OneStep):
             return momentum_residual(after, momentum_plus(before))
 
         inputs = () if u0 is None or u1 is None else (u0, u1)
-        R = vmap(jacrev(residual), (None, *(0,) * (5 + len(inputs))))(theta, q0, q1, q2, h0, h1, *inputs)
+        slopes = vmap(jacrev(residual), (None, *(0,) * (5 + len(inputs))))(theta, q0, q1, q2, h0, h1, *inputs)
         with torch.no_grad():
             p = momentum_plus(self.parameters.partials(theta, q0, q1, s0, h0, 1, u0))
-            J = momentum_jacobian(self.parameters.partials(theta, q1, q2, s0, h1, 2, u1), p)
-        return torch.linalg.solve_ex(J, R)[0] / self.data.balance[:, None]
+            after = self.parameters.partials(theta, q1, q2, s0, h1, 2, u1)
+            J, R = momentum_jacobian(after, p), momentum_residual(after, p)
+            slopes = torch.linalg.solve_ex(J, slopes)[0] / self.data.balance[:, None]
+            return solve(J, R) / self.data.balance, slopes

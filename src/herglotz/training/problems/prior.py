@@ -45,16 +45,7 @@ class Prior:
         grid: int = 64,
     ):
         self.parameters = ParameterVector(model)
-        theta = self.parameters.get()
-        self.departure = departure
-        self.weight_index = self._index(*NETWORKS)
-        self.rate_index = self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous")
-        self.width_index = self._index("friction.log")
-        self.force_index = self._index("friction.coulomb")
-        self.breakaway_index = self._index("friction.breakaway")
-        own = [(f"more.{i}.", term.spread) for i, term in enumerate(model.named_terms) if term.spread is not None]
-        self.own = [(self._index(name), spread) for name, spread in own]
-        self.start, self.rate_spread, self.weight = theta, rate_spread, weight
+        self.start, self.departure = self.parameters.get(), departure
         unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
         speed = low.new_tensor(model.config.speed)
         self.grid = unit[:, : len(low)] * (high - low) + low
@@ -62,19 +53,13 @@ class Prior:
         self.typical_rate = float((speed / low.new_tensor(model.config.scale)).min())
         force = float(self._baseline_force().square().mean().sqrt())
         self.force = force if force > 0 else 1.0
+        self.index, self.spread = self._own(model, weight, rate_spread)
+        with torch.no_grad():
+            self.departs = departure is not None and bool(self._departures(self.start))
 
     def residuals(self, theta: Tensor) -> Tensor:
         """Prior residuals, (m,)."""
-        moved = theta - self.start
-        parts = [moved[self.weight_index] / self.weight, moved[self.rate_index] / self.rate_spread]
-        if len(self.force_index):
-            parts.append(moved[self.force_index] / (self.rate_spread * max(self.parameters.model.config.speed)))
-            parts.append(moved[self.breakaway_index] / (BREAKAWAY * self.force))
-            parts.append(moved[self.width_index] / WIDTH)
-        parts += [moved[index] / spread for index, spread in self.own]
-        if self.departure is not None:
-            parts += [x / (self.departure * x.numel() ** 0.5) for x in self._departures(theta)]
-        return torch.cat(parts)
+        return torch.cat([(theta - self.start)[self.index] / self.spread, self._departed(theta)])
 
     def cost(self, theta: Tensor) -> Tensor:
         """½|residuals|²."""
@@ -82,8 +67,30 @@ class Prior:
 
     def normal_equations(self, theta: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(½|r|², JᵀJ, Jᵀr) of the prior alone."""
-        J, r = jacrev(lambda x: (r := self.residuals(x), r), has_aux=True)(theta)
-        return r.square().sum() / 2, J.T @ J, J.T @ r
+        own = (theta - self.start)[self.index] / self.spread
+        cost, b = own.square().sum() / 2, torch.zeros_like(theta).index_add(0, self.index, own / self.spread)
+        A = torch.zeros_like(theta).index_add(0, self.index, self.spread**-2).diag()
+        if self.departs:
+            J, r = jacrev(lambda x: (r := self._departed(x), r), has_aux=True)(theta)
+            cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
+        return cost, A, b
+
+    def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
+        """Which parameters are N(their start, spread²) by themselves, and their spreads, (m,) each."""
+        spreads = [
+            (self._index(*NETWORKS), weight),
+            (self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous"), rate_spread),
+            (self._index("friction.coulomb"), rate_spread * max(model.config.speed)),
+            (self._index("friction.breakaway"), BREAKAWAY * self.force),
+            (self._index("friction.log"), WIDTH),
+            *(
+                (self._index(f"more.{i}."), term.spread)
+                for i, term in enumerate(model.named_terms)
+                if term.spread is not None
+            ),
+        ]
+        index = torch.cat([index for index, _ in spreads]).to(self.start.device)
+        return index, torch.cat([self.start.new_full((len(index),), spread) for index, spread in spreads])
 
     def _index(self, *prefixes: str) -> Tensor:
         return torch.cat([self.parameters.index(prefix) for prefix in prefixes])
@@ -95,6 +102,11 @@ class Prior:
             if potential.features is None or bool(own.any()):
                 return own
             return potential.features(self.grid, 1).gradient  # the potential is made of features alone
+
+    def _departed(self, theta: Tensor) -> Tensor:
+        """The residuals of the networks' outputs; none without a departure."""
+        parts = self._departures(theta) if self.departs else []
+        return torch.cat([x / (self.departure * x.numel() ** 0.5) for x in parts]) if parts else theta[:0]
 
     def _departures(self, theta: Tensor) -> list[Tensor]:
         """Network outputs on the grid, each relative to its natural size."""

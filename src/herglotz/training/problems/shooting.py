@@ -63,7 +63,7 @@ class ShootingProblem(StatesProblem):
         self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
-        self._slopes: Tensor | None = None  # (S, K+1, d, P + d or d) of `path`, by the unknowns or the states alone
+        self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
 
@@ -114,10 +114,18 @@ class ShootingProblem(StatesProblem):
         if self._at is None or self._slopes is None:
             return path.x
         theta, states = self.unpack(x - self._at)
-        moved = torch.cat([theta.expand(len(states), -1), states], -1)[:, -self._slopes.shape[-1] :]
+        _, slopes = self._slopes
+        moved = torch.cat([theta.expand(len(states), -1), states], -1)[:, -slopes.shape[-1] :]
         guess = path.x.clone()
-        guess[..., : self.d] += (self._slopes @ moved[:, None, :, None])[..., 0]
+        guess[..., : self.d] += (slopes @ moved[:, None, :, None])[..., 0]
         return guess
+
+    def _slopes_of(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
+        """`sensitivities`, made once for a path: a fit that ends there is asked for them again."""
+        width = self.d + (0 if held else self.P)
+        if self._slopes is None or self._slopes[0] is not path or self._slopes[1].shape[-1] != width:
+            self._slopes = path, self.sensitivities(theta, path, held=held)
+        return self._slopes[1]
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|²; infinite where a step fails."""
@@ -137,7 +145,7 @@ class ShootingProblem(StatesProblem):
             return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
         self.path, self._at = path, x.clone()
         grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
-        Z = self._slopes = self.sensitivities(theta, path, held=held)
+        Z = self._slopes_of(theta, path, held=held)
         fit, joints = self._residuals(path.x)
         cost = self.loss(fit, joints)
         by_fit, by_joint = self.weight * self.root_weights(fit), self.root_weights(joints)
@@ -227,7 +235,7 @@ class ShootingProblem(StatesProblem):
         """
         r = self.misfit(path) / self.sigma
         by = self.weight * self.root_weights(r)
-        Z = self.sensitivities(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
+        Z = self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
         Z = Z * (by / self.deviations)[..., None]
         order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
@@ -287,10 +295,10 @@ class ShootingProblem(StatesProblem):
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
         d = self.d
-        q1 = path.x[:, 1:, : self.n]
+        q1, A = path.x[:, 1:, : self.n], path.A[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
-            B = parameter_derivatives(self.parameters, theta, path.x, q1, self.grid.h, self.u)[..., :d, :]
+            B = parameter_derivatives(self.parameters, theta, path.x, q1, A, self.grid.h, self.u)
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
-        return linear_recurrence(path.A[..., :d, :d], torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)
+        return linear_recurrence(A, torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)

@@ -13,6 +13,7 @@ from torch import Tensor
 from herglotz.training.distributed import everywhere, of_first
 
 ROUNDING = 1e-11  # a change of the cost below this, relative, is the rounding of a long sum
+FREE, LEFT = 1e-6, 0.01  # damping of steps that are Newton's, and the share of a quiet step that is not worth one
 
 
 class ByProducts(Protocol):
@@ -100,6 +101,7 @@ def levenberg_marquardt(
     *,
     max_iterations: int = 150,
     rtol: float = 1e-6,
+    atol: float = 0.0,
     patience: int = 5,
     damping: float = 1e-3,
     callback: Progress | None = None,
@@ -118,9 +120,10 @@ def levenberg_marquardt(
         (P,) start.
     max_iterations
         Bound on accepted and rejected steps together.
-    rtol, patience
-        Stop after `patience` accepted steps in a row that each lower the cost by less than `rtol` relative. A step
-        that changes it by rounding only is not taken and counts as one of them.
+    rtol, atol, patience
+        Stop after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol` relative.
+        A step that changes it by rounding only is not taken and counts as one of them. Stop at once where an all but
+        undamped step is to lower it by less than a hundredth of that.
     damping
         λ of the first step. Where few combinations of the unknowns are free beside the diagonal (smoothed states), it
         has to be far smaller than where all are.
@@ -148,13 +151,16 @@ def levenberg_marquardt(
         step = _damped_step(A, b, at.damping * _floored(at.scale))
         new, predicted = math.inf, 0.0
         if step is not None:
-            new = float(of_first(problem.cost(at.x + step))[0])
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
+            if at.damping <= FREE and 0 <= predicted < LEFT * max(rtol * at.best, atol):
+                at.quiet = patience
+                break
+            new = float(of_first(problem.cost(at.x + step))[0])
         # Whether rounding lets the cost fall differs from machine to machine; the search must not depend on it.
         settled = abs(at.best - new) <= rounding * at.best
         if step is not None and not settled and new < at.best and predicted > 0:
             gain = (at.best - new) / predicted
-            at.quiet = at.quiet + 1 if at.best - new <= rtol * at.best else 0
+            at.quiet = at.quiet + 1 if at.best - new <= max(rtol * at.best, atol) else 0
             at.x = at.x + step
             cost, A, b = _of_first(problem.normal_equations(at.x))
             at.best = float(cost)

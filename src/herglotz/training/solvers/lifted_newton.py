@@ -21,7 +21,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.mechanics.legendre import beyond
-from herglotz.stepping import Status, solve_step
+from herglotz.stepping import Status, solve, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
@@ -91,24 +91,30 @@ def linear_recurrence(
 ) -> Tensor:
     """Z_0 = first, Z_{k+1} = A_k Z_k + B_k, (S, K+1, d, r), by about 2 √K products of batches instead of K small ones.
 
-    In √K blocks at once: Z from 0, and the product of the A so far; then from block to block.
+    In √K blocks at once: their ends from Z = 0 and the products of their A, the starts of blocks from block to block,
+    then all that lies between.
     """
     S, K, d = A.shape[:3]
     length = max(1, math.isqrt(K))
     blocks = -(-K // length)
     more = blocks * length - K
     eye = torch.eye(d, dtype=A.dtype, device=A.device)
-    A = torch.cat([A, eye.expand(S, more, d, d)], 1).unflatten(1, (blocks, length))
-    B = torch.cat([B, B.new_zeros(S, more, *B.shape[2:])], 1).unflatten(1, (blocks, length))
-    own, product = [torch.zeros_like(B[:, :, 0])], [eye.expand(S, blocks, d, d)]
+    padded = torch.cat([A, eye.expand(S, more, d, d)], 1), torch.cat([B, B.new_zeros(S, more, *B.shape[2:])], 1)
+    # (length, S · blocks, d, …): one product a step of all blocks, of numbers that lie side by side
+    A, B = (x.unflatten(1, (blocks, length)).movedim(2, 0).flatten(1, 2).contiguous() for x in padded)
+    own, product = torch.zeros_like(B[0]), eye.expand(S * blocks, d, d)
     for k in range(length):
-        own.append(A[:, :, k] @ own[-1] + B[:, :, k])
-        product.append(A[:, :, k] @ product[-1])
+        own, product = torch.baddbmm(B[k], A[k], own), A[k] @ product
     starts = [first]
-    for b in range(blocks):
-        starts.append(product[-1][:, b] @ starts[-1] + own[-1][:, b])
-    inside = torch.stack(product[:-1], 2) @ torch.stack(starts[:-1], 1)[:, :, None] + torch.stack(own[:-1], 2)
-    return torch.cat([inside.flatten(1, 2), starts[-1][:, None]], 1)[:, : K + 1]
+    for end, through in zip(
+        own.unflatten(0, (S, blocks)).unbind(1), product.unflatten(0, (S, blocks)).unbind(1), strict=True
+    ):
+        starts.append(through @ starts[-1] + end)
+    inside = [torch.stack(starts[:-1], 1).flatten(0, 1)]
+    for k in range(length - 1):
+        inside.append(torch.baddbmm(B[k], A[k], inside[-1]))
+    states = torch.stack(inside, 1).unflatten(0, (S, blocks)).flatten(1, 2)
+    return torch.cat([states, starts[-1][:, None]], 1)[:, : K + 1]
 
 
 def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
@@ -141,7 +147,7 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
         delta = beyond(rest.start, rest.bound)
         q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
     P = partials(L_d, q0, q1, s0, h, order=2)
-    dq = -torch.linalg.solve_ex(momentum_jacobian(P, p0), momentum_residual(P, p0)[..., None])[0]
+    dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))[..., None]
     if P.force is not None and P.force.held is not None:
         dq = torch.where((P.force.held > 0)[..., None], 0.0, dq)
     p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
@@ -153,33 +159,29 @@ def parameter_derivatives(
     theta: Tensor,  # (P,)
     x: Tensor,  # (S, K+1, 2n+1) states that the steps start from; the last is not used
     q1: Tensor,  # (S, K, n) positions that they lead to
+    A: Tensor,  # (S, K, d, d) DΦ̃ there, d = 2n or, with s, 2n + 1
     h: Tensor,  # (S, K)
     u: Tensor | None = None,  # (S, K, m)
 ) -> Tensor:
-    """∂Φ̃(x_k)/∂θ of every step, (S, K, 2n+1, P), by the implicit-function theorem.
+    """∂Φ̃(x_k)/∂θ of every step, (S, K, d, P), by the implicit-function theorem.
 
-    With F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ; p1 and s1 follow.
+    With F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ; p1 and s1 follow. θ acts through F as c p0 does: −J⁻¹, and what
+    follows from it, are the columns of DΦ̃ that belong to p0, over c.
     """
-    S, K, n = *h.shape, q1.shape[-1]
-    q0, p0, s0 = (y.flatten(0, 1) for y in (x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]))
-    ends, steps, inputs = q1.flatten(0, 1), h.flatten(), None if u is None else u.flatten(0, 1)
+    (S, K, n), d = q1.shape, A.shape[-1]
+    x, ends, steps = x[:, :-1].flatten(0, 1), q1.flatten(0, 1), h.flatten()
+    by_push, inputs = A[..., n : 2 * n].flatten(0, 1), None if u is None else u.flatten(0, 1)
 
-    def step_functions(
-        theta: Tensor, q0: Tensor, q1: Tensor, p0: Tensor, s0: Tensor, h: Tensor, u: Tensor | None
-    ) -> Tensor:
-        P = parameters.partials(theta, q0, q1, s0, h, 1, u)
-        return torch.cat([momentum_residual(P, p0), momentum_plus(P), P.L[..., None]], -1)
+    def step_functions(theta: Tensor, x: Tensor, q1: Tensor, h: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
+        P = parameters.partials(theta, x[:n], q1, x[2 * n], h, 1, u)
+        made = torch.cat([momentum_residual(P, x[n : 2 * n]), momentum_plus(P), P.L[None]])
+        return made[:d], P.c
 
-    per_step = vmap(jacrev(step_functions), (None, 0, 0, 0, 0, 0, None if u is None else 0))
-    out = x.new_zeros(S * K, 2 * n + 1, len(theta))
+    per_step = vmap(jacrev(step_functions, has_aux=True), (None, 0, 0, 0, None if u is None else 0))
+    out = x.new_zeros(S * K, d, len(theta))
     for _, part in own_parts(S * K, CHUNK, x.device):
-        here, own = (q0[part], ends[part], p0[part], s0[part], steps[part]), None if inputs is None else inputs[part]
-        G = per_step(theta, *here, own)  # (part, 2n+1, P)
-        with torch.no_grad():
-            P = partials(parameters.at(theta, own), here[0], here[1], here[3], here[4], order=2)
-            dq1 = -torch.linalg.solve_ex(momentum_jacobian(P, here[2]), G[:, :n])[0]
-            dp1 = G[:, n : 2 * n] + _momentum_slope(P) @ dq1
-            ds1 = G[:, 2 * n :] + P.D2[:, None, :] @ dq1
-        out[part] = torch.cat([dq1, dp1, ds1], 1)
+        G, c = per_step(theta, x[part], ends[part], steps[part], None if inputs is None else inputs[part])
+        F, G = G[:, :n], G.index_fill(1, torch.arange(n, device=x.device), 0.0)
+        out[part] = G + (by_push[part] / c[:, None, None]) @ F
     add_over_processes(out)
-    return out.reshape(S, K, 2 * n + 1, len(theta))
+    return out.reshape(S, K, d, len(theta))
