@@ -56,12 +56,13 @@ def python(versions: tuple[str, ...] | None, name: str) -> str:
     if versions is None:
         return sys.executable
     base = name if name.startswith("python") else sys.executable
-    folder = ROOT / ".venv" / f"anywhere-{name}"
+    folder = RESULTS.parent / f"anywhere-{name}"
     own = folder / "bin" / "python"
     if not (folder / "installed").exists():
         pinned = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
         kept = [line for line in pinned if not (versions and line.startswith(("numpy", "matplotlib")))]
-        subprocess.run([base, "-m", "venv", str(folder)], check=True)
+        pyenv = os.environ | {"PYENV_VERSION": name.removeprefix("python")}  # its shims know but one version at a time
+        subprocess.run([base, "-m", "venv", str(folder)], check=True, env=pyenv if base == name else None)
         (folder / "constraints.txt").write_text("\n".join([*kept, ""]), encoding="utf-8")
         install = [str(own), "-m", "pip", "install", "--quiet", "-c", str(folder / "constraints.txt")]
         subprocess.run([*install, "--upgrade", *versions, "-e", f"{ROOT}[dev]"], check=True)
