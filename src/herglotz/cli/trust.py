@@ -102,7 +102,6 @@ def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
 
 def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figure: Path) -> None:
     from herglotz.data.units import size
-
     from herglotz.training.uncertainty import determined
 
     data, equation = result.data, result.metrics.get("equation")

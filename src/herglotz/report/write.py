@@ -20,9 +20,9 @@ from herglotz.report.sections import Block, Code, Document, Picture, Section, Sl
 from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
-from herglotz.training.uncertainty import determined
 from herglotz.training.quantities import held_out_rms, quantities
 from herglotz.training.summary import rows as summary_rows
+from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
 
 MEANING = {

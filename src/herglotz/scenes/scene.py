@@ -76,6 +76,7 @@ class Scene:
 
     def __repr__(self) -> str:
         return f"Scene({self.name}: {', '.join(self.coordinates)})"
+
     at: Callable[[Tensor], Scene] | None = None
     drive: Callable[[Tensor], Tensor] | None = None
     external: Callable[[Tensor, Tensor], Tensor] | None = None

@@ -208,8 +208,8 @@ def test_the_example_in_the_comment_runs(tmp_path, start):
 
 
 def test_a_start_of_another_size_is_refused(tmp_path):  # fails if the header holds a state of too few numbers
-    with pytest.raises(InputError, match="start cannot be .* with dof 2; export"):
-        start = {"q": [0.4], "p": [0.1], "s": 0.0}
+    start = {"q": [0.4], "p": [0.1], "s": 0.0}
+    with pytest.raises(InputError, match=r"start cannot be .* with dof 2; export"):
         export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1, metadata={"start": start})
 
 
