@@ -58,9 +58,10 @@ test: .venv/installed
 test-anywhere: .venv/installed
 	$(PY) tests/anywhere.py
 
-# The suite on every Python that is supported and installed here, each in an environment of its own.
+# The suite on every Python that is supported and installed here, and with the oldest and newest numpy and matplotlib,
+# each in an environment of its own.
 test-pythons: .venv/installed
-	$(PY) tests/anywhere.py --only python3.11 python3.12 python3.13
+	$(PY) tests/anywhere.py --only python3.11 python3.12 python3.13 oldest newest
 
 test-slow: .venv/installed
 	$(ENV) $(PY) -m pytest -q -m slow

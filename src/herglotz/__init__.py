@@ -1,10 +1,10 @@
 """herglotz: learned discrete contact Lagrangians. Positions in, a verified stepper out.
 
 >>> import herglotz as hz
->>> from herglotz.verify import verify
->>> run = hz.fit(hz.load("motion.csv"))
->>> rollout = run.stepper.rollout(*run.states_at_end(), h=run.h, steps=100)
->>> print(verify(run).table())
+>>> run = hz.fit("motion.csv")
+>>> print(run.equation())
+>>> future = run.rollout(100)
+>>> print(run.verify().table())
 """
 
 from importlib import import_module
@@ -70,6 +70,10 @@ __all__ = [
     "scene_names",
     "simulate",
 ]
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "import_module"})
 
 
 def __getattr__(name: str) -> Any:

@@ -18,6 +18,11 @@ def test_every_public_name_resolves_again_and_again():
             assert callable(value), name
 
 
+def test_completion_offers_the_public_names():  # fails if dir(hz) lacks hz.fit before its first use, or offers helpers
+    assert set(hz.__all__) <= set(dir(hz))
+    assert not {"Any", "TYPE_CHECKING", "import_module"} & set(dir(hz))
+
+
 def test_the_version_stands_in_one_place():
     # fails if the version is written into pyproject.toml or CITATION.cff too, where it could differ
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -72,7 +72,8 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json({"file": str(arguments.out), "bytes": size, "metadata": found})
     else:
-        print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} coordinate(s), h {result.h:g}")
+        plural = "coordinate" if found["dof"] == 1 else "coordinates"
+        print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} {plural}, h {result.h:g}")
         if kicks.is_file():
             print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
         if arguments.format != "c" and tuned.get("tol"):

@@ -60,6 +60,13 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, formatter_class=Help, **options)
         self._negative_number_matcher = NEGATIVE_NUMBER
 
+    def parse_known_args(self, args=None, namespace=None):
+        """Refuse what no flag takes here, where the subcommand's own help is the one to name."""
+        found, rest = super().parse_known_args(args, namespace)
+        if rest:
+            self.error(f"unrecognized arguments: {' '.join(rest)}")
+        return found, rest
+
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to read on; exit with code 2."""
         self.exit(2, f"herglotz: error: {' '.join(message.split())}; see '{self.prog} --help'\n")

@@ -207,6 +207,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
             model.inputs, _bounded(model.s_enters_motion), data.degrees,
         )  # fmt: skip
 
+    from herglotz.data.checks import unnamed
     from herglotz.data.holds import Arrival
     from herglotz.export import load_exported
 
@@ -214,7 +215,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     m, n = stepper.metadata, stepper.dof
     stored = m.get("start")
     start = stored and State(*(torch.tensor(stored[name], dtype=stepper.dtype) for name in "qps"))
-    names = tuple(m.get("names") or (["q"] if n == 1 else [f"q{i}" for i in range(n)]))
+    names = tuple(m.get("names") or unnamed(n))
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
     by_s = s_matters(m)

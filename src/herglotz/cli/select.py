@@ -12,9 +12,9 @@ from herglotz.cli.settings import LEVELS, add_machine_flags, settings_of
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
-and keep the simplest level that is not beaten beyond its spread. RUN receives the chosen run (as from `herglotz fit`),
-selection.json and selection.png. The last line is the verdict on the chosen run; the exit code is 3 where it does not
-fit.
+and keep the level of fewest parameters that is not beaten beyond its spread. RUN receives the chosen run (as from
+`herglotz fit`), selection.json and selection.png. The last line is the verdict on the chosen run; the exit code is 3
+where it does not fit.
 
 examples:
   herglotz select pendulum.csv --out runs/selected

@@ -102,6 +102,7 @@ def _by_name(found: list[Quantity]) -> dict[str, list[list[float]]]:
 
 def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figure: Path) -> None:
     from herglotz.data.units import size
+    from herglotz.training.uncertainty import determined
 
     data, equation = result.data, result.metrics.get("equation")
     noises = zip(numbers["noise"].items(), data.units, strict=True)
@@ -112,8 +113,7 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     worse = f"{numbers['held_out_over_noise']:.2f}"
     noise = ", ".join(dict.fromkeys(size(x, unit, name in data.degrees) for (name, x), unit in noises))
     rows.append(("noise of a sample", f"{noise}; held-out blocks miss {worse} times as much"))
-    worth = f"{numbers['effective_parameters']:.1f} of {numbers['all_parameters']}"
-    rows.append(("parameters the data fix", f"{worth}; the others stay where the prior holds them"))
+    rows.append(("parameters the data fix", determined(numbers["effective_parameters"], numbers["all_parameters"])))
     print_table(rows)
     if equation:  # the coefficients of named terms stand there with their deviations
         print("Learned equation, standard deviations in brackets, of the last digits:")

@@ -31,6 +31,11 @@ class Labels:
     time_unit: str
 
 
+def unnamed(n: int) -> tuple[str, ...]:
+    """Names of n coordinates that have none: q, or q1, q2, … as a model's features number them."""
+    return ("q",) if n == 1 else tuple(f"q{i + 1}" for i in range(n))
+
+
 def check(
     where: str,  # begins every message
     arrays: Mapping[str, Tensor],  # t (N,), q (N, n) and those of s, p, u that are known

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of
+from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of, unnamed
 from herglotz.data.column_table import column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import liveliest_rows, time_split
@@ -92,15 +92,14 @@ class Trajectories:
         """Build a set from tensors, arrays or lists, filling in what is left out.
 
         Arrays and lists become float64; tensors keep their dtype. `q`, `p` and `u` of shape (N,) become (N, 1).
-        Left out: one trajectory, names q (or q0, q1, ...), unit "rad" for an angle and "1" otherwise, no angles.
+        Left out: one trajectory, names q (or q1, q2, ...), unit "rad" for an angle and "1" otherwise, no angles.
         """
         t, q = _tensor("t", t), _column(_tensor("q", q))
         counts = lengths.tolist() if isinstance(lengths, (Tensor, np.ndarray)) else lengths
         n = q.shape[-1]
         angles = (False,) * n if angles is None else tuple(bool(a) for a in angles)
-        default_names = ("q",) if n == 1 else tuple(f"q{i}" for i in range(n))
         return cls(
-            t, q, (len(t),) if counts is None else tuple(counts), default_names if names is None else tuple(names),
+            t, q, (len(t),) if counts is None else tuple(counts), unnamed(n) if names is None else tuple(names),
             tuple("rad" if a else "1" for a in angles) if units is None else tuple(units), angles,
             None if s is None else _tensor("s", s), None if p is None else _column(_tensor("p", p)),
             None if u is None else _column(_tensor("u", u)), time_unit, source, hold, delay, lag, columns,

@@ -41,11 +41,9 @@ TOP = """\
 {arrival}   #include "{file}"  // cc -O3 -march=native -std=c99 -ffp-contract=fast example.c -lm
 
    int main(void) {{
-     hz_real q0[hz_N] = {{0}}, q1[hz_N] = {{0}}, left;
-     hz_state x;
-     int k, status;
-     q1[0] = (hz_real)0.01;  // two measured positions, h apart
-     status = hz_init(q0, q1, 0, hz_h, {no_u}&x);
+     hz_state x = hz_start;  // or your own: hz_init makes a state from two measured positions
+     hz_real left;
+     int k, status = 0;
      for (k = 0; k < 100 && !(status & 15); k++) {{
        status = hz_step(&x, hz_h, {no_u}&left);
        printf("%d %g %g\\n", k, (double)x.q[0], (double)left);
@@ -96,7 +94,7 @@ static const hz_real hz_floor = {floor}; /* rounding that no iteration removes *
 static const hz_real hz_top_speed = {top_speed}; /* the networks' rounding is relative to h times this, even at rest */
 static const hz_real hz_near = {near}; /* moves below this, relative, keep the last J */
 enum {{ hz_max_iterations = {max_iterations} }};
-{box}"""
+{box}{start}"""
 # `step.h` and `run.h` are texts of `REAL` and `FN_`, as the emitted functions are.
 RUNTIME = ("types.h", "numbers.h", "functions.h", "products.h", "checks.h", "step.h", "run.h", "api.h")
 
@@ -161,6 +159,7 @@ def export_c(
     extra = dict(metadata or {})
     extra["h_range"] = extra.get("h_range") if h_range is None else [float(x) for x in h_range]
     entries = described(model, describe(model, h, box, units, MAX_ITERATIONS, extra), name, dtype, tolerance)
+    check_metadata(entries, path)
     content = sealed_text(c_source(model, entries, path.name)).encode()
     write_atomically(path, content)
     remember(content)
@@ -248,7 +247,7 @@ def _arrival(entries: Mapping[str, Any]) -> str:
     delay, lag = Arrival(**entries.get("arrival", {})).late
     if not delay and not lag:
         return ""
-    unit = entries.get("time_unit", "s")
+    unit = entries.get("time_unit", "s").replace("*", "")  # "*/" would end the comment
     late = f"u(t - {delay:.6g} {unit})" if delay else "u(t)"
     formula = f"T u_f' = {late} - u_f with T = {lag:.6g} {unit}" if lag else f"u_f(t) = {late}"
     return f"   Inputs u act late: give each step the mean over it of u_f,\n   {formula}.\n\n"
@@ -299,6 +298,7 @@ def _constants(model: ContactLagrangian, entries: Mapping[str, Any]) -> str:
         near=number(0.01, dtype),
         max_iterations=MAX_ITERATIONS,
         box=_box_constants(entries["box"], dtype),
+        start=_start_constant(entries, dtype),
     )
 
 
@@ -321,3 +321,12 @@ def _box_constants(box: Mapping[str, list[float]] | None, dtype: str) -> str:
     lines = [f"static const hz_real hz_{k}[hz_N] = {{{numbers(v, dtype)}}};" for k, v in box.items() if k[0] != "s"]
     lines += [f"static const hz_real hz_{k} = {number(box[k][0], dtype)};" for k in ("s_low", "s_high")]
     return "/* The box the model was fitted in. */\n" + "\n".join(lines) + "\n"
+
+
+def _start_constant(entries: Mapping[str, Any], dtype: str) -> str:
+    """A state to start from: that of the metadata, or rest at zero."""
+    start, n = entries.get("start"), entries["dof"]
+    q, p, s = (start[key] for key in "qps") if start else ([0.0] * n, [0.0] * n, 0.0)
+    where = "where the fitted samples end" if start else "at rest, as no recording was given"
+    values = f"{{{numbers(q, dtype)}}}, {{{numbers(p, dtype)}}}, {number(s, dtype)}, 1"
+    return f"/* A state to start from: {where}. */\nstatic const hz_state hz_start = {{{values}}};\n"

@@ -56,6 +56,9 @@ class ExportedStepper(OneStepMethod):
         angles = metadata.get("angles", [False] * self.dof)
         self._box = None if box is None else Box(box, angles, self.dtype, by_s=s_matters(metadata))
 
+    def __repr__(self) -> str:
+        return f"ExportedStepper({self.path}: {self.kind}, dof {self.dof}, {self.metadata['dtype']}, h {self.h:g})"
+
     @property
     def differentiable(self) -> bool:
         """Whether autograd goes through `step`."""

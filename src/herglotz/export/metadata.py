@@ -177,11 +177,11 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
         "names": len(entries.get("names") or range(n)) == n,
         "input_zero": len(entries.get("input_zero") or range(entries["inputs"])) == entries["inputs"],
         "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
-        "start": start is None or set(start) >= {"q", "p", "s"},
+        "start": start is None or (set(start) >= {"q", "p", "s"} and len(start["q"]) == len(start["p"]) == n),
     }
     wrong = [name for name, fine in good.items() if not fine]
     if wrong:
-        raise InputError(f"{where}: {wrong[0]} cannot be {entries.get(wrong[0])} with {n} coordinate(s); {REMEDY}")
+        raise InputError(f"{where}: {wrong[0]} cannot be {entries.get(wrong[0])} with dof {n}; {REMEDY}")
     if entries["box"] is not None:
         _box(entries["box"], n)
 

@@ -12,6 +12,7 @@ from herglotz.plots.style import DPI, styled
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 
 COLOURS = {"fits to the noise": "#1b7f4d", "fits, worse": "#b26a00", "does not fit": "#b3261e"}
+SHORT = 12  # characters of a cell that stays on one line; longer ones break where a phone needs it
 
 
 def as_html(document: Document) -> str:
@@ -54,12 +55,17 @@ def _block(block: Block) -> str:
         return f"<pre><code>{escape(block.text)}</code></pre>"
     if isinstance(block, Table):
         head = "".join(f"<th>{escape(cell)}</th>" for cell in block.head)
-        rows = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in block.rows)
+        rows = "".join("<tr>" + "".join(map(_cell, row)) + "</tr>" for row in block.rows)
         return f'<div class="wide"><table><thead><tr>{head}</tr></thead><tbody>{rows}</tbody></table></div>'
     if isinstance(block, Picture):
         caption = escape(block.caption)
         return f'<figure><img alt="{caption}" src="{_data(block)}"><figcaption>{caption}</figcaption></figure>'
     return _slider(block)
+
+
+def _cell(text: str) -> str:
+    """A cell of a table; a number and its sign stay on one line where the page is narrow."""
+    return f"""<td{' class="short"' if len(text) <= SHORT else ""}>{escape(text)}</td>"""
 
 
 def _data(picture: Picture) -> str:

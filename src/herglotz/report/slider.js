@@ -3,12 +3,15 @@ for (const figure of document.querySelectorAll(".slider")) {
   const v = JSON.parse(figure.querySelector("script").textContent);
   const canvas = figure.querySelector("canvas"), g = canvas.getContext("2d");
   const input = figure.querySelector("input"), output = figure.querySelector("output");
+  const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth || 900, height = Math.max(200, 0.36 * width);
+  canvas.width = ratio * width; canvas.height = ratio * height; g.scale(ratio, ratio);  // text keeps its size on a phone
+  canvas.style.height = `${height}px`;
   const n = v.t.length, left = 55, right = 10, top = 12, bottom = 32;
   input.max = n - 1;
   const known = v.data.concat(v.model.filter((x) => x !== null));
   const low = Math.min(...known), high = Math.max(...known), span = high - low || 1;
-  const x = (t) => left + ((t - v.t[0]) / (v.t[n - 1] - v.t[0] || 1)) * (canvas.width - left - right);
-  const y = (q) => top + ((high + 0.05 * span - q) / (1.1 * span)) * (canvas.height - top - bottom);
+  const x = (t) => left + ((t - v.t[0]) / (v.t[n - 1] - v.t[0] || 1)) * (width - left - right);
+  const y = (q) => top + ((high + 0.05 * span - q) / (1.1 * span)) * (height - top - bottom);
   const line = (from, to, colour) => {
     g.strokeStyle = colour; g.lineWidth = 2; g.beginPath();
     for (let k = from, pen = false; k <= to; k++) {
@@ -20,17 +23,17 @@ for (const figure of document.querySelectorAll(".slider")) {
   };
   const draw = () => {
     const k = Number(input.value);
-    g.clearRect(0, 0, canvas.width, canvas.height);
-    g.fillStyle = "#fbede3"; g.fillRect(x(v.t[v.trained]), top, x(v.t[n - 1]) - x(v.t[v.trained]), canvas.height - top - bottom);
+    g.clearRect(0, 0, width, height);
+    g.fillStyle = "#fbede3"; g.fillRect(x(v.t[v.trained]), top, x(v.t[n - 1]) - x(v.t[v.trained]), height - top - bottom);
     g.fillStyle = "#b5b5b5";
     for (let j = 0; j < n; j++) { g.beginPath(); g.arc(x(v.t[j]), y(v.data[j]), 3, 0, 7); g.fill(); }
     line(0, Math.min(v.trained, k), "#0072b2");
     if (k > v.trained) line(v.trained, k, "#d55e00");
-    g.strokeStyle = "#222"; g.lineWidth = 1; g.beginPath(); g.moveTo(x(v.t[k]), top); g.lineTo(x(v.t[k]), canvas.height - bottom); g.stroke();
+    g.strokeStyle = "#222"; g.lineWidth = 1; g.beginPath(); g.moveTo(x(v.t[k]), top); g.lineTo(x(v.t[k]), height - bottom); g.stroke();
     g.fillStyle = "#222"; g.font = "13px system-ui, sans-serif";
     g.fillText(high.toPrecision(3), 4, y(high) + 4); g.fillText(low.toPrecision(3), 4, y(low) + 4);
-    g.fillText(`${v.t[0].toPrecision(4)}`, left, canvas.height - 10);
-    g.textAlign = "right"; g.fillText(`${v.t[n - 1].toPrecision(4)} ${v.time_unit}`, canvas.width - right, canvas.height - 10); g.textAlign = "left";
+    g.fillText(`${v.t[0].toPrecision(4)}`, left, height - 10);
+    g.textAlign = "right"; g.fillText(`${v.t[n - 1].toPrecision(4)} ${v.time_unit}`, width - right, height - 10); g.textAlign = "left";
     const m = v.model[k];
     output.textContent = `t = ${v.t[k].toPrecision(5)} ${v.time_unit}: ${v.name} recorded ${v.data[k].toPrecision(4)}, model ` +
       (m === null ? "failed" : `${m.toPrecision(4)}, difference ${(v.data[k] - m).toExponential(1)}`) + ` ${v.unit}`;

@@ -22,6 +22,7 @@ from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.quantities import held_out_rms, quantities
 from herglotz.training.summary import rows as summary_rows
+from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
 
 MEANING = {
@@ -190,8 +191,8 @@ def _against(run: Run, data: Trajectories) -> tuple[Block, ...]:
 def _open(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
     if isinstance(posterior, str):
         return (posterior,)
-    worth = f"{posterior.effective_parameters():.1f} of {len(posterior.theta)}"
-    blocks: list[Block] = [f"The data determine {worth} parameters; the others stay where the prior holds them."]
+    worth = determined(posterior.effective_parameters(), len(posterior.theta))
+    blocks: list[Block] = [f"Parameters that the data determine: {worth}."]
     trades = [str(trade) for trade in traded(posterior)]
     if trades:
         blocks.append("What these data cannot tell apart (record other motions, or give one of them):")

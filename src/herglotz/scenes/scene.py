@@ -16,7 +16,7 @@ Step = Tensor | float
 Range = tuple[float, float] | tuple[tuple[float, ...], tuple[float, ...]]  # (low, high), a number or one a coordinate
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Scene:
     """One contact system with its continuous and discrete descriptions.
 
@@ -73,6 +73,10 @@ class Scene:
     H_minus: Callable[[Tensor, Tensor, Tensor, Step], Tensor] | None = None
     numerical: DiscreteLagrangian | None = None
     examples: tuple[Mapping[str, float], ...] = ()
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name}: {', '.join(self.coordinates)})"
+
     at: Callable[[Tensor], Scene] | None = None
     drive: Callable[[Tensor], Tensor] | None = None
     external: Callable[[Tensor, Tensor], Tensor] | None = None

@@ -70,7 +70,7 @@ class Step:
         return cls(new, c, status, residual, iterations)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Crossings:
     """Where one event happened, over all samples of a rollout, in the order of the steps."""
 
@@ -79,8 +79,11 @@ class Crossings:
     t: Tensor  # (M,) time since the start
     state: State  # (M, n), (M, n), (M,)
 
+    def __repr__(self) -> str:
+        return f"Crossings({len(self.step)})"
 
-@dataclass(frozen=True)
+
+@dataclass(frozen=True, repr=False)
 class Rollout:
     """A trajectory of K steps; entry 0 is the start. Everything after a failed step is NaN, with its status.
 
@@ -95,6 +98,11 @@ class Rollout:
     residual: Tensor  # (..., K)
     events: tuple[Crossings, ...] = ()  # one for each event asked for
     outside: Tensor | None = None  # (..., K) of an exported file: 1 where a step leaves the box it was fitted in
+
+    def __repr__(self) -> str:
+        batch, failed = tuple(self.s.shape[:-1]), int((~self.ok).sum())
+        of = f" of a batch {batch}, {failed} failed" if batch else ", failed" if failed else ""
+        return f"Rollout({self.status.shape[-1]} steps, q {tuple(self.q.shape)}{of})"
 
     @property
     def final(self) -> State:

@@ -60,6 +60,10 @@ class Stepper(OneStepMethod):
         self.throw = throw
         self.explicit = explicit
 
+    def __repr__(self) -> str:
+        of = getattr(self.L_d, "__name__", type(self.L_d).__name__)
+        return f"Stepper({of}, {'' if self.tol is None else f'tol {self.tol:g}, '}{self.max_iterations} iterations)"
+
     def init(
         self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
     ) -> State:

@@ -49,7 +49,7 @@ FLAT = 1e-12  # of its terms: a boundary term whose defect is smaller is trivial
 NEAR = 0.05  # of its largest entry: entries so near to ½, 1, … are tried there
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Symmetries:
     """r generators in the order translations, rotations and others; `print` says each in words, with its J.
 
@@ -100,6 +100,9 @@ class Symmetries:
         numbers = {name: getattr(self, name).tolist() for name in ("A", "b", "a", "k", "w", "B", "drift", "spectrum")}
         more = {"names": self.names, "precision": self.precision, "unseen": self.unseen, "gap": self.gap}
         return {**numbers, **more, "coordinates": self.coordinates}
+
+    def __repr__(self) -> str:
+        return f"Symmetries({', '.join(self.names) or 'none'})"
 
     def __str__(self) -> str:
         lines = [f"affine point symmetries: {len(self) or 'none'}"]

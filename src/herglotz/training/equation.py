@@ -64,7 +64,7 @@ class Term:
         return f"{sign} {number(abs(self.value), self.deviation)} {self.what}".rstrip()
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Equation:
     """The learned equation; `str` gives lines of at most 80 columns, without terms that the data do not tell from 0.
 
@@ -87,6 +87,9 @@ class Equation:
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
         return "\n".join([*lines, *textwrap.wrap(f"with {self.units}", WIDTH)])
+
+    def __repr__(self) -> str:
+        return f"Equation({' '.join(str(self).split())})"
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""

@@ -200,7 +200,7 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
         raise InputError(f"{path}: train_lengths {trained} do not fit the data's lengths {run.data.lengths}; {REMEDY}")
     sizes = {f"{name}_{end}": 1 if name == "s" else n for name in "qps" for end in ("low", "high")}
     if {name: len(x) for name, x in run.box.items()} != sizes or not run.h > 0:
-        raise InputError(f"{path}: box and h are not those of a model with {n} coordinate(s); {REMEDY}")
+        raise InputError(f"{path}: box and h are not those of a model with dof {n}; {REMEDY}")
 
 
 def _log(history: list[dict[str, Any]]) -> bytes:

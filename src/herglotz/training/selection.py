@@ -1,4 +1,4 @@
-"""`select`: fit the ladder, compare held-out errors, keep the simplest level that is not beaten."""
+"""`select`: fit the ladder, compare held-out errors, keep the level of fewest parameters that is not beaten."""
 
 from __future__ import annotations
 
@@ -125,17 +125,18 @@ def select(
 ) -> Selection:
     """Fit every level from every seed on the first part of each trajectory; score free runs over the rest.
 
-    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. The
-    first level of the ladder is chosen that the best one does not beat: by the rule of the prior's strengths
-    (`cross_validation.beaten`) between the median seeds, and beyond the best level's own range over seeds.
+    The held-out time is cut into blocks (at least five in all); the score of a fit is the RMS over its blocks. Of the
+    levels that the best one does not beat, that of the fewest trained parameters is chosen, and of equals the first of
+    the ladder. To beat is to win by the rule of the prior's strengths (`cross_validation.beaten`) between the median
+    seeds, and beyond the best level's own range over seeds.
 
     Parameters
     ----------
     data
         Trajectories of positions, or anything else that `fit` takes.
     levels
-        Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried and preferred in this
-        order. None: those of `levels_for`.
+        Which levels, of `herglotz.models.LEVELS` and "auto", which is `fit` left to itself; tried in this order.
+        None: those of `levels_for`.
     seeds
         Fits a level, with seeds config.seed, config.seed + 1, …
     config
@@ -231,12 +232,12 @@ def _simplest(candidates: list[Candidate]) -> Candidate:
     best = min(candidates, key=lambda c: c.error)
     if not best.error < float("inf"):
         raise InputError("no level predicts the held-out part: every free run failed; check the data and their step")
-    for candidate in candidates:
-        if candidate is best or candidate.error <= float(best.of_seeds.max()):
-            return candidate
-        if not beaten(candidate.errors[candidate.median_seed], best.errors[best.median_seed]):
-            return candidate
-    return best
+
+    def as_good(c: Candidate) -> bool:
+        within = c is best or c.error <= float(best.of_seeds.max())
+        return within or not beaten(c.errors[c.median_seed], best.errors[best.median_seed])
+
+    return min(filter(as_good, candidates), key=lambda c: c.parameters)  # the first of equals
 
 
 def _step_cost(run: Run) -> float:

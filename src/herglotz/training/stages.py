@@ -93,7 +93,7 @@ class Stages:
         self.lines = progress in ("lines", "iterations") and is_first()
         self.verbose = progress == "iterations" and is_first()
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
-        self.bar = tqdm(total=0, desc="fit", disable=disable, leave=False, dynamic_ncols=True)
+        self.bar = tqdm(total=1, desc="looking at the data", disable=disable, leave=False, dynamic_ncols=True)
         self.checkpoint, self.key = checkpoint, key
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
@@ -109,6 +109,7 @@ class Stages:
     def keep(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
         if name not in self.kept:
+            self.bar.set_description(name)
             self.kept[name] = make()
             self._write()
         return self.kept[name]

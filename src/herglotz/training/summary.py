@@ -11,6 +11,7 @@ from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
 
 MOST_FEATURES, COLUMNS = 5, 80
+MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
 
 
 class Judged(Protocol):
@@ -36,7 +37,7 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     found = [
         ("data", data.summary()),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
-        ("named terms", features_in_words(run.config.features)),
+        ("named terms", run.config.features and _terms(run.config.features, data.names)),
         (
             "extrapolation RMS",
             _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
@@ -83,6 +84,12 @@ def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
     """What the model is made of beside its terms, told or found; "" without."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
+
+
+def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
+    """The named terms, and which coordinate q1 is where it has a name of its own."""
+    told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
+    return features_in_words(features) + (f"  ({', '.join(told)})" if told else "")
 
 
 def model_card(run: Judged, h_range: tuple[float, float]) -> str:

@@ -97,7 +97,7 @@ def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> Non
         return
     every = math.ceil(data.samples / allowed)
     raise InputError(
-        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinate(s), for the states of all "
+        f"{data.samples} samples to fit, at most {allowed} can be with {data.dof} coordinates, for the states of all "
         f"segments are solved for together; thin them (--every {every}, Trajectories.thinned) or take fewer"
     )
 

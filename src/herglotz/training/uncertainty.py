@@ -136,7 +136,7 @@ class Laplace:
         """
         data, where = data.unwrapped(), data.source or "data"
         if data.angles != self.run.data.angles:
-            raise InputError(f"{where}: {data.dof} coordinate(s) with angles {data.angles}; the run's are other ones")
+            raise InputError(f"{where}: angles {data.angles}, but the run's are {self.run.data.angles}")
         if not 3 <= seen < min(data.lengths):
             raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
         head = _first(data, (seen,) * len(data))
@@ -274,3 +274,9 @@ def _starts(run: Run) -> Tensor:
     first = list(run.data.offsets)
     q, p, s = (x[first] for x in run.states)
     return torch.cat([q, p, s[:, None]], -1)
+
+
+def determined(effective: float, every: int) -> str:
+    """How many parameters the data determine, in words."""
+    free = "" if effective > every - 0.05 else "; the others stay where the prior holds them"  # as one digit shows it
+    return f"{effective:.1f} of {every}{free}"

@@ -67,7 +67,7 @@ def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothin
     file = SimpleNamespace(metadata={"box": None}, dof=2, h=0.1, inputs=0, dtype=torch.float64)
     monkeypatch.setattr("herglotz.export.load_exported", lambda *_, **__: file)
     found = rollout.read_source(Path("a.onnx"), 0)
-    assert (found.names, found.units, found.angles, found.time_unit) == (("q0", "q1"), ("1", "1"), (False, False), "s")
+    assert (found.names, found.units, found.angles, found.time_unit) == (("q1", "q2"), ("1", "1"), (False, False), "s")
     file.metadata = {"box": None, "angles": [True, False]}
     assert rollout.read_source(Path("a.onnx"), 0).units == ("rad", "1")
 

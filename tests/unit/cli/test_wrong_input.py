@@ -57,7 +57,7 @@ def test_bad_data(tmp_path, capsys, name, command):  # fails if a bad file reach
         ("--frequency", "-1", "must be > 0"),
         ("--device", "tpu9", "unknown device"),
         ("--angles", "phi", "phi"),
-        ("--nonsense", "1", "unrecognized"),
+        ("--nonsense", "1", "unrecognized arguments: --nonsense 1; see 'herglotz fit --help'"),
     ],
 )
 def test_bad_options_of_fit(tmp_path, capsys, option, value, message):  # fails if an option is checked after the work

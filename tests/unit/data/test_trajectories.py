@@ -103,7 +103,7 @@ def test_defaults():  # fails if lists become float32 or an angle keeps the unit
     assert one.t.dtype == one.q.dtype == torch.float64
     assert one.q.shape == (3, 1)
     two = Trajectories.of(SIX[:3] + torch.arange(3), torch.zeros(3, 2, dtype=torch.float64), angles=(False, True))
-    assert (two.names, two.units) == (("q0", "q1"), ("1", "rad"))
+    assert (two.names, two.units) == (("q1", "q2"), ("1", "rad"))
     assert Trajectories.of([0, 1, 2], [0, 1, 2], np.array([3])).lengths == (3,)  # fails if numpy integers are refused
 
 

@@ -187,9 +187,11 @@ def test_no_compiler_warnings(tmp_path, dtype):
 
 
 @needs_compiler
-def test_the_example_in_the_comment_runs(tmp_path):
-    # fails if the example at the top of the header no longer compiles
-    path = export_c(damped(1, "linear"), tmp_path / "stepper.h", h=0.1, name="arm")
+@pytest.mark.parametrize("start", [{"q": [0.4], "p": [-0.3], "s": 0.1, "t": 6.65}, None], ids=["recorded", "none"])
+def test_the_example_in_the_comment_runs(tmp_path, start):
+    # fails if the example at the top of the header does not compile, or does not start from the recording's state
+    model = damped(1, "linear")
+    path = export_c(model, tmp_path / "stepper.h", h=0.1, name="arm", metadata={"start": start, "time_unit": "*/ s"})
     comment = path.read_text().split("*/")[0]
     code = comment[comment.index("#include <stdio.h>") : comment.index("herglotz-metadata")]
     (tmp_path / "example.c").write_text(code)
@@ -198,7 +200,17 @@ def test_the_example_in_the_comment_runs(tmp_path):
     assert built.returncode == 0, built.stderr
     assert not built.stderr
     done = subprocess.run([tmp_path / "example"], capture_output=True, text=True, check=True)
-    assert len(done.stdout.splitlines()) == 100
+    q, p, s = (start[key] for key in "qps") if start else ([0.0], [0.0], 0.0)
+    state = State(*(torch.tensor([x], dtype=torch.float64) for x in (q, p, s)))
+    expected = Stepper(model).rollout(*state, h=0.1, steps=100).q[0, 1:, 0]
+    printed = torch.tensor([float(line.split()[1]) for line in done.stdout.splitlines()], dtype=torch.float64)
+    assert torch.allclose(printed, expected, rtol=1e-5, atol=1e-9)  # %g prints six digits
+
+
+def test_a_start_of_another_size_is_refused(tmp_path):  # fails if the header holds a state of too few numbers
+    start = {"q": [0.4], "p": [0.1], "s": 0.0}
+    with pytest.raises(InputError, match=r"start cannot be .* with dof 2; export"):
+        export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1, metadata={"start": start})
 
 
 STATUSES = """

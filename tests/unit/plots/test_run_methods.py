@@ -11,6 +11,7 @@ import herglotz as hz
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.export.run_file import WRITERS
+from herglotz.theory.symmetries import symmetries
 from herglotz.training.motion import Motion
 
 
@@ -53,6 +54,22 @@ def test_words_are_short():  # fails if a run, data or a prediction fill the scr
     assert max(map(len, run.summary().splitlines())) <= 80
     data = Trajectories.of(run.data.t, run.data.q, names=("theta",), angles=(True,))
     assert len(repr(run.predict(data))) < 100
+    named = replace(run, config=replace(run.config, features=("cos(q1)",)))
+    assert "cos(q1)  (q1 is theta)" in named.summary()  # fails if nobody is told which column q1 of a term is
+
+
+def test_results_are_short():  # fails if what a step, a scene or a symmetry search returns fills the screen
+    run = fake_run()
+    state, _ = run.last_fitted()
+    many = run.stepper.rollout(*(x[None] for x in state), h=0.1, steps=300)
+    found = symmetries(run.model, (state.q[None], state.p[None], state.s[None]), h=0.1)
+    assert repr(run.stepper.rollout(*state, h=0.1, steps=300)) == "Rollout(300 steps, q (301, 1))"
+    assert repr(many) == "Rollout(300 steps, q (1, 301, 1) of a batch (1,), 0 failed)"
+    assert repr(replace(many, status=many.status + 1)).endswith("1 failed)")
+    assert repr(run.stepper) == "Stepper(ContactLagrangian, 30 iterations)"
+    assert repr(hz.scene("kepler")) == "Scene(kepler: x, y)"
+    assert repr(found).startswith("Symmetries(")
+    assert max(len(repr(x)) for x in (run.equation(), found)) < 200
 
 
 def test_pictures_files_and_checks(tmp_path, monkeypatch):  # fails if a method of a run does not reach its room

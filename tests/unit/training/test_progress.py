@@ -40,6 +40,8 @@ def test_one_bar_goes_through_all_stages():  # fails if a stage's unused bound s
         for name, total in (("a", 100), ("b", 9)):
             stages.run(name, torch.zeros(1), total, optimise)
         assert (bar.n, bar.total) == (4, 2 + 9)
+        stages.keep("terms", lambda: {"desc": bar.desc})  # fails if a search has no name while it lasts
+        assert stages.kept["terms"] == {"desc": "terms: "}
 
 
 def test_the_log_has_every_iteration():  # fails if a stage's name is lost or cut

@@ -18,9 +18,9 @@ from herglotz.training.run import Run
 from herglotz.training.selection import Candidate, Selection, _simplest, block_errors, levels_for
 
 
-def candidate(level, *seeds):
+def candidate(level, *seeds, parameters=7):
     """Held-out errors a seed and block, and nothing else of a run."""
-    run = SimpleNamespace(metrics={"parameters": 7, "seconds": 1.0}, data=SimpleNamespace(units=("rad",)))
+    run = SimpleNamespace(metrics={"parameters": parameters, "seconds": 1.0}, data=SimpleNamespace(units=("rad",)))
     return Candidate(level, cast(Any, (run,) * len(seeds)), torch.tensor(seeds, dtype=torch.float64), 10.0)
 
 
@@ -35,6 +35,9 @@ def candidate(level, *seeds):
         ([candidate("linear", [2.0] * 3), candidate("affine", [1.0] * 3, [2.1] * 3, [1.1] * 3)], "linear"),
         # fails if a tiny advantage in every block counts as being beaten
         ([candidate("linear", [1.002, 1.202, 0.902]), candidate("forced", [1.0, 1.2, 0.9])], "linear"),
+        # fails if 35 weights are preferred to 2 named terms of the same error, or the terms where they are beaten
+        ([candidate("linear", [1.0] * 3, parameters=35), candidate("auto", [1.0] * 3, parameters=2)], "auto"),
+        ([candidate("linear", [1.0] * 3, parameters=35), candidate("auto", [9.0] * 3, parameters=2)], "linear"),
         # fails if a level whose free run failed can be chosen, or spoils the comparison
         ([candidate("linear", [math.inf] * 3), candidate("affine", [1.0] * 3)], "affine"),
         ([candidate("linear", [1.0] * 3), candidate("affine", [math.inf] * 3)], "linear"),
