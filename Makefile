@@ -7,7 +7,7 @@ ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg
 # Each worker takes tests that stand side by side, so that few fixtures of a module are made twice.
 SPREAD := -n $(WORKERS) --dist worksteal
 
-.PHONY: demo docs tutorials lint check test test-anywhere test-pythons test-slow mutants fuzz supply census clean
+.PHONY: demo docs tutorials lint check test test-anywhere test-pythons test-slow mutants fuzz faults supply census clean
 
 # $(1): what is installed beside the package's own requirements
 define install
@@ -74,6 +74,11 @@ mutants: .venv/installed
 # Damage every kind of file: ten minutes; counts of tried, refused, executed, silently wrong. A slice is in the tests.
 fuzz: .venv/installed
 	$(ENV) PYTHONPATH=. $(PY) tests/fuzz.py
+
+# Strike a fit 900 times: killed, ended, without disk, memory or permission, its workers killed or stopped; counts of what
+# was made good. Half an hour of processor time; a slice is in the slow tests.
+faults: .venv/installed
+	$(ENV) PYTHONPATH=. $(PY) tests/faults.py
 
 # What is installed with it: licences, build/sbom.json, the hashes of lock.txt, and the README's example with the wheel
 # and its requirements alone. Half a minute of processor time; pip fetches what it has not in its cache.

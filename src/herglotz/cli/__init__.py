@@ -55,6 +55,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, OSError) as error:
         return _say(f"error: {error}", WRONG_INPUT)
     except Exception as error:
+        if _no_memory(error):
+            return _say("error: out of memory; use fewer samples or a machine with more", WRONG_INPUT)
         return _say(_internal(error, argv), INTERNAL)
 
 
@@ -78,6 +80,12 @@ def _one_thread() -> Iterator[None]:
     finally:
         if not chosen:  # `one_thread` would take it for the user's choice
             os.environ.pop("OMP_NUM_THREADS", None)
+
+
+def _no_memory(error: Exception) -> bool:
+    """Whether Python or torch, which has a word of its own for each device, was refused memory."""
+    words = ("can't allocate memory", "out of memory", "std::bad_alloc")
+    return isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and any(x in str(error) for x in words))
 
 
 def _internal(error: Exception, argv: Sequence[str] | None) -> str:
