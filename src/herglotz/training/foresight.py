@@ -27,13 +27,12 @@ from herglotz.training.look import Look
 from herglotz.training.named_terms import DRY, NamedTerms, candidates, places, settings_of, started, values_of
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
 from herglotz.training.problems.prior import NETWORKS, prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.structure import MOST
 from herglotz.training.task import Task, build_model, with_sticking
-from herglotz.training.trajectory_fit import FIRST_SEGMENT
 from herglotz.training.uncertainty import inverse_of
 
 UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless; as `LOST` of the verdict

@@ -15,7 +15,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
-from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, segment_lengths
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FAR, FEW, FREEDOM, far_out, heavy_tailed, scale_of
@@ -24,7 +24,6 @@ from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, leven
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.task import Task
 
-FIRST_SEGMENT = 20  # recorded steps; later stages double it
 MOST = 10_000  # states of segments, in numbers: they are solved for together, in one dense matrix (800 MB)
 LOST = 2.0  # segments stop growing where they miss the data by so many times what shorter ones do
 FOLLOWED = 0.05  # of the spread of q: segments that miss less follow the motion, and grow on to simulation error
@@ -68,20 +67,6 @@ class TrajectoryFit:
         problem = self.problem
         _, A, _ = problem.normal_equations(self.result.x)
         return held_out_errors(problem, self.path, self.theta, A)
-
-
-def segment_lengths(data: Trajectories) -> list[int]:
-    """Segment lengths of the stages: 20, 40, 80, … recorded steps, and at last each trajectory whole.
-
-    A length of more than two thirds of the longest trajectory cuts none in two.
-    """
-    longest = max(data.lengths) - 1
-    lengths = []
-    length = FIRST_SEGMENT
-    while round(longest / length) > 1:
-        lengths.append(length)
-        length *= 2
-    return [*lengths, longest]
 
 
 def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> None:

@@ -30,11 +30,11 @@ from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
-from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
 from herglotz.training.problems.robust import FREEDOM, scale_of
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
-from herglotz.training.trajectory_fit import FIRST_SEGMENT, SegmentStages
+from herglotz.training.trajectory_fit import SegmentStages
 
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
 AT_THE_NOISE = 1.5  # times the precision: fitted states, and the noise's own estimate, leave 10 to 30 %

@@ -9,7 +9,7 @@ from herglotz.stepping import Stepper
 from herglotz.training import Prior, ShootingProblem
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.problems.grid import segment_grid
-from herglotz.training.trajectory_fit import segment_lengths
+from herglotz.training.problems.grid import segment_lengths
 
 
 def line(lengths):

@@ -11,6 +11,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 
+FIRST_SEGMENT = 20  # recorded steps; later stages double it
+
 
 @dataclass(frozen=True)
 class SegmentGrid:
@@ -48,6 +50,20 @@ class SegmentGrid:
     def start_trajectory(self, data: Trajectories) -> Tensor:
         """Trajectory of every segment, (S,)."""
         return data.trajectory[self.start_sample]
+
+
+def segment_lengths(data: Trajectories) -> list[int]:
+    """Segment lengths of the stages: 20, 40, 80, … recorded steps, and at last each trajectory whole.
+
+    A length of more than two thirds of the longest trajectory cuts none in two.
+    """
+    longest = max(data.lengths) - 1
+    lengths = []
+    length = FIRST_SEGMENT
+    while round(longest / length) > 1:
+        lengths.append(length)
+        length *= 2
+    return [*lengths, longest]
 
 
 def substeps(h: float, max_step: float) -> int:
