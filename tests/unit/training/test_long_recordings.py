@@ -8,8 +8,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Stepper
 from herglotz.training import Prior, ShootingProblem
 from herglotz.training.cross_validation import held_out_errors
-from herglotz.training.problems.grid import segment_grid
-from herglotz.training.problems.grid import segment_lengths
+from herglotz.training.problems.grid import segment_grid, segment_lengths
 
 
 def line(lengths):
