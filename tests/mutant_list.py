@@ -177,8 +177,12 @@ MUTANTS = [
     ("verify/dissipation.py", 'TOLD = 0.05', 'TOLD = -1.0'),
     ("verify/dissipation.py", 'best = min(nulls.values())', 'best = max(nulls.values())'),
     ("verify/dissipation.py", 'rate.mul_(factor)', 'rate.mul_(1.0)'),
+    ("verify/dissipation.py", 'LESS = 5.0', 'LESS = 1e9'),
+    ("verify/dissipation.py", 'LESS = 5.0', 'LESS = 2.0'),
+    ("verify/dissipation.py", 'small * (down - up)', 'small * (up - down)'),
+    ("verify/dissipation.py", '_rates(model)[0].add_(more)', 'pass'),
     ("verify/dissipation.py", 'model = deepcopy(model)', 'pass'),
-    ("verify/dissipation.py", 'if not math.isfinite(own) or not any(', 'if math.isfinite(own) or not any('),
+    ("verify/dissipation.py", 'if not math.isfinite(own) or', 'if math.isfinite(own) or'),
     ("verify/dissipation.py", 'model=_scaled(run.model, factor)', 'model=run.model'),
     # issue of trust: what no test noticed
     ("models/model.py", "return h * max(self.config.speed)", "return h * min(self.config.speed)"),

@@ -18,7 +18,7 @@ from herglotz.stepping import State, solve
 from herglotz.training import Run
 from herglotz.training.inputs import grid_inputs, step_inputs
 from herglotz.training.problems.grid import segment_grid
-from herglotz.verify.dissipation import dissipation
+from herglotz.verify.dissipation import WINDOW, dissipation
 from herglotz.verify.report import Check
 
 # Bound of the one-step error over that of uniform motion, the null model. A fitted model reaches 1e-2 and less on clean
@@ -26,7 +26,6 @@ from herglotz.verify.report import Check
 ONE_STEP = 0.5
 # Bound of free runs over 20 recorded steps, over the spread; noise and a good model stay far below a tenth.
 FOLLOW = 0.1
-WINDOW = 20  # recorded steps: errors of one step have grown, chaos has not
 # Bound of the free run beyond training, over the spread: the mean of the unseen samples would give exactly 1.
 FREE_RUN = 1.0
 DECIDABLE = 2.0  # one step is judged where the null model's squared error exceeds this multiple of the noise's
@@ -43,8 +42,8 @@ def data_checks(run: Run) -> tuple[list[Check], dict[str, float]]:
     Follow: the RMS of free runs over windows of 20 recorded steps from the run's states, over the spread; a step that
     fails counts as infinite. A collapsed model has small residuals and fails here.
 
-    Dissipation: the same windows with γ → −γ, 0, γ/2 and 2γ; a model that follows the data no better fails. Left out
-    where the model has none, or the data do not show it.
+    Dissipation: the same windows with γ → −γ, 0, γ/2 and 2γ; a model that follows the data no better fails. A model of
+    rate 0 fails where a rate divides its error by 5. Left out where it has no rate, or the data do not show it.
 
     Free run: the RMS of prediction − data over the samples beyond the training part, over their spread; left out where
     the fit held nothing out.

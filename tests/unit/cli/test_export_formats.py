@@ -118,7 +118,11 @@ def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys
     other.model.load_state_dict({key: 2 * value for key, value in other.model.state_dict().items()})
     save_run(other, tmp_path / "runs" / "one")
     assert main(few) == 0
-    assert "not compared with its model" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "not compared with its model" in out
+    assert ": its identities hold; its numbers are not verified" in out
+    assert main([*few, "--against", "runs/one"]) == 1
+    assert ": NOT verified" in capsys.readouterr().out  # fails if the rows alone make the headline
     shutil.copytree(tiny_run, tmp_path / "runs" / "two")
     assert main(few) == 0
     assert "beside runs/two, 1000 steps" in capsys.readouterr().out

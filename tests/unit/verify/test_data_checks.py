@@ -70,7 +70,7 @@ def test_a_model_that_follows_badly_fails(stiffness, passes):
     assert checks["follow"].passed is passes
 
 
-@pytest.mark.parametrize("factor", [-1.0, 2.0, -2.0, 0.3])
+@pytest.mark.parametrize("factor", [-1.0, 2.0, -2.0, 0.3, 0.0])
 def test_a_wrong_dissipation_fails(factor):
     # fails if a bound of 0.1 of the spread decides alone: weak damping of either sign stays below it (γ = 0.01: 0.013)
     run = run_of(rate=0.01)
@@ -84,6 +84,13 @@ def test_a_wrong_dissipation_fails(factor):
     checks, _ = named(run)
     assert checks["follow"].passed
     assert not checks["dissipation"].passed
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.01])
+def test_no_dissipation_where_there_is_none_passes(noise):
+    # fails if any rate that follows a little better, by chance or for the rule, refuses a conservative motion
+    run = run_of(rate=0.0, noise=noise)
+    assert named(run)[0]["dissipation"].passed
 
 
 def test_a_dissipation_that_noise_hides_is_not_judged_and_said_so():
