@@ -59,6 +59,14 @@ def test_one_sample_takes_the_same_iterations_in_plain_numbers(n, keep):
     assert float(largest(equation(one.x, False).F)) < 1e-15
 
 
+@pytest.mark.parametrize("batch", [(), (1,), (1, 1)])
+def test_one_sample_under_any_axes(batch):
+    # fails if what is known of a sample without a batch, or with two axes of one, is of another shape
+    x = torch.full((*batch, 2), 0.4, dtype=torch.float64)
+    one = newton_one(lambda x, _: Point(*arctangent(x)), x, Rules(4 * EPS, 60), lambda *_: (1.0, 1e3 * EPS))
+    assert one.merit.shape == one.residual.shape == one.done.shape == batch
+
+
 def test_a_solution_gets_its_derivative():
     # fails if the slope that is attached has the wrong sign, or the value moves
     a = torch.tensor([2.0], dtype=torch.float64, requires_grad=True)

@@ -160,3 +160,14 @@ def test_contact_vector_field_of_the_damped_oscillator():
     torch.testing.assert_close(dq, p)
     torch.testing.assert_close(dp, -(q + 0.2 * p))
     torch.testing.assert_close(ds, (p**2 / 2 - q**2 / 2)[:, 0] - 0.2 * s)
+
+
+@pytest.mark.parametrize("batch", [(), (4,), (2, 3)])
+def test_the_derivative_of_a_flow_under_any_axes(batch):
+    # fails if q, p and s are joined along another axis than the last
+    make = torch.Generator().manual_seed(0)
+    q, p = torch.randn(2, *batch, 2, dtype=torch.float64, generator=make)
+    s = torch.randn(batch, dtype=torch.float64, generator=make)
+    _, D = flow_derivative(lambda q, p, s: (q + 2 * p, 3 * p, s + 5 * q.sum(-1)), q, p, s)
+    known = [[1, 0, 2, 0, 0], [0, 1, 0, 2, 0], [0, 0, 3, 0, 0], [0, 0, 0, 3, 0], [5, 5, 0, 0, 1]]
+    assert torch.equal(D, torch.tensor(known, dtype=torch.float64).expand(*batch, 5, 5))

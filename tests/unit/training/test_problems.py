@@ -171,6 +171,23 @@ def test_lifted_solution_is_the_stepped_one():
         torch.testing.assert_close(path.x[..., 2], out.s, rtol=1e-9, atol=1e-10)
 
 
+def test_the_last_defect_is_not_looked_at(monkeypatch):
+    # fails if a sweep is spent on a defect that quadratic convergence has made rounding
+    problem, x = shooting_problem("affine")
+    theta, states = problem.unpack(x)
+    start = problem.with_s(states)
+    rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
+    exact = solve_path(problem.parameters, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
+    assert exact is not None
+    swept, steps = [], lifted_newton.linear_steps
+    monkeypatch.setattr(lifted_newton, "linear_steps", lambda *x: swept.append(1) or steps(*x))
+    near = exact.x * (1 + 1e-9)
+    path = solve_path(problem.parameters, theta, start, problem.grid.h, near, 1e-12, sweeps=30)
+    assert path is not None
+    assert len(swept) == 1
+    torch.testing.assert_close(path.x, exact.x, rtol=1e-12, atol=1e-12)
+
+
 @pytest.mark.parametrize("level", ["linear", "affine", "dry"])
 def test_linear_sweeps_give_the_path_that_solved_steps_give(level, monkeypatch):
     # fails if a step that is linear about the guess ends where its equation does not hold, or friction lets go
