@@ -28,7 +28,9 @@ from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
+    central,
     chains,
+    offered,
     own_terms,
     places,
     settings_of,
@@ -84,6 +86,8 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
+        lacks = found.coloured and found.rms > self.floor
+        self.all = offered(self.data, self.all, found.terms, lacks=lacks)
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
@@ -102,7 +106,7 @@ class DictionarySearch:
             return None
         start = smoothed(self.data, local)
         families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
-        linear = linear_starts(self.data, self.base, families, local)
+        linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         found = found or self._grown(*self._bare(), 1, start)
         if found is None:
@@ -225,8 +229,8 @@ class DictionarySearch:
     def _missing(self, found: Found) -> str | None:
         """The term whose absence costs most, where that is more than it may; None where none does."""
         names = [name for name in self.all.names if name not in found.terms.names]
-        if not names:
-            return None
+        if not names or found.rms <= self.floor:
+            return None  # rounding may be lowered by any term
         _, problem = self._problem(found, self.all, found.config.substeps)
         theta = problem.parameters.get()
         at = places(problem.parameters, self.all)
