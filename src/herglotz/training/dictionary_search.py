@@ -36,13 +36,12 @@ from herglotz.training.named_terms import (
     settings_of,
     started,
     values_of,
-    with_inverse_free,
 )
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import prune
+from herglotz.training.pruning import joining, prune
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
@@ -244,12 +243,8 @@ class DictionarySearch:
         if DRY in names:  # what shapes a force of 0 has no effect yet
             for shape in ("friction.breakaway", "friction.log"):
                 absent[problem.parameters.index(shape)] = True
-        left, slope = with_inverse_free(A, (~absent).nonzero()[:, 0], others, b)
-        gain = torch.where(left > 1e-9, slope.square() / left.clamp_min(1e-300), 0.0)
-        best = int(gain.argmax())
-        if float(gain[best]) <= math.log(self.data.q.numel()):
-            return None
-        return next(name for name in names if int(others[best]) in at[name])
+        best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(self.data.q.numel()))
+        return None if best is None else next(name for name in names if int(others[best]) in at[name])
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""

@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
@@ -231,12 +230,3 @@ def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int
     if terms.dry:
         at[DRY] = parameters.index(DRY).tolist()
     return at
-
-
-def with_inverse_free(A: Tensor, free: Tensor, others: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Diagonal of the Schur complement and gradient of `others` where the `free` unknowns follow them."""
-    scale = A.diagonal().clamp_min(1e-300).sqrt()
-    S, y = A / scale[:, None] / scale, b / scale
-    C = torch.linalg.pinv(S[free][:, free], hermitian=True) @ S[free][:, others]
-    left = S[others, others] - (S[free][:, others] * C).sum(0)
-    return left, y[others] - C.T @ y[free]
