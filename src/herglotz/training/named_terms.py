@@ -93,7 +93,7 @@ def distances(data: Trajectories) -> tuple[str, ...]:
 
 
 def offered(data: Trajectories, every: NamedTerms, beside: NamedTerms, *, lacks: bool) -> NamedTerms:
-    """The candidates `every` beside the terms of a model, with distances where it has one already or `lacks` a force."""
+    """The candidates `every`, with distances where a model of the terms `beside` has one or `lacks` a force."""
     of_r = distances(data) if every.springs else ()
     return every.joined(NamedTerms(of_r)) if lacks or set(of_r) & set(beside.features) else every
 
