@@ -28,19 +28,20 @@ from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
+    central,
     chains,
+    offered,
     own_terms,
     places,
     settings_of,
     started,
     values_of,
-    with_inverse_free,
 )
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import prune
+from herglotz.training.pruning import joining, prune
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
@@ -84,6 +85,8 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
+        lacks = found.coloured and found.rms > self.floor
+        self.all = offered(self.data, self.all, found.terms, lacks=lacks)
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
@@ -102,7 +105,7 @@ class DictionarySearch:
             return None
         start = smoothed(self.data, local)
         families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
-        linear = linear_starts(self.data, self.base, families, local)
+        linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         found = found or self._grown(*self._bare(), 1, start)
         if found is None:
@@ -225,8 +228,8 @@ class DictionarySearch:
     def _missing(self, found: Found) -> str | None:
         """The term whose absence costs most, where that is more than it may; None where none does."""
         names = [name for name in self.all.names if name not in found.terms.names]
-        if not names:
-            return None
+        if not names or found.rms <= self.floor:
+            return None  # rounding may be lowered by any term
         _, problem = self._problem(found, self.all, found.config.substeps)
         theta = problem.parameters.get()
         at = places(problem.parameters, self.all)
@@ -240,12 +243,8 @@ class DictionarySearch:
         if DRY in names:  # what shapes a force of 0 has no effect yet
             for shape in ("friction.breakaway", "friction.log"):
                 absent[problem.parameters.index(shape)] = True
-        left, slope = with_inverse_free(A, (~absent).nonzero()[:, 0], others, b)
-        gain = torch.where(left > 1e-9, slope.square() / left.clamp_min(1e-300), 0.0)
-        best = int(gain.argmax())
-        if float(gain[best]) <= math.log(self.data.q.numel()):
-            return None
-        return next(name for name in names if int(others[best]) in at[name])
+        best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(self.data.q.numel()))
+        return None if best is None else next(name for name in names if int(others[best]) in at[name])
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""

@@ -145,8 +145,8 @@ def _lefts(run: Run) -> list[str]:
     if not _newtonian(run.model):
         return ["L", *(f"force on {name}" for name in run.data.names)]
     kinetic, names = run.model.kinetic, run.data.names
-    mass = kinetic.mass().detach().diagonal().tolist()  # type: ignore[operator]
-    return [f"{name}″" if i == 0 else f"{mass[i]:.4g} {name}″" for i, name in enumerate(names)]
+    mass = [f"{m:.4g} " for m in kinetic.mass().detach().diagonal().tolist()]  # type: ignore[operator]
+    return [f"{m.removeprefix('1 ')}{name}″" for m, name in zip(mass, names, strict=True)]
 
 
 def _kinetic(run: Run) -> list[Term]:

@@ -20,6 +20,7 @@ from herglotz.errors import InputError
 from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
+from herglotz.training.dictionary_search import ROUNDING
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look
@@ -124,18 +125,22 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         plan = plan or choose(seen, config)
         task = Task(seen.kept, seen.base, seen.settings, stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
-    run.metrics["equation"] = _equation(run, plan).as_dict()
+    run.metrics["equation"] = _equation(run, plan, ROUNDING * task.exact).as_dict()
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 
 
-def _equation(run: Run, plan: Plan) -> Equation:
-    """The learned equation, with standard deviations where named terms were fitted to trajectories."""
+def _equation(run: Run, plan: Plan, least: float) -> Equation:
+    """The learned equation, with standard deviations where named terms were fitted to trajectories.
+
+    They are those of data that are known no better than to `least`, in units of q: what moves them by less is rounding.
+    """
     covariance = None
     if plan.network == "none" and run.metrics["follows_data"]:
         with suppress(InputError):  # whole trajectories cannot be followed: no deviations
             posterior = laplace(run)
-            covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)]
+            rounding = max(1.0, least / (posterior.sigma * posterior.inflation)) ** 2
+            covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)] * rounding
     return equation_of(run, covariance)
 
 

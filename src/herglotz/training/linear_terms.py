@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import reduce
 from typing import NamedTuple
 
 import torch
@@ -32,18 +33,35 @@ class LinearStart(NamedTuple):
 
 
 def linear_starts(
-    data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials
-) -> list[LinearStart]:
+    data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials,
+    one_of: Sequence[NamedTerms] = (),
+) -> list[LinearStart]:  # fmt: skip
     """The start with fewest terms whose error the best one does not undercut by more than a 20th, and simpler ones.
 
     Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind
     the first have fewer terms than it, the fewest first: their errors may be noise, which whole trajectories tell.
+    The best start `one_of` other families stands alone where it errs less than the first, or as little with fewer
+    terms.
     """
-    tried = [start for terms in families if (start := LinearTerms(data, base, terms).start(local)) is not None]
+    if not families:
+        return []
+    problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
+    tried = [start for terms in families if (start := problem.start(terms)) is not None]
     tried.sort(key=lambda start: len(start.terms.names))
     least = min((start.error for start in tried), default=math.inf)
     fair = next((i for i, start in enumerate(tried) if start.error <= MARGIN * least), 0)
-    return [*tried[fair : fair + 1], *tried[:fair]]
+    tried = [*tried[fair : fair + 1], *tried[:fair]]
+    others = [start for terms in one_of if (start := problem.start(terms)) is not None and start.terms.features]
+    other = min(others, key=lambda start: start.error, default=None)
+    if other is None or (tried and _better(tried[0], other)):
+        return tried
+    return [other]
+
+
+def _better(first: LinearStart, other: LinearStart) -> bool:
+    """Whether the first start errs less, by more than a 20th where it has more terms."""
+    more = len(first.terms.names) > len(other.terms.names)
+    return first.error * (MARGIN if more else 1 / MARGIN) < other.error
 
 
 class LinearTerms:
@@ -54,17 +72,20 @@ class LinearTerms:
     data, base
         What is trained on, and the first look at it.
     every
-        The candidates.
+        The candidates of all families.
+    local
+        The polynomials around each sample.
     """
 
-    def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms):
+    def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials):
         self.data, self.base, self.all = data, base, every
         self.own = own_terms(data.angles)
+        self.overlap = max(1.0, local.width / 2)
+        self.fit = self._problem(local)
 
-    def start(self, local: LocalPolynomials) -> LinearStart | None:
-        """Terms and values of the linear problem, pruned, and its error; None where no mass fits."""
-        fit = self._problem(local)
-        columns = self._columns(fit)
+    def start(self, of: NamedTerms) -> LinearStart | None:
+        """The terms of a family that the linear problem needs, their values and its error; None where no mass fits."""
+        fit, columns = self.fit, self._columns(of)
         if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
             return None
         x = fit.solve(columns)
@@ -74,7 +95,7 @@ class LinearTerms:
         r = fit.errors(x)
         if not bool(torch.isfinite(r).all()):
             return None
-        terms, left, alone = self._pruned(fit, columns, x, r, max(1.0, local.width / 2))
+        terms, left, alone = self._pruned(of, columns, x, r)
         for x in (fit.solve(left), alone):
             start = fit.start(x)
             if start is not None:
@@ -90,22 +111,21 @@ class LinearTerms:
         forces = NamedForces(self.all.drag, self.base.speed if self.all.dry else (), u)
         return LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
 
-    def _pruned(
-        self, fit: LinearFit, columns: Tensor, x: Tensor, r: Tensor, overlap: float
-    ) -> tuple[NamedTerms, Tensor, Tensor]:
+    def _pruned(self, of: NamedTerms, columns: Tensor, x: Tensor, r: Tensor) -> tuple[NamedTerms, Tensor, Tensor]:
         """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
 
-        Smoothed samples that share half a window say the same: N is over the `overlap`.
+        Smoothed samples that share half a window say the same: N is over the overlap.
         """
+        fit, overlap = self.fit, self.overlap
         X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
         size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
-        place = self._linear_places(fit, columns)
+        place = self._linear_places(columns)
         free = torch.tensor([i for own in place.values() for i in own])
         simplest = torch.tensor([i for name in self.own for i in place[name]], dtype=torch.long)
         worth = math.log(max(3, int(r.numel() / overlap)))
         kept, less = prune(X.T @ X / size / overlap, x[columns][1:], free, worth, simplest=simplest)
         stay = set(kept.tolist())
-        terms = self.all.only([name for name, own in place.items() if stay & set(own)])
+        terms = of.only([name for name, own in place.items() if stay & set(own)])
         left, at = columns.clone(), columns.nonzero()[1:, 0]
         for name, own in place.items():
             if name not in terms.names:
@@ -129,23 +149,32 @@ class LinearTerms:
     def _moving(self) -> list[str]:
         return [x for x in self.all.features if "v" in x]
 
-    def _columns(self, fit: LinearFit) -> Tensor:
-        """All columns for joints; no mass or friction between lengths; no springs where the terms have none."""
-        springs = torch.tensor([self.all.springs or x not in SPRINGS for x in fit.names])
-        if any(self.data.angles):
-            return springs
+    def _columns(self, of: NamedTerms) -> Tensor:
+        """Columns of a family, and all masses, springs and friction of joints; no mass or friction between lengths."""
         i, j = pairs(self.data.dof, torch.device("cpu"))
+        joints = any(self.data.angles)
         diagonal = iter((i == j).tolist())
-        between = torch.tensor([not next(diagonal) if x == "mass" else x == "coupling.viscous" for x in fit.names])
-        return springs & ~between
+        order = {STILL: iter(self._still), MOVING: iter(self._moving), DRAG: iter(self.all.drag)}
 
-    def _linear_places(self, fit: LinearFit, columns: Tensor) -> dict[str, list[int]]:
+        def used(name: str) -> bool:
+            if name == "mass":
+                return next(diagonal) or joints
+            if name in order:
+                return next(order[name]) in of.names
+            if name in SPRINGS:
+                return of.springs
+            return of.dry if name == DRY else joints or name != "coupling.viscous"
+
+        return torch.tensor([used(name) for name in self.fit.names])
+
+    def _linear_places(self, columns: Tensor) -> dict[str, list[int]]:
         """Columns of each term among those that are used, the first mass not counted."""
-        names = [x for x, used in zip(fit.names, columns.tolist(), strict=True) if used][1:]
+        order = {STILL: iter(self._still), MOVING: iter(self._moving), DRAG: iter(self.all.drag)}
+        own = {parameter: term for term, (parameter, _) in self.own.items()}
+        names = [next(order[x]) if x in order else own.get(x, x) for x in self.fit.names]
+        left = [name for name, used in zip(names, columns.tolist(), strict=True) if used][1:]
         at: dict[str, list[int]] = {}
-        for parameter, terms in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            own = [i for i, x in enumerate(names) if x == parameter]
-            at |= {term: [i] for term, i in zip(terms, own, strict=True)}
-        at |= {term: [names.index(parameter)] for term, (parameter, _) in self.own.items()}
-        at[DRY] = [i for i, x in enumerate(names) if x == DRY]
+        for i, name in enumerate(left):
+            if name in (*self.all.names, DRY):
+                at.setdefault(name, []).append(i)
         return at

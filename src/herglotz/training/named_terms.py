@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
-import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
@@ -20,6 +19,7 @@ from herglotz.training.parameter_vector import ParameterVector
 
 HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
 WAVES = 3  # highest harmonic of one angle
+NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
 DRY = "friction.coulomb"
 
@@ -39,6 +39,11 @@ class NamedTerms:
         """All of them, each once."""
         return (*self.features, *self.drag, *((DRY,) if self.dry else ()))
 
+    def joined(self, other: NamedTerms) -> NamedTerms:
+        """These and the other ones, each once."""
+        features = tuple(dict.fromkeys(self.features + other.features))
+        return replace(self, features=features, drag=tuple(dict.fromkeys(self.drag + other.drag)))
+
     def only(self, names: Sequence[str]) -> NamedTerms:
         """Those of them that are among `names`."""
         return NamedTerms(
@@ -57,7 +62,7 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
         powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
         features = [*own_terms(angles), *(waves if angles[0] else powers)]
     else:
-        features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r")]
+        features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r^")]
         if any(angles):
             features += [f"q{i + 1}^{k}" for k in (3, 4) for i, angle in enumerate(angles) if not angle]
     drag = []
@@ -76,6 +81,31 @@ def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTer
     every = (*baseline_features(data.angles, zero, zero)[0], *pairs, *candidates(data).features)
     still = tuple(dict.fromkeys(text for text in every if unchanged(text, data.angles, moved)))
     return NamedTerms(still, one_rate=True, springs=False)
+
+
+def distances(data: Trajectories) -> tuple[str, ...]:
+    """Potentials of the distance r = |q|, where the coordinates have one unit of length and stay away from r = 0."""
+    if any(data.angles) or data.dof < 2 or len(set(data.units)) > 1:
+        return ()
+    r = data.q.norm(dim=1)
+    away = float(r.min()) > NEAR * float(r.square().mean().sqrt())
+    return tuple(name for name in lengths(data.angles) if name.startswith("r^")) if away else ()
+
+
+def offered(data: Trajectories, every: NamedTerms, beside: NamedTerms, *, lacks: bool) -> NamedTerms:
+    """The candidates `every`, with distances where a model of the terms `beside` has one or `lacks` a force."""
+    of_r = distances(data) if every.springs else ()
+    return every.joined(NamedTerms(of_r)) if lacks or set(of_r) & set(beside.features) else every
+
+
+def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:
+    """One power of the distance each, with the friction and the forces across the velocity of `every`.
+
+    Powers of r are so much alike over most motions that a linear problem of all of them says little of each.
+    """
+    across = tuple(x for x in every.features if "v" in x)
+    of_r = distances(data) if every.springs else ()
+    return [every.joined(NamedTerms((name,))).only((name, *across, *every.drag, DRY)) for name in of_r]
 
 
 def chains(data: Trajectories) -> list[NamedTerms]:
@@ -200,12 +230,3 @@ def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int
     if terms.dry:
         at[DRY] = parameters.index(DRY).tolist()
     return at
-
-
-def with_inverse_free(A: Tensor, free: Tensor, others: Tensor, b: Tensor) -> tuple[Tensor, Tensor]:
-    """Diagonal of the Schur complement and gradient of `others` where the `free` unknowns follow them."""
-    scale = A.diagonal().clamp_min(1e-300).sqrt()
-    S, y = A / scale[:, None] / scale, b / scale
-    C = torch.linalg.pinv(S[free][:, free], hermitian=True) @ S[free][:, others]
-    left = S[others, others] - (S[free][:, others] * C).sum(0)
-    return left, y[others] - C.T @ y[free]

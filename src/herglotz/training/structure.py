@@ -30,6 +30,7 @@ from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
 from herglotz.training.linear_start import LinearFit
+from herglotz.training.named_terms import distances
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -41,7 +42,6 @@ from herglotz.training.task import EXACT, NOISY, build_model
 MOST, MOST_LENGTHS = 3, 12  # most coordinates with and without an angle: the dictionary of joints grows as 3ⁿ n²
 TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
 NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
-NEAR = 0.02  # negative powers of r are candidates where the data stay beyond this share of the RMS distance
 THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
@@ -91,9 +91,8 @@ def dictionary(data: Trajectories) -> tuple[str, ...]:
     """The features that these coordinates are tried with."""
     if any(data.angles):
         return tuple(revolute(data.angles))
-    r = data.q.norm(dim=1)
-    away = len(set(data.units)) == 1 and float(r.min()) > NEAR * float(r.square().mean().sqrt())
-    return tuple(name for name in lengths(data.angles) if away or not name.startswith("r^"))
+    away = distances(data)
+    return tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
 
 
 def kept_structure(
@@ -169,17 +168,7 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
     if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * size):
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
-    larger = joints or _needs_distances(fit, x, names)
-    return Structure(replace(rich, objective=objective), found, f"{words}: exact", larger=larger)
-
-
-def _needs_distances(fit: LinearFit, x: Tensor, names: tuple[str, ...]) -> bool:
-    """Whether bodies without angles are missed without powers of r, which the search for terms does not try."""
-    still = iter([name for name in names if "v" not in name])
-    columns = _columns(fit, [False] * fit.R.shape[1])
-    columns &= torch.tensor([name != POTENTIAL or not next(still).startswith("r") for name in fit.names])
-    with_r, without = (float(fit.errors(y).square().mean().sqrt()) for y in (x, fit.solve(columns)))
-    return without > MISSED * with_r
+    return Structure(replace(rich, objective=objective), found, f"{words}: exact", larger=joints)
 
 
 def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:

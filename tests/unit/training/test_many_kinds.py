@@ -92,7 +92,7 @@ def test_fewer_residuals_than_a_dictionary_needs_give_no_start():
     search = DictionarySearch(data, estimate_baseline(data, outliers=False, drag=False), config)
     local = local_polynomials(data)
     assert local is not None
-    assert LinearTerms(data, search.base, search.all).start(local) is None
+    assert LinearTerms(data, search.base, search.all, local).start(search.all) is None
 
 
 @pytest.mark.slow  # 40 s

@@ -14,10 +14,14 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, fit
+from herglotz.training import FitConfig, Plan, fit, laplace
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
+from herglotz.training.fit import _equation
+from herglotz.training.linear_terms import linear_starts
+from herglotz.training.named_terms import NamedTerms, candidates, central, offered
+from herglotz.training.pruning import joining
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
 
@@ -222,3 +226,54 @@ def test_wrong_drag_is_an_input_error(text, says):
     # fails if a text is read as another force
     with pytest.raises(InputError, match=says):
         parse_drag(text, (True, False))
+
+
+def test_a_distance_is_found_where_it_matters():
+    # fails if powers of r are no candidates, one of them does not stand alone, or springs are taken for a distance
+    names = {}
+    for system, noise in (("kepler", 0.0), ("kepler", 1e-3), ("chain", 1e-3)):
+        settings = {"masses": 2} if system == "chain" else {}
+        data = simulate(scene(system, **settings), trajectories=3, steps=50, h=0.1, noise=noise, seed=1)
+        local, every = local_polynomials(data), candidates(data)
+        assert local is not None
+        starts = linear_starts(data, estimate_baseline(data), [every], local, central(data, every))
+        names[system, noise] = {name for name in starts[0].terms.features if name.startswith("r")}
+        assert not any(name.startswith("r^") for name in every.names)
+        assert ("r^-1" in offered(data, every, starts[0].terms, lacks=False).names) is (system == "kepler")
+    assert names == {("kepler", 0.0): {"r^-1"}, ("kepler", 1e-3): {"r^-1"}, ("chain", 1e-3): set()}
+
+
+def test_a_planet_is_found_in_noise_with_its_rotation():
+    # fails if 1/r is missed or a term that noise brings joins it: the rotation is lost with either
+    data = simulate(scene("kepler"), trajectories=3, steps=60, h=0.1, noise=1e-3, seed=1)
+    run = fit(data, progress=False)
+    assert run.metrics["plan"]["features"] == ("r^-1",)
+    assert run.metrics["train_rms"] < 1.2e-3
+    symmetries = run.symmetries()
+    assert len(symmetries) == 1
+    assert "rotation" in str(symmetries)
+
+
+def test_the_best_of_many_terms_has_to_bring_more():
+    # fails if a term joins that is no better than the best of twenty terms of noise is by chance: 12.3 of 400 residuals
+    J = torch.linalg.qr(torch.randn(400, 21, generator=torch.Generator().manual_seed(0), dtype=torch.float64))[0]
+    free, others = torch.tensor([0]), torch.arange(1, 21)
+    for gain, found in ((math.log(400) + 5.0, None), (math.log(400) + 7.0, 4)):
+        b = J.T @ (J[:, 5] * gain**0.5 + 0.1 * J[:, 7])
+        assert joining(J.T @ J, b, free, others, math.log(400)) == found
+
+
+def test_rounding_is_no_reason_for_a_term():
+    # fails if a term may join that lowers a misfit which is below that of exact data
+    search = SimpleNamespace(all=candidates(simulate(scene("duffing"), trajectories=1, steps=9, h=0.1)), floor=1e-8)
+    assert DictionarySearch._missing(search, SimpleNamespace(terms=NamedTerms(), rms=0.9e-8)) is None  # pyright: ignore
+
+
+def test_deviations_are_no_smaller_than_rounding(duffing):
+    # fails if terms of exact data that rounding has made are told from 0: `1.7e-16 ± 2e-17 x²`
+    plan, least = Plan.from_dict(duffing.metrics["plan"]), 50 * duffing.metrics["sigma"]
+    posterior = laplace(duffing)
+    by = 50 / posterior.inflation
+    for term, wide in zip(duffing.equation().terms, _equation(duffing, plan, least).terms, strict=True):
+        assert wide.deviation == pytest.approx(by * term.deviation)
+    assert str(_equation(duffing, plan, 0.0)) == str(duffing.equation())

@@ -207,14 +207,17 @@ class ShootingProblem(StatesProblem):
         self.path = Path(x, path.A)
 
     def guess_from_states(self, states: Tensor) -> None:
-        """Start the next solve from states (N, 2n+1) at the samples, with straight lines between them."""
+        """Start the next solve from states (N, 2n+1) at the samples, with cubics between them (Hermite's)."""
         data, times = self.data, self.grid.times(self.data)
         owner, x = self.grid.start_trajectory(data), states.new_empty(*times.shape, states.shape[-1])
         for b, (first, length) in enumerate(zip(data.offsets, data.lengths, strict=True)):
             t, known, own = data.t[first : first + length].contiguous(), states[first : first + length], owner == b
             at = torch.searchsorted(t, times[own].contiguous()).clamp(1, length - 1)
-            share = ((times[own] - t[at - 1]) / (t[at] - t[at - 1])).clamp(0, 1)[..., None]
-            x[own] = known[at - 1] + share * (known[at] - known[at - 1])
+            h, rise = (t[at] - t[at - 1])[..., None], known[at] - known[at - 1]
+            share = ((times[own] - t[at - 1])[..., None] / h).clamp(0, 1)
+            slope = torch.gradient(known, spacing=(t,), dim=0)[0]
+            bend = (1 - share) * (h * slope[at - 1] - rise) - share * (h * slope[at] - rise)
+            x[own] = known[at - 1] + share * rise + share * (1 - share) * bend
         self.path = Path(x, x[..., None])
 
     def misfit(self, path: Path) -> Tensor:
