@@ -288,14 +288,20 @@ def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor
 
 
 def _rows(y: Tensor, xs: tuple[Tensor, Tensor, Tensor], create_graph: bool) -> tuple[Tensor, ...]:
-    """∂y/∂x for each x: (..., m, n), (..., m, n) and (..., m), the m components of y (..., m) in one backward pass."""
+    """∂y/∂x for each x: (..., m, n), (..., m, n) and (..., m), the m components of y (..., m) in one backward pass.
+
+    A function of L_d whose backward pass is Python that looks at numbers cannot take all rows at once.
+    """
     m, batch = y.shape[-1], y.ndim - 1
     found: tuple[Tensor | None, ...] = (None,) * len(xs)
     if y.requires_grad:
-        one_each = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
-        found = torch.autograd.grad(
-            y, xs, one_each, create_graph=create_graph, retain_graph=True, allow_unused=True, is_grads_batched=True
-        )
+        options = {"create_graph": create_graph, "retain_graph": True, "allow_unused": True}
+        unit = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
+        try:
+            found = torch.autograd.grad(y, xs, unit, is_grads_batched=True, **options)
+        except RuntimeError:
+            one_by_one = zip(*(torch.autograd.grad(y, xs, row, **options) for row in unit), strict=True)
+            found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
     rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
     return tuple(g.movedim(0, batch) for g in rows)
 
