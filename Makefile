@@ -53,8 +53,8 @@ test: .venv/installed
 	$(PY) -m ruff check .
 	$(PY) -m pyright & types=$$!; $(ENV) $(PY) -m pytest -q $(SPREAD); tests=$$?; wait $$types && exit $$tests
 
-# Other instructions, threads, versions and roundings: eight times as long as `make test`, folder by folder; it can be
-# stopped and goes on where it was.
+# Other instructions, threads, versions and roundings, each on the folders that it can change: three times as long as
+# `make test`, folder by folder; it can be stopped and goes on where it was.
 test-anywhere: .venv/installed
 	$(PY) tests/anywhere.py
 

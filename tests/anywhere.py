@@ -15,23 +15,44 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
+
+import torch
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "build" / "anywhere.json"
 ONE = {"OMP_NUM_THREADS": "1", "MPLBACKEND": "Agg"}
-VARIANTS = {  # name: (environment, workers, versions)
-    "native": (ONE, 2, None),
-    "default": ({**ONE, "ATEN_CPU_CAPABILITY": "default"}, 2, None),  # SSE: what every x86-64 processor has
-    "avx2": ({**ONE, "ATEN_CPU_CAPABILITY": "avx2"}, 2, None),
-    "mkl-compatible": ({**ONE, "MKL_CBWR": "COMPATIBLE"}, 2, None),  # MKL without processor-specific kernels
-    "two-threads": ({**ONE, "OMP_NUM_THREADS": "2"}, 1, None),
-    "shake": ({**ONE, "HERGLOTZ_SHAKE": "1"}, 2, None),  # data disturbed by 1e-14 before every fit (tests/conftest.py)
+# A variant runs the folders whose tests it can change; `make test` is the variant without any change.
+# Sums so large that a second thread shares them, and fits, which carry a last digit far:
+ROUNDED = ("extremes", "learned", "unit", "unit/stepping", "unit/training", "unit/trust", "unit/tune")
+FITTED = (*ROUNDED, "unit/benchmarks", "unit/cli", "unit/models", "unit/verify")
+# What numpy and matplotlib are used for: files, figures, and C through ctypes:
+ARRAYS = ("unit", "unit/benchmarks", "unit/cli", "unit/data", "unit/export", "unit/plots", "unit/tune")
+
+
+class Variant(NamedTuple):
+    """Another machine."""
+
+    environment: dict[str, str]
+    workers: int = 2
+    versions: tuple[str, ...] | None = None  # of packages, in an environment of their own
+    folders: tuple[str, ...] | None = None  # in tests/; None: all
+
+
+VARIANTS = {
+    # What every x86-64 processor has: SSE in torch, and in MKL, without kernels for one make of processor.
+    "least": Variant({**ONE, "ATEN_CPU_CAPABILITY": "default", "MKL_CBWR": "COMPATIBLE"}),
+    "avx2": Variant({**ONE, "ATEN_CPU_CAPABILITY": "avx2"}),
+    "two-threads": Variant({**ONE, "OMP_NUM_THREADS": "2"}, workers=1, folders=ROUNDED),
+    # Data disturbed by 1e-14 before every fit (tests/conftest.py).
+    "shake": Variant({**ONE, "HERGLOTZ_SHAKE": "1"}, folders=FITTED),
     # The least that pyproject.toml allows; this matplotlib calls what later versions of pyparsing warn of.
-    "oldest": (ONE, 2, ("numpy==1.26.*", "matplotlib==3.8.*", "pyparsing<3.3")),
-    "newest": (ONE, 2, ("numpy", "matplotlib")),
+    "oldest": Variant(ONE, versions=("numpy==1.26.*", "matplotlib==3.8.*", "pyparsing<3.3"), folders=ARRAYS),
+    "newest": Variant(ONE, versions=("numpy", "matplotlib"), folders=ARRAYS),
 }
-PYTHONS = {f"python3.{minor}": (ONE, 2, ()) for minor in (11, 12, 13)}  # interpreters, with the pinned versions
+if torch.backends.cpu.get_cpu_capability() == "AVX2":
+    del VARIANTS["avx2"]  # `make test` is it
+PYTHONS = {f"python3.{minor}": Variant(ONE, versions=()) for minor in (11, 12, 13)}  # with the pinned versions
 EVERY = {**VARIANTS, **PYTHONS}
 COUNTED = ("passed", "failed", "error", "skipped", "xfailed")
 
@@ -73,7 +94,7 @@ def python(versions: tuple[str, ...] | None, name: str) -> str:
 
 def run(variant: str, folder: str, options: list[str]) -> dict[str, Any]:
     """One folder in one variant: the counts of pytest, and which tests failed."""
-    environment, workers, versions = EVERY[variant]
+    environment, workers, versions, _ = EVERY[variant]
     paths = sorted(str(path.relative_to(ROOT)) for path in (ROOT / folder).glob("test_*.py"))
     spread = ["-n", str(workers), "--dist", "worksteal"] if workers > 1 else []
     command = [python(versions, variant), "-m", "pytest", "-q", "-rfE", *spread, *paths, *options]
@@ -86,12 +107,20 @@ def run(variant: str, folder: str, options: list[str]) -> dict[str, Any]:
     return {"counts": counts, "failed": failed}
 
 
-def table(results: dict[str, dict[str, Any]], wanted: list[str]) -> str:
+def wanted(variant: str, folders: list[str]) -> list[str]:
+    """Those of the folders that this variant can change."""
+    own = EVERY[variant].folders
+    return [folder for folder in folders if own is None or folder.removeprefix("tests/") in own]
+
+
+def table(results: dict[str, dict[str, Any]], folders: list[str]) -> str:
     """One row a variant: sums of the counts, folders done, and the tests that failed below."""
     rows, below = [f"{'variant':16}" + "".join(f"{name:>9}" for name in COUNTED) + "  folders"], []
     for variant, found in results.items():
         sums = [sum(x["counts"].get(name, 0) for x in found.values()) for name in COUNTED]
-        rows.append(f"{variant:16}" + "".join(f"{n:9}" for n in sums) + f"  {len(found)} of {len(wanted)}")
+        rows.append(
+            f"{variant:16}" + "".join(f"{n:9}" for n in sums) + f"  {len(found)} of {len(wanted(variant, folders))}"
+        )
         below += [f"{variant}: {line}" for x in found.values() for line in x["failed"]]
     return "\n".join(rows + below)
 
@@ -110,7 +139,7 @@ def main() -> int:
     stop = time.monotonic() + 60 * arguments.minutes
     for variant in arguments.only:
         found = results.setdefault(variant, {})
-        for folder in arguments.folders:
+        for folder in wanted(variant, arguments.folders):
             if time.monotonic() > stop or (folder in found and not found[folder]["failed"]):
                 continue
             found[folder] = run(variant, folder, arguments.pytest)
@@ -118,7 +147,7 @@ def main() -> int:
             RESULTS.parent.mkdir(exist_ok=True)
             RESULTS.write_text(json.dumps({"key": key, "results": results}, indent=1), encoding="utf-8")
     print(table(results, arguments.folders))
-    complete = all(set(arguments.folders) <= set(results[variant]) for variant in arguments.only)
+    complete = all(set(wanted(variant, arguments.folders)) <= set(results[variant]) for variant in arguments.only)
     return int(not complete or any(x["failed"] for found in results.values() for x in found.values()))
 
 

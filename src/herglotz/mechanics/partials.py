@@ -245,20 +245,18 @@ def autograd_partials(
         if order == 1:
             return _detach(Partials(L, D1, D2, D3, force=force), keep_graph)
         n = q0.shape[-1]
-        rows0 = [_grad(D1[..., i], (a, b, s), keep_graph, retain=True) for i in range(n)]
-        rows1 = [_grad(D2[..., i], (b, s), keep_graph, retain=True) for i in range(n)]
-        (D33,) = _grad(D3, (s,), keep_graph, retain=True)
+        by_q0, by_q1, by_s = _rows(torch.cat([D1, D2, D3[..., None]], -1), (a, b, s), keep_graph)
         second = Partials(
             L,
             D1,
             D2,
             D3,
-            D11=torch.stack([r[0] for r in rows0], -2),
-            D12=torch.stack([r[1] for r in rows0], -2),
-            D22=torch.stack([r[0] for r in rows1], -2),
-            D13=torch.stack([r[2] for r in rows0], -1),
-            D23=torch.stack([r[1] for r in rows1], -1),
-            D33=D33,
+            D11=by_q0[..., :n, :],
+            D12=by_q1[..., :n, :],
+            D22=by_q1[..., n : 2 * n, :],
+            D13=by_s[..., :n],
+            D23=by_s[..., n : 2 * n],
+            D33=by_s[..., 2 * n],
             force=force,
         )
         return _detach(second, keep_graph)
@@ -271,12 +269,7 @@ def _autograd_forces(
     minus, plus = forces
     if order == 1:
         return Forces(minus, plus)
-    blocks = []
-    for F in forces:
-        rows = [_grad(F[..., i], xs, keep_graph, retain=True) for i in range(F.shape[-1])]
-        blocks += [torch.stack([r[0] for r in rows], -2), torch.stack([r[1] for r in rows], -2)]
-        blocks += [torch.stack([r[2] for r in rows], -1)]
-    return Forces(minus, plus, *blocks)
+    return Forces(minus, plus, *(block for F in forces for block in _rows(F, xs, keep_graph)))
 
 
 def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> bool:
@@ -286,14 +279,31 @@ def _differentiable(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor,
     return checked(L_d, L_d(q0, q1, s0, h), s0).requires_grad
 
 
-def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool, retain: bool = False) -> tuple[Tensor, ...]:
+def _grad(y: Tensor, xs: tuple[Tensor, ...], create_graph: bool) -> tuple[Tensor, ...]:
     """Gradient of y.sum(); zeros where y does not depend on an argument."""
     if not y.requires_grad:
         return tuple(torch.zeros_like(x) for x in xs)
-    grads = torch.autograd.grad(
-        y.sum(), xs, create_graph=create_graph, retain_graph=create_graph or retain, allow_unused=True
-    )
+    grads = torch.autograd.grad(y.sum(), xs, create_graph=create_graph, allow_unused=True)
     return tuple(torch.zeros_like(x) if g is None else g for g, x in zip(grads, xs, strict=True))
+
+
+def _rows(y: Tensor, xs: tuple[Tensor, Tensor, Tensor], create_graph: bool) -> tuple[Tensor, ...]:
+    """∂y/∂x for each x: (..., m, n), (..., m, n) and (..., m), the m components of y (..., m) in one backward pass.
+
+    A function of L_d whose backward pass is Python that looks at numbers cannot take all rows at once.
+    """
+    m, batch = y.shape[-1], y.ndim - 1
+    found: tuple[Tensor | None, ...] = (None,) * len(xs)
+    if y.requires_grad:
+        options = {"create_graph": create_graph, "retain_graph": True, "allow_unused": True}
+        unit = torch.eye(m, dtype=y.dtype, device=y.device).reshape(m, *(1,) * batch, m).expand(m, *y.shape)
+        try:
+            found = torch.autograd.grad(y, xs, unit, is_grads_batched=True, **options)
+        except RuntimeError:
+            one_by_one = zip(*(torch.autograd.grad(y, xs, row, **options) for row in unit), strict=True)
+            found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
+    rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
+    return tuple(g.movedim(0, batch) for g in rows)
 
 
 def _detach(P: Partials, keep_graph: bool) -> Partials:

@@ -55,12 +55,18 @@ class Combination(nn.Module):
 
     def ridge(self, x: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
-        cos, sin, power = x.split(self.counts[:3], -1)
-        exponent, highest = self.power.split(self.counts)[2], self.highest
-        rest, product = exponent - k, torch.ones_like(power)
-        for j in range(highest - k):  # no pow: its forward-mode derivative takes the logarithm of negative numbers
-            product = product * torch.where(rest > j, power, 1.0)
-        return torch.cat([_wave(cos, k), _wave(sin, k + 3), _front(exponent, k) * product], -1)
+        functions = (lambda y: _wave(y, k), lambda y: _wave(y, k + 3), lambda y: self._powers(y, k))
+        parts = zip(functions, x.split(self.counts[:3], -1), strict=True)
+        found = [function(part) for function, part in parts if part.shape[-1]]
+        return found[0] if len(found) == 1 else torch.cat(found or [x], -1)
+
+    def _powers(self, x: Tensor, k: int) -> Tensor:
+        """Return the k-th derivatives of the powers."""
+        exponent = self.power.split(self.counts)[2]
+        rest, product = exponent - k, torch.ones_like(x)
+        for j in range(self.highest - k):  # no pow: its forward-mode derivative takes the logarithm of negative numbers
+            product = product * torch.where(rest > j, x, 1.0)
+        return _front(exponent, k) * product
 
     def radial(self, square: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of the functions of r², (..., number of radial functions)."""

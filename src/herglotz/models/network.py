@@ -87,7 +87,8 @@ def midpoint_velocity_jets(
     """Return q̄ = (q0 + q1)/2 and v = Δ/h as jets over the 2n components of (q0, q1); Δ defaults to q1 − q0."""
     n = q0.shape[-1]
     eye = torch.eye(n, dtype=q0.dtype, device=q0.device)
-    shape = torch.broadcast_shapes(q0.shape[:-1], h.shape)
+    shape = q0.shape[:-1]
+    shape = shape if shape == h.shape else torch.broadcast_shapes(shape, h.shape)  # 0.1 ms, of a step's 10
     q0, q1 = q0.expand(*shape, n), q1.expand(*shape, n)
     rate = 1 / h.expand(shape)[..., None]  # (..., 1)
     eye_v = eye.reshape(n, *(1,) * len(shape), n) * rate  # (n, ..., n)

@@ -45,7 +45,7 @@ def test_thirty_two_masses_are_stepped_at_order_two():
     system, errors = scene("chain", masses=32), []
     assert system.dof == len(system.coordinates) == 32
     exact = system.flow(*start(32, seed=1), 1.0)[0]
-    for steps in (20, 40):
+    for steps in (5, 10):  # the slope is 2.02
         out = Stepper(system.L_d_rules["strang"]).rollout(*start(32, seed=1), h=1 / steps, steps=steps)
         assert bool(out.ok.all())
         torch.testing.assert_close(out.sigma[:, -1], torch.full((4,), math.exp(-0.1), dtype=torch.float64))
