@@ -301,7 +301,7 @@ MUTANTS = [
     ("export/differences.py", '(columns / offset[..., None]).mT', 'columns / offset[..., None]'),
     ("export/differences.py", 'torch.diag_embed(k * offset', 'torch.diag_embed(offset'),
     # the figures of the paper
-    ("plots/parachute.py", "for _ in range(k):", "for _ in range(k + 1):"),
+    ("plots/parachute.py", "float(S.D2) for S", "float(S.D1) for S"),
     ("plots/parachute.py", "PrintedParachute(squared=True)", "PrintedParachute(squared=False)"),
     ("plots/parachute.py", "p[: SHOWN + 1, 0].numpy()", "p[1 : SHOWN + 2, 0].numpy()"),
     ("plots/parachute.py", "range(min(last, 9) + 1)", "range(min(last, 9))"),
