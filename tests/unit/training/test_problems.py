@@ -253,13 +253,13 @@ def test_nothing_is_computed_where_nothing_is_left_to_gain():
         def normal_equations(self, x):
             return self.cost(x), torch.eye(len(x), dtype=x.dtype), x
 
-    x = torch.tensor([1.0, 2.0], dtype=torch.float64)
-    for damping, asked in ((1e-8, 3), (1.0, 8)):  # start, step and its equations; damped steps have more to go
-        line = Line()
-        result = levenberg_marquardt(line, x, damping=damping)
-        assert result.reason == "converged"
-        assert float(result.x.abs().max()) < 1e-2
-        assert line.asked == asked if damping < 1 else line.asked > asked
+    x, line, damped = torch.tensor([1.0, 2.0], dtype=torch.float64), Line(), Line()
+    result = levenberg_marquardt(line, x, damping=1e-8)
+    assert result.reason == "converged"
+    assert float(result.x.abs().max()) < 1e-6
+    assert line.asked == 3  # the start, one step, and its equations
+    levenberg_marquardt(damped, x, damping=1e9)  # its steps gain nothing for their length alone
+    assert damped.asked > 3
 
 
 def test_levenberg_marquardt_is_scale_free():
