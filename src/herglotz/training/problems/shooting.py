@@ -238,7 +238,7 @@ class ShootingProblem(StatesProblem):
         count, which = int(which.max()) + 1, which[self.grid.sample]
         fit, _ = self._residuals(self.path.x)
         by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
-        rows = self._slopes.flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N', n, P + d)
+        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N', n, P + d)
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         columns = rows.new_zeros(self.P + self.grid.segments * self.d, count, self.n)
         for k in range(self.grid.segments):
