@@ -7,7 +7,7 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
-from herglotz.cli.common import check_output_folder, existing
+from herglotz.cli.common import check_output_folder, existing, finite
 from herglotz.cli.settings import add_data_settings
 from herglotz.errors import InputError
 
@@ -24,11 +24,20 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
 
 
 def add_column_flags(parser: argparse.ArgumentParser) -> None:
-    """Add --angles, and --time, --coordinates, --inputs, --drop and --group: the roles of a csv file's columns."""
+    """Add what says how a file is read: --angles, what its sensors read, and the roles of a csv file's columns."""
     parser.add_argument(
         "--angles", type=names, metavar="NAMES",
         help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
     )  # fmt: skip
+    for flag, what in (
+        ("--sensor-zeros", "what they read where the coordinates are 0"),
+        ("--sensor-scales", "what one unit of each reading is worth"),
+    ):
+        parser.add_argument(
+            flag, type=finite, nargs="+", metavar="X",
+            help=f"{what}, a number for each coordinate, or for each of every recording: positions are "
+            "scale * (reading - zero)",
+        )  # fmt: skip
     columns = parser.add_argument_group("columns of a csv file (default: by their names, printed as a table)")
     columns.add_argument("--time", metavar="NAME", help="column of the time")
     columns.add_argument("--coordinates", type=names, metavar="NAMES", help="exactly these, with commas")
@@ -39,7 +48,8 @@ def add_column_flags(parser: argparse.ArgumentParser) -> None:
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what the flags say of the columns, for `load`."""
-    given = {name: getattr(arguments, name) for name in ("angles", "time", "coordinates", "inputs", "drop", "group")}
+    roles = ("angles", "time", "coordinates", "inputs", "drop", "group", "sensor_zeros", "sensor_scales")
+    given = {name: getattr(arguments, name) for name in roles}
     return {name: value for name, value in given.items() if value is not None}
 
 

@@ -25,6 +25,8 @@ A recorded step that is longer than those the model was fitted to is crossed in 
 sampled faster is thinned, its inputs averaged: K counts the samples that are left.
 
 --out FILE writes the predicted motion, and FILE.png beside it: data, free run and their difference.
+Where the recordings of the fit differ in what their sensors read at 0, those zeros that suit the first samples best
+are taken off this recording; --sensor-zeros says it instead, relative to the longest recording of the fit.
 With --windows W --horizon T, W windows spread over the recording are scored instead, each K samples and then a free
 run over the time T: for motions that no model follows for long.
 
@@ -72,7 +74,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise InputError(
             f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"
         )
-    found = result.predict(data, warmup=arguments.warmup, windows=arguments.windows, horizon=arguments.horizon)
+    found = result.predict(
+        data, warmup=arguments.warmup, windows=arguments.windows, horizon=arguments.horizon,
+        same_zeros=arguments.sensor_zeros is not None,
+    )  # fmt: skip
     written = [] if out is None else _write(found, out)
     if arguments.json:
         print_json(found.metrics())
@@ -107,6 +112,9 @@ def _report(found: Prediction, arguments: argparse.Namespace) -> None:
         steps = f"every {found.every} samples of the recording are one step"
     if found.outside > 0:
         steps += f"{'; ' if steps else ''}{100 * found.outside:.3g} % are outside of the steps of the training data"
+    if found.zeros:
+        zeros = zip(found.data.names, found.zeros, found.data.units, strict=True)
+        rows.append(("sensors at 0", ", ".join(f"{name} {size(zero, unit)}" for name, zero, unit in zeros)))
     print_table([*rows, *([("steps", steps)] if steps else [])])
 
 

@@ -122,6 +122,11 @@ def add_optimiser_flags(parser: argparse._ActionsContainer) -> None:
         "(default auto)",
     )  # fmt: skip
     _setting(
+        parser, "--find-zeros", action="store_true",
+        help="look for zeros of the sensors that differ between recordings, kept where free runs over held-out time "
+        "ask for them (default: all recordings agree, or --sensor-zeros says it)",
+    )  # fmt: skip
+    _setting(
         parser, "--supervision", choices=SUPERVISION,
         help="what the one-step objective is fitted to: positions, s beside them, or momenta as well, where they are "
         "recorded (default q)",

@@ -16,13 +16,14 @@ from torch import Tensor
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.extra_formats import Table
 from herglotz.data.readers import load
+from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
 
-OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles")
+OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "sensor_zeros", "sensor_scales")
 
 
 def as_trajectories(
@@ -35,6 +36,8 @@ def as_trajectories(
     drop: Names = (),
     group: str | None = None,
     angles: Names | bool | None = None,  # coordinates that are angles in rad; True for all, () for none
+    sensor_zeros: Sequence[float] = (),  # what the sensors read at 0, n numbers or n for each recording
+    sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth: q = scale · (reading − zero)
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
 
@@ -51,20 +54,23 @@ def as_trajectories(
     names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, Trajectories):
-        wrong = "trajectories have their columns already; of the options, only angles changes them"
+        wrong = "trajectories have their columns already; angles, sensor_zeros and sensor_scales alone change them"
         refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         found = data
     elif isinstance(data, (str, Path)):
-        found = load(data, **{k: v for k, v in {"time": time, **names}.items() if v not in (None, ())})
+        columns = {k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}
+        return _marked(load(data, sensor_zeros=sensor_zeros, sensor_scales=sensor_scales, **columns), angles)
     elif hasattr(data, "columns") and h is not None:
         found = in_radians_and_seconds(_array(np.asarray(data), h, time, names))
     elif hasattr(data, "columns") or isinstance(data, Mapping):
-        return _table(data, Wanted(time, **names), angles)
+        found = _table(data, Wanted(time, **names))
     elif _is_list_of_recordings(data):
-        return _of_each(data, {"h": h, "time": time, **names, "angles": angles})
+        several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
+        refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
+        found = _of_each(data, {"h": h, "time": time, **names, "angles": angles})
     else:
         found = _array(data, h, time, names)
-    return _marked(found, angles)
+    return _marked(measured(found, sensor_zeros, sensor_scales), angles)
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -93,12 +99,12 @@ def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
     return Trajectories.cat([as_trajectories(one, **options) for one in rows])
 
 
-def _table(data: Any, wanted: Wanted, angles: Any) -> Trajectories:
+def _table(data: Any, wanted: Wanted) -> Trajectories:
     """The recordings of a DataFrame or a dict of columns; what each column was taken for is printed."""
     is_frame = hasattr(data, "columns")
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): np.asarray(x) for name, x in data.items()})
-    found = _marked(in_radians_and_seconds(from_frame(frame, wanted, where)), angles)
+    found = in_radians_and_seconds(from_frame(frame, wanted, where))
     print(found.table(), file=sys.stderr)
     return found
 

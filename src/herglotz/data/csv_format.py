@@ -16,12 +16,13 @@ from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import SHOWN, number, quote
+from herglotz.data.sensors import measured
 from herglotz.data.table import from_numbers, from_table, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 
 LONG = 100_000  # characters of a row of plain numbers
-ARRIVAL = r"#\s*(hold|delay|lag):\s*(.+)"  # comments that say what happens to inputs before they act
+SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs before they act, and what sensors read
 
 
 def read_csv(
@@ -42,7 +43,8 @@ def read_csv(
     `*_dot`) are left aside; every other column is a coordinate. Times may be dates in ISO 8601: they become seconds
     since the first row. Lines that start with # and blank lines are skipped, but for `# hold: zero` (or `first`,
     `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between samples and how late they act,
-    in the file's unit of time. A coordinate in rad is taken for an angle.
+    in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`, which make q = scale · (reading − zero) of
+    the coordinates, one after the other (`herglotz.data.sensors`). A coordinate in rad is taken for an angle.
 
     Returns
     -------
@@ -109,12 +111,17 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
 
 
 def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
-    """With what the first comments `# hold: …`, `# delay: …` and `# lag: …` among the lines say of the inputs."""
+    """With what the first comments of each kind among the lines say of the inputs and of the sensors."""
     said: dict[str, str | float] = {}
-    for match in filter(None, (re.fullmatch(ARRIVAL, line.strip()) for line in lines)):
+    sensors: dict[str, list[float]] = {}
+    for match in filter(None, (re.fullmatch(SAID, line.strip()) for line in lines)):
         name, text = match.groups()
-        said.setdefault(name, text if name == "hold" else number(text, f"{found.source}, comment '# {name}: {text}'"))
-    return replace(found, **said)  # type: ignore[arg-type]
+        where = f"{found.source}, comment '# {name}: {text}'"
+        if name in ("zero", "scale"):
+            sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
+        else:
+            said.setdefault(name, text if name == "hold" else number(text, where))
+    return replace(measured(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
 
 
 def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[str] = ()) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -15,6 +15,7 @@ from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
+from herglotz.data.sensors import measured
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError
@@ -56,6 +57,8 @@ def load(
     angles: Names | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
+    sensor_zeros: Sequence[float] = (),  # what the sensors read at 0; see `herglotz.data.sensors`
+    sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth
     **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
 ) -> Trajectories:
     """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
@@ -70,6 +73,9 @@ def load(
         Make angles continuous.
     show
         Print the table of columns on stderr, where a table was read.
+    sensor_zeros, sensor_scales
+        Positions are scale · (reading − zero), both in the file's units: n numbers each, or n for each recording of the
+        file, one recording after the other; after what the file itself says.
     **columns
         Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`.
 
@@ -83,7 +89,7 @@ def load(
     InputError
         If the format is not known (the message lists those that are), or from the reader of that format.
     """
-    found = in_radians_and_seconds(_read(Path(path), Wanted(**columns)))
+    found = measured(in_radians_and_seconds(_read(Path(path), Wanted(**columns))), sensor_zeros, sensor_scales)
     if angles is not None:
         found = found.with_angles(angles)
     if show and found.columns:

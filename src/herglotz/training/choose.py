@@ -107,7 +107,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
                 "alike": c.alike},
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
-        departures=c.departures,
+        departures=c.departures, zeros=seen.zeros,
         reasons=_reasons(seen, user_settings, named=named, one_step=one_step) | {
             "objective": why,
             "network": why_network,
@@ -126,6 +126,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
         "level": _level_reason(seen, user_settings),
         "substeps": "the fit needed shorter steps: halved ones met the data better" if named else AS_SET,
         **seen.why_arrival,
+        "zeros": seen.apart or "no recording was found to differ from the others",
         "forces": _forces_reason(seen),
         "start": "least squares on finite differences" if not seen.base.start else "one linear problem",
         "outliers": _outlier_reason(seen),

@@ -85,6 +85,10 @@ class FitConfig:
         Loss of trajectory fitting. "on": Student's t, which outliers cannot pull. "off": least squares. "auto": least
         squares, and Student's t where the first residuals have outliers that noise would not. Single spikes of the
         training data are left out beforehand, unless "off".
+    find_zeros
+        The sensors may read something else in each recording where a coordinate is 0: where such zeros could replace
+        named terms they are found, and kept if free runs over held-out time ask for them
+        (`herglotz.training.sensor_zeros`). It costs a second search for terms.
     supervision
         What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
         where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
@@ -149,6 +153,7 @@ class FitConfig:
     coulomb: bool = False
     sticking: bool | None = None
     robust: str = "auto"
+    find_zeros: bool = False
     supervision: str = "q"
     restarts: int | None = None
     use_inputs: bool = True

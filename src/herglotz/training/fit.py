@@ -120,7 +120,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
     started = time.perf_counter()
     with stages.bar:
         seen = look(data, config, stages, plan)
-        if plan is None and seen.found is not None and seen.found.doubt:
+        if plan is None and seen.found is not None and (seen.found.doubt or (config.find_zeros and seen.found.apart)):
             seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
         task = Task(seen.kept, seen.base, seen.settings, stages)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.named_terms import NamedTerms
+from herglotz.training.named_terms import NamedTerms, places
+from herglotz.training.problems.zeros import WithZeros
+from herglotz.training.pruning import prune
 from herglotz.training.trajectory_fit import TrajectoryFit
 
 COLOURED = 3.0  # standard deviations of white noise's autocorrelation
@@ -45,3 +49,31 @@ class Found:
         together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
         with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
         return float(with_next) > COLOURED / r.numel() ** 0.5
+
+    @property
+    def apart(self) -> bool:
+        """Whether zeros of sensors that differ between recordings stay where terms are left out by the quadratic model.
+
+        Terms go before zeros: they may make up for zeros that they have not been given.
+        """
+        problem, fit = self.fit.problem, self.fit
+        if len(problem.data) == 1:
+            return False
+        target, x = WithZeros(problem), problem.pack(fit.theta, fit.path.x[:, 0, : problem.d])
+        x = torch.cat([x, x.new_zeros(target.count)])
+        cost, A, b = target.normal_equations(x)
+        if not bool(torch.isfinite(cost)):
+            return False
+        at = torch.arange(len(x))
+        zeros, states = at[-target.count :], at[problem.P : -target.count]
+        rest = torch.cat([at[: problem.P], zeros])
+        C = torch.linalg.solve(A[states][:, states], torch.cat([A[states][:, rest], b[states, None]], 1))
+        S, slope = A[rest][:, rest] - A[rest][:, states] @ C[:, :-1], b[rest] - A[rest][:, states] @ C[:, -1]
+        best = x[rest] - torch.linalg.pinv(S, hermitian=True) @ slope
+        terms = torch.tensor(
+            [i for own in places(problem.parameters, self.terms).values() for i in own], dtype=torch.long
+        )
+        last = torch.arange(problem.P, len(rest))
+        S = S * (problem.sigma / self.rms) ** 2
+        kept, _ = prune(S, best, torch.cat([terms, last]), math.log(problem.data.q.numel()), simplest=last)
+        return bool((kept >= problem.P).any())

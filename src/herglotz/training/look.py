@@ -10,6 +10,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.holds import Arrival
 from herglotz.data.roughness import roughness
+from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
 from herglotz.models import ContactLagrangian
@@ -38,6 +39,7 @@ from herglotz.training.trajectory_fit import check_size
 PROBE = 40  # iterations of the short one-step fits: one measures the noise, other fits start from the others
 FINE = 0.1  # rad
 SURE = 1e-6  # of the spread: exact data are left to named terms that miss whole trajectories by less
+MAY_DIFFER = "zeros of their own in the sensors could replace some terms, and --find-zeros looks for them"
 EXPLAINED = 100.0  # a baseline with an error below this multiple of the σ of exact data explains the data
 
 
@@ -68,6 +70,8 @@ class Look:
     outliers: bool  # more than single spikes are suspected
     arrival: Arrival  # what happens to recorded inputs before they act
     why_arrival: dict[str, str]  # the reason of each of its fields
+    zeros: tuple[float, ...]  # (B · n) what the sensors read at 0, recording after recording; empty: 0; `data` has q
+    apart: str  # what keeps recordings from being followed together; empty: nothing that is known
     friction: str  # why friction is set-valued or not
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
@@ -79,9 +83,12 @@ class Look:
 
 
 def look(
-    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None, *, named: bool = True
-) -> Look:
+    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None = None, *, named: bool = True,
+    zeros: tuple[float, ...] = (),
+) -> Look:  # fmt: skip
     """Measure what the choice of a plan, or a given plan, needs; `named`: search for a model of named terms too.
+
+    `zeros` are those of the sensors, where the recordings differ in them (`herglotz.training.sensor_zeros`).
 
     Raises
     ------
@@ -89,7 +96,8 @@ def look(
         If the data cannot be used, or do not suit the settings.
     """
     settings = user_settings.resolved(data)
-    data, arrival, why_arrival = _read(data, settings)
+    zeros = zeros if plan is None else plan.zeros
+    data, arrival, why_arrival = _read(measured(data, zeros), settings)
     train, unseen = _split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -106,9 +114,11 @@ def look(
     if plan is not None and plan.network == "covered":
         terms = replace(terms, motion=_baseline_motion(task))
     probe = _probe(task) if (terms.leaves_objective if plan is None else plan.continues_probe) else None
+    apart = MAY_DIFFER if terms.found is not None and terms.found.apart and not zeros else ""
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, arrival=arrival,
-        why_arrival=why_arrival, friction=why_friction, noise=roughness(kept), settings=terms.settings, base=terms.base,
+        why_arrival=why_arrival, zeros=zeros, apart=apart, friction=why_friction, noise=roughness(kept),
+        settings=terms.settings, base=terms.base,
         structure=terms.structure, found=terms.found, baseline_motion=terms.motion, probe=probe,
     )  # fmt: skip
 

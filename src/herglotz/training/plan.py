@@ -40,6 +40,7 @@ class Plan:
     fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
+    zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
 
     def applied(self, settings: FitConfig) -> FitConfig:
@@ -72,6 +73,7 @@ class Plan:
             "hold": not self.hold,
             "delay": not self.delay,
             "lag": not self.lag,
+            "zeros": not self.zeros,
             "drag": not self.drag,
             "substeps": self.substeps == 1,
             "continues_probe": not self.continues_probe,
@@ -120,6 +122,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "hold": "inputs between samples",
     "delay": "delay of the inputs",
     "lag": "lag of the actuator",
+    "zeros": "what the sensors read at 0, recording after recording",
     "drag": "friction beside the viscous one",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",

@@ -11,6 +11,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.actuator import acting
 from herglotz.data.holds import Arrival
+from herglotz.data.sensors import measured
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
@@ -58,6 +59,7 @@ class Prediction:
     every: int  # stride by which the recording was thinned, so that its steps are not shorter than the model's
     most_substeps: int  # largest number of model steps in a recorded step
     outside: float  # share of model steps that are shorter or longer than those of the training data
+    zeros: tuple[float, ...] = ()  # of the sensors, (n,), that were taken off the recording; empty: 0
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -122,13 +124,15 @@ class Prediction:
             "every": self.every,
             "most_substeps": self.most_substeps,
             "steps_outside_training": self.outside,
+            "zeros": dict(zip(self.data.names, self.zeros, strict=True)) if self.zeros else None,
         }
 
 
 @one_thread()
 def predict(
-    run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None
-) -> Prediction:
+    run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None,
+    same_zeros: bool = False,
+) -> Prediction:  # fmt: skip
     """Score a run on another recording.
 
     The state at sample `warmup` of each trajectory is smoothed from the samples up to it, with the model held. From
@@ -146,6 +150,9 @@ def predict(
     windows, horizon
         Score this many windows, spread evenly over the recording, of K samples and then a free run over the time
         `horizon`, instead of one free run to the end of each trajectory.
+    same_zeros
+        The sensors read what those of the run's reference read. False: where the recordings of the fit differ in it,
+        the zeros of the one whose zeros suit the warm-up best are taken off, the same for all of these trajectories.
 
     Returns
     -------
@@ -173,13 +180,10 @@ def predict(
                 f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
                 f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
             )
-    states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
-    sigma = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
-    for b in range(len(data)):
-        rows = torch.arange(data.offsets[b], data.offsets[b] + warmup)
-        start = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, high)
-        if start is not None:
-            states[rows] = start
+    zeros = [()] if same_zeros else zeros_of(run)
+    ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
+    best = min(range(len(ways)), key=lambda i: ways[i][1])
+    states, data = ways[best][0], measured(data, zeros[best])
     grid = _free_run(run.stepper, data, states, warmup, high)
     inside = torch.arange(grid.longest) < grid.end[:, None]
     h = grid.h[inside]
@@ -187,13 +191,20 @@ def predict(
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
     n = data.dof
     state = State(states[:, :n], states[:, n : 2 * n], states[:, 2 * n])
-    return Prediction(data, state, warmup, every, most, outside)
+    return Prediction(data, state, warmup, every, most, outside, zeros[best])
 
 
 def arrival_of(run: Trained) -> Arrival:
     """What happened to the inputs of the fit before they acted; other recordings that say nothing are alike."""
     plan = run.metrics.get("plan") or {}
     return Arrival(plan.get("hold") or run.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
+
+
+def zeros_of(run: Trained) -> list[tuple[float, ...]]:
+    """The zeros of the sensors in the recordings of the fit, each once, those of the reference first."""
+    zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
+    every = dict.fromkeys(tuple(zeros[i : i + n]) for i in range(0, len(zeros), n))
+    return [(), *(zero for zero in every if any(zero))]
 
 
 def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
@@ -242,8 +253,23 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     return _rows(data, rows, tuple(b - a for a, b in spans))
 
 
-def _smoothed(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> Tensor | None:
-    """States at every sample of a warm-up, (K, 2n+1), the model held; None where the model has no step near it."""
+def _warmed_up(run: Trained, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
+    """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
+    states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
+    sigma, cost = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6, 0.0
+    for b in range(len(data)):
+        rows = torch.arange(data.offsets[b], data.offsets[b] + warmup)
+        start, own = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, run.h_range[1])
+        cost += own
+        if start is not None:
+            states[rows] = start
+    return states, cost
+
+
+def _smoothed(
+    model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float
+) -> tuple[Tensor | None, float]:
+    """States at every sample of a warm-up, (K, 2n+1), the model held, and ½|r|²; None where it has no step near it."""
     problem = SmoothingProblem(
         model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=BELIEVED
     )  # fmt: skip
@@ -251,8 +277,8 @@ def _smoothed(model: ContactLagrangian, data: Trajectories, sigma: float, max_st
     states = StatesOnly(problem, x[: problem.P])
     result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
     if result.reason == "not_finite":
-        return None
-    return problem.states(states.full(result.x))
+        return None, float("inf")
+    return problem.states(states.full(result.x)), result.cost
 
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:

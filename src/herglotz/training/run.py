@@ -226,8 +226,8 @@ class Run:
         data
             Anything that `fit` takes: a path, a DataFrame, arrays, trajectories.
         **settings
-            How to read it (`herglotz.data.as_trajectories`), and `warmup`, `windows`, `horizon`
-            (`herglotz.training.predict`).
+            How to read it (`herglotz.data.as_trajectories`; with `sensor_zeros` no others are taken off), and `warmup`,
+            `windows`, `horizon`, `same_zeros` (`herglotz.training.predict`).
 
         Returns
         -------
@@ -240,6 +240,7 @@ class Run:
             If the recording is not of the same coordinates, units and inputs, or is too short.
         """
         reading, others = split_options(settings)
+        others.setdefault("same_zeros", "sensor_zeros" in reading)
         return predict(self, as_trajectories(data, **reading), **others)
 
     def plot(self, name: str = "trajectory") -> Any:

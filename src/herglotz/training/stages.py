@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from copy import copy
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -95,6 +96,7 @@ class Stages:
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
         self.bar = tqdm(total=1, desc="looking at the data", disable=disable, leave=False, dynamic_ncols=True)
         self.checkpoint, self.key = checkpoint, key
+        self.label = ""
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
         self.kept: dict[str, dict[str, Any]] = {}
@@ -106,8 +108,15 @@ class Stages:
                 )
             self.done, self.kept = stored["stages"], stored["kept"]
 
+    def labelled(self, label: str) -> Stages:
+        """The same record; what is kept and run from here on has names that end with this label."""
+        other = copy(self)
+        other.label = label
+        return other
+
     def keep(self, name: str, make: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
+        name += self.label
         if name not in self.kept:
             self.bar.set_description(name)
             self.kept[name] = make()
@@ -126,6 +135,7 @@ class Stages:
 
         `problem` is what the stage optimises, where later work goes on from what it remembers.
         """
+        name += self.label
         stored = self.done.get(name)
         if stored is not None and stored["done"]:
             kept = {key: stored[key] for key in ("cost", "reason", "iterations", "history", "memory")}

@@ -51,6 +51,7 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled")  # fmt: skip
+TOLD = ("reason", "sigma", "doubt", "apart", "larger")  # of `Structure`, as a checkpoint has it
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
@@ -63,6 +64,7 @@ class Structure(NamedTuple):
     reason: str  # in words and numbers
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     doubt: bool = False  # another model may fit better: held-out free runs decide
+    apart: bool = False  # sensors whose zeros differ between recordings would lower the misfit
     larger: bool = False  # features that the search for terms does not try are needed
 
 
@@ -104,12 +106,12 @@ def kept_structure(
     def search() -> dict[str, Any]:
         found = find()
         start = {name: getattr(found.base, name) for name in numbers}
-        rest = {"reason": found.reason, "sigma": found.sigma, "doubt": found.doubt, "larger": found.larger}
+        rest = {name: getattr(found, name) for name in TOLD}
         return {"config": found.config.to_dict(), "base": start, **rest}
 
     kept = stages.keep(name, search)
     found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
-    return Structure(found, replace(base, **kept["base"]), kept["reason"], kept["sigma"], kept["doubt"], kept["larger"])
+    return Structure(found, replace(base, **kept["base"]), **{name: kept[name] for name in TOLD})
 
 
 def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
@@ -124,7 +126,7 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
-    return Structure(found.config, found.base, words, found.rms, doubt)
+    return Structure(found.config, found.base, words, found.rms, doubt, found.apart)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

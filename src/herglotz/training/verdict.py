@@ -132,7 +132,8 @@ def judged(
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)
     kept_numbers = {k: v if v is not None and math.isfinite(v) else None for k, v in numbers.items()}
-    return {"verdict": in_words(errors, ahead, metrics)} | kept_numbers
+    apart = "" if seen.zeros else seen.apart
+    return {"verdict": in_words(errors, ahead, metrics | {"apart": apart})} | kept_numbers
 
 
 def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -> str:
@@ -151,7 +152,8 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
     error = max(worst, free)
     if error <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"
-    return f"{WORSE} by a factor of {error / errors.limit:.2g}: {errors}"
+    apart = f". {_one_by_one(metrics['apart'])}" if metrics.get("apart") else ""
+    return f"{WORSE} by a factor of {error / errors.limit:.2g}: {errors}{apart}"
 
 
 def _left_open(ahead: Foresight) -> str:
@@ -168,7 +170,14 @@ def _left_open(ahead: Foresight) -> str:
     )
 
 
+def _one_by_one(apart: str) -> str:
+    """What to do about recordings that differ."""
+    return f"The recordings may differ: {apart}. Try each by itself, or --sensor-zeros"
+
+
 def _remedy(metrics: dict[str, Any], training: bool) -> str:
+    if metrics.get("apart"):
+        return f"each recording by itself, or --sensor-zeros, for they may differ: {metrics['apart']}"
     if not training:
         return "a simpler level, or a larger train fraction: the unseen part differs from the training part"
     if metrics["objective"] in ("residual", "raw"):

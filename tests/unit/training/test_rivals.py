@@ -30,8 +30,8 @@ def held(monkeypatch):
     """Plans of both rivals with the errors that a test gives them; the looks that were taken are counted."""
     errors, looks = {}, []
 
-    def look(*_, named):
-        looks.append(named)
+    def look(*_, named, zeros):
+        looks.append((named, zeros))
         return SimpleNamespace(name="networks")
 
     def held_out(seen, config, plan, every=1):  # noqa: ARG001
@@ -41,7 +41,8 @@ def held(monkeypatch):
     monkeypatch.setattr(rivals, "choose", lambda seen, _: plan("potential" if seen.name == "networks" else "none"))
     monkeypatch.setattr(rivals, "_held_out", held_out)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=NOISE, seed=0)
-    seen = SimpleNamespace(name="named", kept=data, train=data)
+    found = SimpleNamespace(doubt=True, apart=False)
+    seen = SimpleNamespace(name="named", kept=data, train=data, found=found, zeros=(), apart="")
 
     def winner(named, networks):
         errors.update({"none": named, "potential": networks})

@@ -66,6 +66,7 @@ class ShootingProblem(StatesProblem):
         self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
+        self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
 
     def memory(self) -> dict[str, Any]:
         """The last path and where it was solved: the next solve starts there, and its last bits depend on it."""
@@ -225,7 +226,30 @@ class ShootingProblem(StatesProblem):
         return self._missed(path.x) / self.data.balance
 
     def _missed(self, x: Tensor) -> Tensor:
-        return x[..., : self.n].flatten(0, 1)[self.grid.node] - self.data.q[self.grid.sample]
+        return x[..., : self.n].flatten(0, 1)[self.grid.node] - (self.data.q - self.zeros)[self.grid.sample]
+
+    def by_zeros(self, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
+
+        `which` zero, from 0, each sample has, (N,); −1: none. Columns (unknowns, Z, n), diagonal and gradient (Z, n).
+        """
+        assert self.path is not None
+        assert self._slopes is not None
+        count, which = int(which.max()) + 1, which[self.grid.sample]
+        fit, _ = self._residuals(self.path.x)
+        by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
+        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N', n, P + d)
+        segment = self.grid.node // (self.grid.h.shape[1] + 1)
+        columns = rows.new_zeros(self.P + self.grid.segments * self.d, count, self.n)
+        for k in range(self.grid.segments):
+            own = segment == k
+            z = int(which[own][0])
+            if z >= 0:
+                columns[self._columns(k, self.P), z] += rows[own].sum(0).T
+        kept = which >= 0
+        zero = rows.new_zeros(count, self.n)
+        diagonal = zero.index_add(0, which[kept], by[kept].square())
+        return columns, diagonal, zero.index_add(0, which[kept], (by * self.root_weights(fit) * fit)[kept])
 
     def joint_residuals(self, path: Path) -> Tensor:
         """End of each segment less the start of the next, (S, d), over the joint's weight."""

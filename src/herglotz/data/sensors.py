@@ -1,0 +1,54 @@
+"""What sensors read: of each coordinate y = zero + q / scale, so that q = scale · (y − zero)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+from torch import Tensor
+
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import InputError, refuse
+
+
+def measured(data: Trajectories, zeros: Sequence[float] = (), scales: Sequence[float] = ()) -> Trajectories:
+    """The positions q = scale · (y − zero) of readings y; momenta and the action stay as they are recorded.
+
+    Parameters
+    ----------
+    data
+        Readings, in the units of their columns.
+    zeros
+        What each sensor reads where its coordinate is 0, in degrees where the table has degrees: n numbers or, of B
+        recordings that differ, B · n numbers, recording after recording; empty: 0.
+    scales
+        What one unit of each reading is worth, n numbers (or B · n); empty: 1.
+
+    Raises
+    ------
+    InputError
+        If there is another number of them, one is not finite, or a scale is 0.
+    """
+    if not len(zeros) and not len(scales):
+        return data
+    zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", zeros), ("scales", scales)))
+    none = f"{data.source or 'data'}: a scale of 0 leaves no motion; give what one unit of the reading is worth"
+    refuse({none: 0.0 in [float(x) for x in scales]})
+    turned = [name in data.degrees and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
+    q = data.q - zero * zero.new_tensor([math.pi / 180 if x else 1.0 for x in turned]) if len(zeros) else data.q
+    return replace(data, q=scale * q if len(scales) else q)
+
+
+def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> Tensor:
+    """(N, n) or (n,) from n numbers, or n for each recording."""
+    n, count = data.dof, len(data)
+    x = data.q.new_tensor([float(number) for number in numbers])
+    where = f"{data.source or 'data'}: sensor {what}"
+    if len(x) not in (0, n, count * n):
+        every = f", or {count} · {n} for its {count} recordings one after the other" if count > 1 else ""
+        raise InputError(f"{where}: {n} numbers are due, one for each of {', '.join(data.names)}{every}; got {len(x)}")
+    bad = next((number for number in numbers if not math.isfinite(number)), None)
+    if bad is not None:
+        raise InputError(f"{where} must be finite numbers, got {bad}")
+    return x if len(x) in (0, n) else x.reshape(count, n)[data.trajectory]

@@ -1,0 +1,60 @@
+"""Zeros of sensors as unknowns of a fit: y = q + z, with z = 0 in the reference, the recording of most samples."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.solvers.levenberg_marquardt import memory_of, remind
+
+
+def reference_of(data: Trajectories) -> int:
+    """The recording of most samples, the first of several."""
+    return max(range(len(data)), key=lambda b: data.lengths[b])
+
+
+class WithZeros:
+    """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
+
+    Each recording but the reference has zeros of its own.
+    """
+
+    def __init__(self, problem: ShootingProblem):
+        data, reference = problem.data, reference_of(problem.data)
+        own = torch.arange(len(data), device=data.t.device)
+        which = torch.where(own < reference, own, own - 1).where(own != reference, -1)
+        self.problem, self.which = problem, which[data.trajectory]
+        self.count = (len(data) - 1) * problem.n
+
+    def memory(self) -> dict[str, Any]:
+        """Of the problem."""
+        return memory_of(self.problem)
+
+    def recall(self, memory: dict[str, Any]) -> None:
+        """Inverse of `memory`."""
+        remind(self.problem, memory)
+
+    def cost(self, x: Tensor) -> Tensor:
+        """½|r|² with q + z − y as the residuals of the data."""
+        return self.problem.cost(self._set(x))
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(cost, JᵀJ, Jᵀr) of all unknowns."""
+        cost, A, b = self.problem.normal_equations(self._set(x))
+        if not bool(torch.isfinite(cost)):
+            return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
+        columns, diagonal, slope = self.problem.by_zeros(self.which)
+        C = columns.flatten(1)
+        return cost, torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)]), torch.cat(
+            [b, slope.flatten()]
+        )  # fmt: skip
+
+    def _set(self, x: Tensor) -> Tensor:
+        """The problem's own unknowns, its zeros being those of x."""
+        z = torch.cat([x[-self.count :].reshape(-1, self.problem.n), x.new_zeros(1, self.problem.n)])
+        self.problem.zeros = z[self.which]
+        return x[: -self.count]

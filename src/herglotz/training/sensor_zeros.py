@@ -1,0 +1,229 @@
+"""Sensors whose zeros differ from recording to recording: y = q + z, with z = 0 in the recording of most samples.
+
+A model cannot follow such recordings together, though each of them alone: friction makes up for some of the difference,
+and nothing then asks for the zeros any more. Three steps avoid that:
+
+1. The reference is fitted alone: with terms of its own, for those of all recordings hide the difference, and where they
+   miss more than the noise, with those of all recordings.
+2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
+3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations.
+
+Whether the recordings are used as they are or with these zeros, free runs over held-out time decide (`rivals`).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from itertools import product
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.roughness import precision
+from herglotz.data.sensors import measured
+from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.units import common_unit, size
+from herglotz.models import ContactLagrangian
+from herglotz.training.config import FitConfig
+from herglotz.training.cross_validation import MARGIN
+from herglotz.training.first_states import first_states, states_of_pairs
+from herglotz.training.look import Look, look
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.one_step import ResidualProblem
+from herglotz.training.problems.prior import prior_of
+from herglotz.training.problems.robust import FREEDOM
+from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.problems.zeros import WithZeros, reference_of
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task, build_model
+from herglotz.training.trajectory_fit import FIRST_SEGMENT, FLOOR, STAGE, SegmentStages, TrajectoryFit
+
+AT_THE_NOISE = 1.5  # times the precision: no better model is needed, as in the verdict
+ALONE = 0.8  # times the misfit together: a recording that misses no more where it is fitted alone differs from others
+ROUND = 12  # zeros of an angle that are tried, all around
+SPREADS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)  # zeros of a length that are tried, in its spreads
+AS_GOOD = 1.01  # times the least mean square: no force may depend on a coordinate, and its zero is not determined
+NUDGE = 1e-3  # of the spread: differences for the derivatives by the zeros
+FLAT = 1e-3  # of the largest singular value: directions of the zeros that no force depends on
+ROUNDS = 10  # of Gauss–Newton
+CLEARLY = 5.0  # standard deviations by which a zero differs from 0
+SETTLED = 0.1  # of the misfit: zeros that move by less have no say in the terms
+
+
+@dataclass(frozen=True)
+class Apart:
+    """Recordings that named terms do not follow together, or only with terms that zeros of the sensors replace."""
+
+    reference: int  # the recording whose zeros are 0
+    together: float  # misfit of the reference by the fit to all recordings, in units of q
+    alone: float  # by the fit of the same terms to itself
+    zeros: tuple[float, ...] = ()  # (B · n) recording after recording; empty where they do not explain the difference
+    deviations: tuple[float, ...] = ()  # (B · n), standard deviations
+    unit: str = ""  # of all coordinates, where they have one
+
+    def of(self, found: FoundZeros) -> Apart:
+        """With these zeros."""
+        z, deviations = (tuple(x.flatten().tolist()) for x in (found.z, found.deviations))
+        return replace(self, zeros=z, deviations=deviations)
+
+    @property
+    def differs(self) -> str:
+        """What is wrong, in words; empty where the reference is followed with the others about as well as alone."""
+        if self.alone > ALONE * self.together:
+            return ""
+        own, others = (size(x, self.unit, digits=2) for x in (self.alone, self.together))
+        return f"recording {self.reference} is missed by {own} fitted alone, by {others} with the others"
+
+    def __str__(self) -> str:
+        sure = (f"{z:.4g} ± {d:.2g}" for z, d in zip(self.zeros, self.deviations, strict=True) if d)
+        words = f"zeros that differ from those of recording {self.reference}: {', '.join(sure)}"
+        return "; ".join(filter(None, (self.differs, words)))
+
+
+def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | None:
+    """What keeps recordings from being followed together; None where nothing does, or there is one alone.
+
+    Parameters
+    ----------
+    data, config
+        All recordings, and the user's settings.
+    seen
+        The look at them, with the named terms that follow them best.
+    """
+    if len(data) == 1 or seen.found is None or seen.found.sigma is None:
+        return None
+    of = ZerosOf(seen)
+    together, alone = of.fit(seen.kept), of.fit(seen.kept[of.reference])
+    if together is None or alone is None:
+        return None
+    own = seen.kept.trajectory[together.problem.grid.sample] == of.reference
+    before = _rms(together.problem.misfit(together.path)[own])
+    apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
+    first, tried = look(data[of.reference], config, Stages(False, None, "", resume=False)), []
+    if first.found is not None and first.found.sigma is not None:
+        tried.append(ZerosOf(replace(first, kept=seen.kept)).zeros(build_model(first.base, first.settings, "none")))
+    if not tried or tried[0].rms > AT_THE_NOISE * precision(seen.kept):
+        alone.problem.parameters.set(alone.theta)
+        tried.append(of.zeros(alone.problem.parameters.model))
+    found = next(one for one in tried if one.rms <= MARGIN * min(other.rms for other in tried))
+    if found.z.any() and found.rms <= MARGIN * together.noise:
+        return apart.of(found)
+    return apart if apart.differs else None
+
+
+def refined(apart: Apart, seen: Look) -> Apart | None:
+    """The zeros by the terms of a look at the recordings without the last ones; None where they are about the same."""
+    if seen.found is None or seen.found.sigma is None:
+        return None
+    of, start = ZerosOf(seen), seen.kept.q.new_zeros(len(seen.kept), seen.kept.dof)
+    found = of.moved(build_model(seen.base, seen.settings, "none"), start)
+    if float((found.z / seen.kept.balance).abs().max()) < SETTLED * of.sigma:
+        return None
+    z = found.z + found.z.new_tensor(apart.zeros).reshape(found.z.shape)
+    return apart.of(clearly(found._replace(z=z)))
+
+
+class FoundZeros(NamedTuple):
+    """Zeros of the sensors, their standard deviations, and the misfit with them."""
+
+    z: Tensor  # (B, n)
+    deviations: Tensor  # (B, n)
+    rms: float
+
+
+def clearly(found: FoundZeros) -> FoundZeros:
+    """With 0 for the zeros that are not clearly there."""
+    return found._replace(z=torch.where(found.z.abs() > CLEARLY * found.deviations, found.z, 0.0))
+
+
+class ZerosOf:
+    """The zeros of the recordings that a look at them kept, by the named terms that it found."""
+
+    def __init__(self, seen: Look):
+        assert seen.found is not None
+        assert seen.found.sigma is not None
+        self.data, self.freedom = seen.kept, FREEDOM if seen.outliers else None
+        self.task = Task(seen.kept, seen.base, seen.settings, Stages(False, None, "", resume=False))
+        self.sigma = max(seen.found.sigma, FLOOR * self.task.size)
+        self.reference = reference_of(self.data)
+
+    def fit(self, data: Trajectories) -> TrajectoryFit | None:
+        """The shortest segments of these recordings; None where the model cannot follow them."""
+        task = replace(self.task, data=data, stages=Stages(False, None, "", resume=False))
+        stages = SegmentStages(task, build_model(task.base, task.config, "none"))
+        return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=_smooth(data))
+
+    def zeros(self, model: ContactLagrangian) -> FoundZeros:
+        """By a model that follows the reference alone."""
+        z = self.data.q.new_zeros(len(self.data), self.data.dof)
+        for b, one in enumerate(self.data):
+            if b != self.reference:
+                z[b] = _by_steps(model, one, self.task.base.max_step)
+        return clearly(self.moved(model, z))
+
+    def moved(self, model: ContactLagrangian, start: Tensor) -> FoundZeros:
+        """By multiple shooting over all recordings, from these zeros (B, n) and the parameters of the model.
+
+        The misfit is infinite where the model cannot follow them.
+        """
+        data, n, count = measured(self.data, start.flatten().tolist()), self.data.dof, len(self.data) - 1
+        rows, base = [b for b in range(len(data)) if b != self.reference], self.task.base
+        problem = ShootingProblem(
+            model, data, segment_grid(data, FIRST_SEGMENT, base.model_step), sigma=self.sigma,
+            prior=prior_of(model, base, None), freedom=self.freedom,
+        )  # fmt: skip
+        theta, smooth = problem.parameters.get(), _smooth(data)
+        problem.guess_from_states(states_of_pairs(model, smooth))
+        x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
+        target = WithZeros(problem)
+        result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
+        if not math.isfinite(result.cost):
+            return FoundZeros(start, torch.zeros_like(start), math.inf)
+        _, A, _ = target.normal_equations(result.x)
+        assert problem.path is not None
+        rms = _rms(problem.misfit(problem.path))
+        variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-count * n :] * (rms / self.sigma) ** 2
+        z, deviations = start.clone(), torch.zeros_like(start)
+        z[rows] += result.x[-count * n :].reshape(count, n)
+        deviations[rows] = variance.clamp_min(0).sqrt().reshape(count, n)
+        return FoundZeros(z, deviations, rms)
+
+
+def _rms(x: Tensor) -> float:
+    return float(x.square().mean().sqrt())
+
+
+def _smooth(data: Trajectories) -> Trajectories:
+    local = local_polynomials(data)
+    return data if local is None else smoothed(data, local)
+
+
+def _by_steps(model: ContactLagrangian, data: Trajectories, max_step: float) -> Tensor:
+    """The zeros (n,) of one recording with which the model misses its steps least, the nearest to 0 of good ones."""
+    smooth = _smooth(data)
+
+    def errors(z: Tensor) -> Tensor:
+        problem = ResidualProblem(model, replace(smooth, q=smooth.q - z), max_step=max_step)
+        return problem.residuals(problem.start()).flatten()
+
+    spread = smooth.q.std(0).tolist()
+    axes = [
+        [2 * math.pi * k / ROUND for k in range(-ROUND // 2, ROUND // 2)] if angle else [x * size for x in SPREADS]
+        for angle, size in zip(data.angles, spread, strict=True)
+    ]
+    points = sorted((data.q.new_tensor(point) for point in product(*axes)), key=lambda z: float(z.norm()))
+    costs = torch.stack([errors(z).square().mean() for z in points])
+    z = points[int((costs <= AS_GOOD * costs.min()).nonzero()[0])]
+    best, small = errors(z), NUDGE * smooth.q.std(0)
+    for _ in range(ROUNDS):
+        J = torch.stack([(errors(z + dz) - errors(z - dz)) / (2 * dz.sum()) for dz in small.diag()], -1)
+        new = z - torch.linalg.pinv(J, rtol=FLAT) @ best
+        r = errors(new)
+        if not _rms(r) < _rms(best):
+            break
+        z, best = new, r
+    return z
