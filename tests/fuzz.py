@@ -140,8 +140,8 @@ def fuzz(
     for kind in kinds(folder, only, exports):
         content, make, count = kind.path.read_bytes(), random.Random(f"{seed} {kind.name}"), Count()
         end = time.monotonic() + seconds
+        kind.open(kind.path)  # the good file loads; of a header, outside `watched`, which refuses to compile
         with watched(count), open(os.devnull, "w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-            kind.open(kind.path)  # the good file loads
             while count.tried < least or time.monotonic() < end:
                 try_one(kind, content, make, count)
         kind.path.write_bytes(content)

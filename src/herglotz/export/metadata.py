@@ -171,11 +171,11 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
     good = {
         "dof": n >= 1,
         "h": 0 < entries["h"] < float("inf"),
-        "inputs": entries["inputs"] >= 0,
+        "inputs": 0 <= entries["inputs"] < 2**31,  # what an int of C holds
         "angles": len(entries["angles"]) == n,
         "units": len(entries["units"]) in (0, n),
-        "names": len(entries.get("names") or range(n)) == n,
-        "input_zero": len(entries.get("input_zero") or range(entries["inputs"])) == entries["inputs"],
+        "names": len(entries.get("names") or ()) in (0, n),
+        "input_zero": len(entries.get("input_zero") or ()) in (0, entries["inputs"]),
         "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
         "start": start is None or (set(start) >= {"q", "p", "s"} and len(start["q"]) == len(start["p"]) == n),
     }

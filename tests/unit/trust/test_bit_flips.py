@@ -152,6 +152,7 @@ def test_metadata_of_a_wrong_type(model):
     wrong: list[tuple[str, object]] = [
         ("dof", 1.5), ("dof", 0), ("dtype", "float16"), ("angles", [1]), ("h", "0.1"), ("box", {"q_low": [0.0]}),
         ("units", ["rad", "m"]), ("start", []), ("h_range", [2.0, 1.0]), ("inputs", True),
+        ("dof", 2**70), ("inputs", 2**70),
     ]  # fmt: skip
     for name, value in wrong:
         with pytest.raises(InputError, match=name):
