@@ -161,12 +161,12 @@ class ModelConfig:
         products = {text: parse(text, self.angles) for text in expand((*self.features, *self.known), self.angles)}
         for text, feature in products.items():
             constant = not any(p.power or any(p.form) or p.velocities for p in feature)
-            if constant and self.level not in ("affine", "full"):
-                raise InputError(
-                    f"feature '{text}': a constant moves nothing at the level '{self.level}'; leave it out"
-                )
-            if self.order == 4 and max(len(p.velocities) for p in feature) > 2:
-                raise InputError(f"feature '{text}': order 4 takes at most two velocities a product; set order=2")
+            refuse({
+                f"feature '{text}': a constant moves nothing at the level '{self.level}'; leave it out":
+                    constant and self.level not in ("affine", "full"),
+                f"feature '{text}': order 4 takes at most two velocities a product; set order=2":
+                    self.order == 4 and max(len(p.velocities) for p in feature) > 2,
+            })  # fmt: skip
         alone = "alike" if self.alike else "translations" if self.translations else ""
         if self.order == 4 and alone and all(feature[0].velocities for feature in products.values()):
             raise InputError(f"order 4 with {alone} needs features of the position; name some, or set order=2")

@@ -56,22 +56,28 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
     """The terms that these coordinates are tried with: with translations those of L that do not see them."""
     if translations:
         return _unmoved(data, directions(translations, data.angles))
-    angles, n = data.angles, data.dof
-    if n == 1:
+    angles = data.angles
+    if len(angles) == 1:
         waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
         powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
         features = [*own_terms(angles), *(waves if angles[0] else powers)]
+    elif any(angles):
+        still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
+        features = [*revolute(angles), *still]
     else:
-        features = revolute(angles) if any(angles) else [x for x in lengths(angles) if not x.startswith("r^")]
-        if any(angles):
-            features += [f"q{i + 1}^{k}" for k in (3, 4) for i, angle in enumerate(angles) if not angle]
+        features = [x for x in lengths(angles) if not x.startswith("r^")]
+    return NamedTerms(tuple(features), tuple(_frictions(data)), True)
+
+
+def _frictions(data: Trajectories) -> list[str]:
+    """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
     drag = []
-    for i, angle in enumerate(angles, 1):
+    for i, angle in enumerate(data.angles, 1):
         drag += [f"|v{i}| v{i}", f"load {i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
-    if not any(angles):  # friction between joints is part of their model
-        drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(n), 2)]
-        drag += [AIR] if n > 1 and len(set(data.units)) == 1 else []
-    return NamedTerms(tuple(features), tuple(drag), True)
+    if not any(data.angles):
+        drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(data.dof), 2)]
+        drag += [AIR] if data.dof > 1 and len(set(data.units)) == 1 else []
+    return drag
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:

@@ -96,7 +96,7 @@ def test_a_planted_zero_is_found_with_its_deviation(planted):
     found = sensor_zeros(pendulums(planted), FitConfig(), seen(planted))
     assert found is not None
     assert found.zeros[0] == 0.0  # the reference
-    # five seeds: 0.0 to 1.6 standard deviations; fails if terms make up for a part of it
+    # fails if terms make up for a part of it; chance exceeds four standard deviations once in 16 000
     assert abs(found.zeros[1] - planted) < 4 * found.deviations[1]
     assert found.deviations[1] < 0.5 * NOISE
 

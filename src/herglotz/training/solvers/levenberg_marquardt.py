@@ -94,6 +94,17 @@ class _Search:
         """Why the search is over; None while it is not."""
         return "converged" if self.quiet >= patience else "no_descent" if self.damping > 1e12 else None
 
+    def ends(self, predicted: float, enough: float) -> bool:
+        """Whether an all but undamped step is to lower the cost by next to nothing beside what is `enough`."""
+        return self.damping <= FREE and 0 <= predicted < LEFT * enough
+
+    @classmethod
+    def gone_on(cls, x: Tensor, cost: float, scale: Tensor, damping: float, resumed: Any) -> _Search:
+        """The search at its start x, or where it was interrupted."""
+        if resumed is None:
+            return cls(x, cost, damping, scale.clone(), [cost])
+        return cls(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
+
 
 def levenberg_marquardt(
     problem: SumOfSquares,
@@ -142,9 +153,7 @@ def levenberg_marquardt(
     cost, A, b = _of_first(problem.normal_equations(x))
     if not bool(torch.isfinite(cost)):
         return OptimiserResult(x, float(cost), "not_finite", 0)
-    at = _Search(x, float(cost), damping, A.diagonal().clone(), [float(cost)])
-    if resumed is not None:
-        at = _Search(**{**resumed["search"], "x": x, "scale": resumed["search"]["scale"].to(x)})
+    at = _Search.gone_on(x, float(cost), A.diagonal(), damping, resumed)
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
@@ -152,7 +161,7 @@ def levenberg_marquardt(
         new, predicted = math.inf, 0.0
         if step is not None:
             predicted = float(-(b @ step) - 0.5 * step @ (A @ step))
-            if at.damping <= FREE and 0 <= predicted < LEFT * max(rtol * at.best, atol):
+            if at.ends(predicted, max(rtol * at.best, atol)):
                 at.quiet = patience
                 break
             new = float(of_first(problem.cost(at.x + step))[0])
