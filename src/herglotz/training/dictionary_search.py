@@ -85,8 +85,7 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
-        lacks = found.coloured and found.rms > self.floor
-        self.all = offered(self.data, self.all, found.terms, lacks=lacks)
+        self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:

@@ -173,7 +173,7 @@ def _with_absent_terms(
     """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
     plain = not any(name.startswith(NETWORKS) for name in parameters.names) and c.objective == "trajectory"
-    told = c.known or c.terms or c.input_map or (c.translations and not c.features)
+    told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
     if not plain or c.level not in ("linear", "forced") or told or data.dof > MOST:
         return model, task.base, {}
     every, own = candidates(data, c.translations), NamedTerms(c.features, c.drag, c.coulomb)

@@ -114,12 +114,11 @@ def look(
     if plan is not None and plan.network == "covered":
         terms = replace(terms, motion=_baseline_motion(task))
     probe = _probe(task) if (terms.leaves_objective if plan is None else plan.continues_probe) else None
-    apart = MAY_DIFFER if terms.found is not None and terms.found.apart and not zeros else ""
     return Look(
         data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, arrival=arrival,
-        why_arrival=why_arrival, zeros=zeros, apart=apart, friction=why_friction, noise=roughness(kept),
-        settings=terms.settings, base=terms.base,
-        structure=terms.structure, found=terms.found, baseline_motion=terms.motion, probe=probe,
+        why_arrival=why_arrival, zeros=zeros, apart="" if zeros else terms.apart, friction=why_friction,
+        noise=roughness(kept), settings=terms.settings, base=terms.base, structure=terms.structure,
+        found=terms.found, baseline_motion=terms.motion, probe=probe,
     )  # fmt: skip
 
 
@@ -132,6 +131,11 @@ class _Terms:
     structure: str | None = None
     found: Structure | None = None
     motion: tuple[Triples, float] | None = None
+
+    @property
+    def apart(self) -> str:
+        """What keeps recordings from being followed together, as far as the search for terms shows it."""
+        return MAY_DIFFER if self.found is not None and self.found.apart else ""
 
     @property
     def leaves_objective(self) -> bool:

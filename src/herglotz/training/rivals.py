@@ -125,7 +125,7 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
     task = Task(inside.kept, inside.base, inside.settings, silent, hurried=True)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)
     found: dict[str, Any] = {"rms": free_run_rms(task, inside, fitted), "sigma": fitted.sigma}
-    if len(seen.data) > 1 and plan.network == "none" and inside.unseen is not None:
+    if config.find_zeros and plan.network == "none" and inside.unseen is not None:
         error = unseen_window_errors(task, fitted, inside.unseen) / inside.train.balance
         found["windows"] = float(error.square().mean().sqrt())
     if fitted.notes.get("departure") is not None:

@@ -103,13 +103,8 @@ def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | N
     own = seen.kept.trajectory[together.problem.grid.sample] == of.reference
     before = _rms(together.problem.misfit(together.path)[own])
     apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
-    first, tried = look(data[of.reference], config, Stages(False, None, "", resume=False)), []
-    if first.found is not None and first.found.sigma is not None:
-        tried.append(ZerosOf(replace(first, kept=seen.kept)).zeros(build_model(first.base, first.settings, "none")))
-    if not tried or tried[0].rms > AT_THE_NOISE * precision(seen.kept):
-        alone.problem.parameters.set(alone.theta)
-        tried.append(of.zeros(alone.problem.parameters.model))
-    found = next(one for one in tried if one.rms <= MARGIN * min(other.rms for other in tried))
+    first = look(data[of.reference], config, Stages(False, None, "", resume=False))
+    found = of.best(first, alone)
     if found.z.any() and found.rms <= MARGIN * together.noise:
         return apart.of(found)
     return apart if apart.differs else None
@@ -156,6 +151,17 @@ class ZerosOf:
         task = replace(self.task, data=data, stages=Stages(False, None, "", resume=False))
         stages = SegmentStages(task, build_model(task.base, task.config, "none"))
         return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=_smooth(data))
+
+    def best(self, first: Look, alone: TrajectoryFit) -> FoundZeros:
+        """By the terms of the reference alone, at a look at it, or by those of all recordings, fitted to it alone."""
+        tried = []
+        if first.found is not None and first.found.sigma is not None:
+            own = build_model(first.base, first.settings, "none")
+            tried.append(ZerosOf(replace(first, kept=self.data)).zeros(own))
+        if not tried or tried[0].rms > AT_THE_NOISE * precision(self.data):
+            alone.problem.parameters.set(alone.theta)
+            tried.append(self.zeros(alone.problem.parameters.model))
+        return next(one for one in tried if one.rms <= MARGIN * min(other.rms for other in tried))
 
     def zeros(self, model: ContactLagrangian) -> FoundZeros:
         """By a model that follows the reference alone."""
