@@ -204,16 +204,19 @@ def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
 
 
 def _check_alone(L_d: Any, L: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> None:
-    """Refuse an L_d whose first sample alone is another number: (q1 − q0) / h pairs samples where h has a batch."""
+    """Refuse an L_d whose first sample hangs on the steps of others: (q1 − q0) / h pairs samples of a batch of h."""
     if L.numel() < 2:
         return
-    first = (slice(0, 1),) * L.ndim
-    alone = L_d(*(x.detach()[first] for x in (q0, q1, s0, h.expand(L.shape))))
-    one, other = float(L.detach()[first]), float(alone)
+    first = (0,) * L.ndim
+    steps = 2 * h.detach().expand(L.shape).clone()
+    steps[first] /= 2
+    with torch.no_grad():
+        other = float(L_d(q0.detach(), q1.detach(), s0.detach(), steps)[first])
+    one = float(L.detach()[first])
     if abs(one - other) > torch.finfo(L.dtype).eps ** 0.5 * (abs(one) + abs(other)):
         raise InputError(
-            f"{_name(L_d)} mixes samples: the first one alone gives {other:g}, in the batch {one:g}; "
-            "write h[..., None] beside positions, as in (q1 - q0) / h[..., None]"
+            f"{_name(L_d)} mixes samples: other steps of the other samples change the first one from {one:g} to "
+            f"{other:g}; write h[..., None] beside positions, as in (q1 - q0) / h[..., None]"
         )
 
 

@@ -53,6 +53,7 @@ LIKELIER = 1.0  # log-likelihood that halved steps have to bring
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
+FINE = 0.1  # of the misfit that is rounding: steps of exact data that change the motion by less do not show in it
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -318,7 +319,7 @@ class DictionarySearch:
         while self._too_long(found):
             other = self._refit(found, found.terms, 2 * found.config.substeps)
             count = self.data.q.numel()  # likelihoods of as many parameters compare as they are
-            if other is None or not count * math.log(found.rms / max(other.rms, self.floor)) > LIKELIER:
+            if other is None or not count * math.log(found.rms / max(other.rms, FINE * self.floor)) > LIKELIER:
                 self.in_vain = found.config.substeps, found.rms
                 break  # other values of the parameters make up for the longer steps
             found = self._longer(other)
@@ -327,11 +328,11 @@ class DictionarySearch:
     def _too_long(self, found: Found) -> bool:
         """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
         m = found.config.substeps
-        if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= self.floor:
+        if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= FINE * self.floor:
             return False
         if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
             return False
-        return self._change(found, 2 * m) > max(FINER * found.rms, self.floor)
+        return self._change(found, 2 * m) > max(FINER * found.rms, FINE * self.floor)
 
     def _change(self, found: Found, substeps: int) -> float:
         """RMS change of the fitted motion by so many model steps in a recorded one."""

@@ -67,7 +67,9 @@ class Found:
         at = torch.arange(len(x))
         zeros, states = at[-target.count :], at[problem.P : -target.count]
         rest = torch.cat([at[: problem.P], zeros])
-        C = torch.linalg.solve(A[states][:, states], torch.cat([A[states][:, rest], b[states, None]], 1))
+        C, singular = torch.linalg.solve_ex(A[states][:, states], torch.cat([A[states][:, rest], b[states, None]], 1))
+        if int(singular):  # a joint that dry friction holds does not tell its speed
+            return False
         S, slope = A[rest][:, rest] - A[rest][:, states] @ C[:, :-1], b[rest] - A[rest][:, states] @ C[:, -1]
         best = x[rest] - torch.linalg.pinv(S, hermitian=True) @ slope
         terms = torch.tensor(

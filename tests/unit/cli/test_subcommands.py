@@ -237,7 +237,7 @@ def test_verify_fails_with_1(monkeypatch, capsys):  # fails if a failed check st
     class Failed:
         passed = False
 
-        def table(self) -> str:
+        def table(self, _verdict: str = "") -> str:
             return "NOT verified"
 
     import herglotz.verify

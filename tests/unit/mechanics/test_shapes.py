@@ -59,7 +59,7 @@ def test_a_step_that_is_not_broadcast_is_refused():
         return h * (0.5 * (v * v).sum(-1) - 0.02 * s0)
 
     q, h = torch.linspace(0, 1, 8).double()[:, None], torch.full((8,), 0.1).double()
-    message = r"hasty mixes samples: the first one alone gives .* write h\[\.\.\., None\]"
+    message = r"hasty mixes samples: .* write h\[\.\.\., None\]"
     with pytest.raises(InputError, match=message):
         Stepper(hasty).step(State(q, q + 0.3, q[:, 0]), h)
     with pytest.raises(InputError, match=message):

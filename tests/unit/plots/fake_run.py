@@ -12,7 +12,7 @@ from herglotz.training.run import box_of
 TERMS = "cos(q1) explains the data to 0.01"
 PLAN = Plan(
     "linear", "trajectory", "none", 2, ("cos(q1)",), "", 0.0, 0.0, (), 1, {"alike": True}, {}, False, False, 0.01,
-    True, 1, (2e-4, 6e-4, 2e-3, 6e-3),
+    True, 1, (2e-4, 6e-4, 2e-3, 6e-3), (),
     {"level": TERMS, "objective": "the data are noisy", "features": TERMS, "outliers": ""},
 )  # fmt: skip
 
