@@ -15,7 +15,7 @@ MUTANTS = [
     ("mechanics/tangent.py", "p1_q0 + P.force.plus_1", "p1_q0 - P.force.plus_1"),
     ("mechanics/tangent.py", "zero[..., 0], P.c[..., None]], -1)", "zero[..., 0], P.D3[..., None]], -1)"),
     ("mechanics/contact.py", "torch.cat([-p, torch.zeros_like(p)", "torch.cat([p, torch.zeros_like(p)"),
-    ("mechanics/partials.py", "D12=torch.stack([r[1] for r in rows0], -2)", "D12=torch.stack([r[1] for r in rows0], -1)"),
+    ("mechanics/partials.py", "D12=by_q1[..., :n, :]", "D12=by_q1[..., :n, :].mT"),
     ("theory/hamiltonian.py", "return (p1 * q1).sum(-1) - L", "return (p1 * q1).sum(-1) + L"),
     ("theory/hamiltonian.py", "return -(p0 * q0).sum(-1) - L", "return (p0 * q0).sum(-1) - L"),
     ("theory/hamiltonian.py", "D11=B @ P.D12.mT - P.D11", "D11=B @ P.D12.mT + P.D11"),
