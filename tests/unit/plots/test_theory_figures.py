@@ -1,5 +1,6 @@
 """The figures of S^k for anything that has an L_d, and the paper's two figures from the package."""
 
+import numpy as np
 import pytest
 import torch
 from fake_run import fake_run
@@ -8,6 +9,11 @@ from herglotz.cli import main
 from herglotz.errors import InputError
 from herglotz.plots import IDENTITIES, save_theory_figures
 from herglotz.plots.fan import point_fan, spread_fan
+from herglotz.plots.hamilton_jacobi import (
+    STEPS,
+    plot_hamilton_jacobi_residual,
+    plot_momentum_vs_generating_function,
+)
 from herglotz.scenes import scene
 
 
@@ -62,3 +68,50 @@ def test_both_fans_of_a_run_take_the_step_that_is_asked_for():
     run = fake_run(steps=12)
     for fan in (spread_fan, point_fan):
         assert (fan(run, 5).h, fan(run, 5, 0.05).h) == (run.h, 0.05)
+
+
+def test_the_momentum_is_drawn_against_the_actions_derivative():
+    # fails if the line y = x misses the points, a number is another one's, or the title says less than what is drawn
+    left, right = plot_momentum_vs_generating_function(pendulum, h=0.1).axes
+    diagonal, points = left.lines
+    p, dS = points.get_data()
+    assert len(p) == 32 * STEPS
+    assert list(diagonal.get_xdata()) == list(diagonal.get_ydata()) == [min(p.min(), dS.min()), max(p.max(), dS.max())]
+    largest = np.abs(p - dS).max()
+    assert largest < 1e-12  # rounding: 1e-14 measured
+    assert p.max() - p.min() > 0.5
+    drawn = right.lines[:STEPS]
+    assert [set(line.get_xdata()) for line in drawn] == [{float(k)} for k in range(1, STEPS + 1)]
+    assert max(line.get_ydata().max() for line in drawn) == largest
+    assert right.lines[STEPS].get_ydata()[0] == largest
+    assert right.get_ylim()[0] < min(line.get_ydata().min() for line in drawn)
+    assert f"{largest:.1e}" in left.figure.get_suptitle()
+
+
+def test_the_residual_is_rounding_on_the_flow_and_a_square_off_it():
+    # fails if a column stands at another momentum, the null experiment is on the flow, or its lines are not its own
+    table, null = plot_hamilton_jacobi_residual(pendulum, h=0.1).axes[:2]
+    image = table.images[0]
+    momenta = point_fan(pendulum, 31, 0.1).start.p[:, 0]
+    left, right, bottom, top = image.get_extent()
+    assert ((right - left) / 31, left + (right - left) / 62) == pytest.approx(
+        (float(momenta[1] - momenta[0]), float(momenta[0]))
+    )
+    assert (bottom, top) == (0.5, STEPS + 0.5)
+    residual = np.asarray(image.get_array())
+    assert residual.shape == (STEPS, 31)
+    assert residual.max() < -12
+    *curves, on_flow, square = null.lines
+    assert len(curves) == 3
+    assert on_flow.get_ydata()[0] == pytest.approx(10 ** residual.max())
+    spans = []
+    for curve in curves:
+        d, r = curve.get_data()
+        spans += [d.min(), d.max()]
+        some = (r > 1e-11) & (r < 1e-3)
+        assert np.polyfit(np.log(d[some]), np.log(r[some]), 1)[0] == pytest.approx(2.0, abs=0.1)
+    d, r = square.get_data()
+    assert list(d) == [min(spans), max(spans)]
+    assert np.diff(np.log(r)) / np.diff(np.log(d)) == pytest.approx(2.0)
+    assert null.get_ylim()[0] < on_flow.get_ydata()[0]
+    assert null.get_ylim()[1] > r.max()
