@@ -1,9 +1,12 @@
 """The figures of S^k for anything that has an L_d, and the paper's two figures from the package."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
 from fake_run import fake_run
+from matplotlib.text import Text
 
 from herglotz.cli import main
 from herglotz.errors import InputError
@@ -72,7 +75,8 @@ def test_both_fans_of_a_run_take_the_step_that_is_asked_for():
 
 def test_the_momentum_is_drawn_against_the_actions_derivative():
     # fails if the line y = x misses the points, a number is another one's, or the title says less than what is drawn
-    left, right = plot_momentum_vs_generating_function(pendulum, h=0.1).axes
+    axes: Any = plot_momentum_vs_generating_function(pendulum, h=0.1).axes
+    left, right = axes
     diagonal, points = left.lines
     p, dS = points.get_data()
     assert len(p) == 32 * STEPS
@@ -90,7 +94,8 @@ def test_the_momentum_is_drawn_against_the_actions_derivative():
 
 def test_the_residual_is_rounding_on_the_flow_and_a_square_off_it():
     # fails if a column stands at another momentum, the null experiment is on the flow, or its lines are not its own
-    table, null = plot_hamilton_jacobi_residual(pendulum, h=0.1).axes[:2]
+    axes: Any = plot_hamilton_jacobi_residual(pendulum, h=0.1).axes
+    table, null = axes[:2]
     image = table.images[0]
     momenta = point_fan(pendulum, 31, 0.1).start.p[:, 0]
     left, right, bottom, top = image.get_extent()
@@ -115,3 +120,4 @@ def test_the_residual_is_rounding_on_the_flow_and_a_square_off_it():
     assert np.diff(np.log(r)) / np.diff(np.log(d)) == pytest.approx(2.0)
     assert null.get_ylim()[0] < on_flow.get_ydata()[0]
     assert null.get_ylim()[1] > r.max()
+    assert any(text.get_text().startswith("grows like distance^2.0") for text in null.findobj(Text))
