@@ -89,6 +89,8 @@ def test_the_momentum_is_drawn_against_the_actions_derivative():
     assert max(line.get_ydata().max() for line in drawn) == largest
     assert right.lines[STEPS].get_ydata()[0] == largest
     assert right.get_ylim()[0] < min(line.get_ydata().min() for line in drawn)
+    assert list(right.get_xticks()) == list(range(1, STEPS + 1))
+    assert right.get_ylim()[1] >= 1e3 * largest
     assert f"{largest:.1e}" in left.figure.get_suptitle()
 
 
@@ -118,6 +120,10 @@ def test_the_residual_is_rounding_on_the_flow_and_a_square_off_it():
     d, r = square.get_data()
     assert list(d) == [min(spans), max(spans)]
     assert np.diff(np.log(r)) / np.diff(np.log(d)) == pytest.approx(2.0)
+    at, first = curves[0].get_data()
+    assert np.exp(np.interp(np.log(at[7]), np.log(d), np.log(r))) == pytest.approx(6 * first[7])
+    assert at.max() / at.min() > 1e4  # from far above rounding to as wide as the fan
+    assert image.norm.vmin == -18  # a two hundredth of rounding
     assert null.get_ylim()[0] < on_flow.get_ydata()[0]
     assert null.get_ylim()[1] > r.max()
     assert any(text.get_text().startswith("grows like distance^2.0") for text in null.findobj(Text))
