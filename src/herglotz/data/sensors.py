@@ -46,8 +46,8 @@ def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> 
     x = data.q.new_tensor([float(number) for number in numbers])
     where = f"{data.source or 'data'}: sensor {what}"
     if len(x) not in (0, n, count * n):
-        every = f", or {count} · {n} for its {count} recordings one after the other" if count > 1 else ""
-        raise InputError(f"{where}: {n} numbers are due, one for each of {', '.join(data.names)}{every}; got {len(x)}")
+        every = f", or {count * n}, those of its {count} recordings one after the other" if count > 1 else ""
+        raise InputError(f"{where}: give {n}, one for each of {', '.join(data.names)}{every}; got {len(x)}")
     bad = next((number for number in numbers if not math.isfinite(number)), None)
     if bad is not None:
         raise InputError(f"{where} must be finite numbers, got {bad}")

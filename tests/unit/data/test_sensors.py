@@ -33,7 +33,7 @@ def test_one_zero_a_coordinate_is_that_of_all_recordings():
 @pytest.mark.parametrize(
     ("zeros", "scales", "said"),
     [
-        ((0.1,), (), "sensor zeros: 2 numbers are due, one for each of theta, x, or 2 · 2 for its 2 recordings"),
+        ((0.1,), (), "sensor zeros: give 2, one for each of theta, x, or 4, those of its 2 recordings"),
         ((0.1, math.nan), (), "sensor zeros must be finite numbers, got nan"),
         ((), (1.0, 0.0), "a scale of 0 leaves no motion"),
     ],
