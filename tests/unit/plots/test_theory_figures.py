@@ -215,7 +215,7 @@ def test_solutions_without_S_are_left_out_and_counted():
     # fails if one solution that leaves the domain hides the others, or is left out without a word
     source = (wall, (STATES[0], 1 + 4 * STATES[1].square(), STATES[2]))
     momentum, residual = (plot(source, h=0.4) for plot in IDENTITIES.values())
-    drawn = len(momentum.axes[0].lines[1].get_xdata())
+    drawn = len(np.asarray(momentum.axes[0].lines[1].get_xdata()))
     assert 0 < drawn < 8 * STEPS
     assert f"{drawn} end points, {8 * STEPS - drawn} left out (caustic, or failed step)" in texts(momentum)
     axes: Any = residual.axes
@@ -246,6 +246,6 @@ def test_axes_have_the_units_of_the_run():
 def test_a_point_of_two_coordinates_is_one_point():
     # fails if its coordinates are counted as points, or a fan in a plane is drawn over a momentum without saying which
     momentum, residual = (plot(scene("kepler")) for plot in IDENTITIES.values())
-    assert len(momentum.axes[0].lines[1].get_xdata()) == 2 * 32 * STEPS
+    assert np.shape(momentum.axes[0].lines[1].get_xdata()) == (2 * 32 * STEPS,)
     assert f"○ {32 * STEPS} end points\n" in texts(momentum)
     assert residual.axes[0].get_xlabel() == r"initial momentum $\hat p_0$, first coordinate"
