@@ -143,7 +143,7 @@ def partials(
     ValueError
         If `order` is neither 1 nor 2.
     InputError
-        If an argument is no tensor of positions or actions, or L_d returns no number a sample.
+        If an argument is no tensor of positions or actions, or L_d is no function that returns a number a sample.
     """
     if order not in (1, 2):
         raise ValueError(f"order must be 1 or 2, got {order}")
@@ -151,6 +151,10 @@ def partials(
     h = torch.as_tensor(h, dtype=q0.dtype, device=q0.device)
     if isinstance(L_d, ClosedForm):
         return L_d.partials(q0, q1, s0, h, order)
+    if not callable(L_d):
+        raise InputError(
+            f"L_d must be a function L_d(q0, q1, s0, h), got a {type(L_d).__name__}; of a Stepper, give its L_d"
+        )
     return autograd_partials(L_d, q0, q1, s0, h, order)
 
 
