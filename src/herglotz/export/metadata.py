@@ -53,6 +53,7 @@ class Metadata(_Needed, total=False):
     start: dict[str, float | list[float]] | None
     metrics: dict[str, Any]
     arrival: dict[str, Any]
+    columns: list[list[str]]
     name: str
 
 

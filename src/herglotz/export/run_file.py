@@ -54,7 +54,7 @@ def export_run(
         "metrics": run.metrics,
         "card": model_card(run, (span[0], span[-1])),
         "h_range": span,
-        **({"arrival": run.arrival._asdict()} if run.model.inputs else {}),
+        **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind == "c":

@@ -136,6 +136,8 @@ def load_run(folder: str | Path) -> Run:
         If a file is missing, damaged, changed, of another run or of another format.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file, and no run; fit data first: herglotz fit {folder} --out RUN")
     if not (folder / "model.pt").is_file():
         raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
     contents = _bound(folder)
