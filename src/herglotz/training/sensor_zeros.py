@@ -7,6 +7,8 @@ and nothing then asks for the zeros any more. Three steps avoid that:
    miss more than the noise, with those of all recordings.
 2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
 3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations.
+4. The same with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt: a zero that
+   the reference has itself makes such terms, which friction then distorts. It is kept where it misses no more.
 
 Whether the recordings are used as they are or with these zeros, free runs over held-out time decide (`rivals`).
 """
@@ -14,6 +16,7 @@ Whether the recordings are used as they are or with these zeros, free runs over 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -27,10 +30,14 @@ from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
+from herglotz.models.feature_potential import baseline_is_named
+from herglotz.models.features import Product, parse
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import Look, look
+from herglotz.training.named_terms import STILL, NamedTerms, places
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -51,6 +58,7 @@ NUDGE = 1e-3  # of the spread: differences for the derivatives by the zeros
 FLAT = 1e-3  # of the largest singular value: directions of the zeros that no force depends on
 ROUNDS = 10  # of Gauss–Newton
 CLEARLY = 5.0  # standard deviations by which a zero differs from 0
+ONE_SIDED = re.compile(r"q\d+ v\d+")  # friction that is not the same on both sides of 0
 SETTLED = 0.1  # of the misfit: zeros that move by less have no say in the terms
 
 
@@ -80,7 +88,9 @@ class Apart:
 
     def __str__(self) -> str:
         sure = (f"{z:.4g} ± {d:.2g}" for z, d in zip(self.zeros, self.deviations, strict=True) if d)
-        words = f"zeros that differ from those of recording {self.reference}: {', '.join(sure)}"
+        some = 0.0 in self.deviations
+        which = f"zeros that differ from those of recording {self.reference}" if some else "zeros of all recordings"
+        words = f"{which}: {', '.join(sure)}"
         return "; ".join(filter(None, (self.differs, words)))
 
 
@@ -115,7 +125,8 @@ def refined(apart: Apart, seen: Look) -> Apart | None:
     if seen.found is None or seen.found.sigma is None:
         return None
     of, start = ZerosOf(seen), seen.kept.q.new_zeros(len(seen.kept), seen.kept.dof)
-    found = of.moved(build_model(seen.base, seen.settings, "none"), start)
+    model = build_model(seen.base, seen.settings, "none")
+    found = of.symmetric(model, of.moved(model, start))
     if float((found.z / seen.kept.balance).abs().max()) < SETTLED * of.sigma:
         return None
     z = found.z + found.z.new_tensor(apart.zeros).reshape(found.z.shape)
@@ -169,23 +180,35 @@ class ZerosOf:
         for b, one in enumerate(self.data):
             if b != self.reference:
                 z[b] = _by_steps(model, one, self.task.base.max_step)
-        return clearly(self.moved(model, z))
+        return self.symmetric(model, clearly(self.moved(model, z)))
 
-    def moved(self, model: ContactLagrangian, start: Tensor) -> FoundZeros:
+    def symmetric(self, model: ContactLagrangian, found: FoundZeros) -> FoundZeros:
+        """With zeros of all recordings in place of terms that q → −q turns round, where these miss no more."""
+        other = clearly(self.moved(model, found.z, odd(model, self.task.config)))
+        if not other.rms <= MARGIN * found.rms:
+            return found
+        if not other.z[self.reference].any():
+            other.deviations[self.reference] = 0.0
+        return other
+
+    def moved(self, model: ContactLagrangian, start: Tensor, held: Tensor | None = None) -> FoundZeros:
         """By multiple shooting over all recordings, from these zeros (B, n) and the parameters of the model.
 
-        The misfit is infinite where the model cannot follow them.
+        Parameters that are `held` are 0, and the reference has zeros too. The misfit is infinite where the model cannot
+        follow the recordings.
         """
-        data, n, count = measured(self.data, start.flatten().tolist()), self.data.dof, len(self.data) - 1
-        rows, base = [b for b in range(len(data)) if b != self.reference], self.task.base
+        data, n, base = measured(self.data, start.flatten().tolist()), self.data.dof, self.task.base
+        rows = [b for b in range(len(data)) if b != self.reference or held is not None]
+        count = len(rows)
         problem = ShootingProblem(
             model, data, segment_grid(data, FIRST_SEGMENT, base.model_step), sigma=self.sigma,
             prior=prior_of(model, base, None), freedom=self.freedom,
         )  # fmt: skip
         theta, smooth = problem.parameters.get(), _smooth(data)
+        theta[[] if held is None else held] = 0.0
         problem.guess_from_states(states_of_pairs(model, smooth))
         x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
-        target = WithZeros(problem)
+        target = WithZeros(problem, held)
         result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
         if not math.isfinite(result.cost):
             return FoundZeros(start, torch.zeros_like(start), math.inf)
@@ -197,6 +220,24 @@ class ZerosOf:
         z[rows] += result.x[-count * n :].reshape(count, n)
         deviations[rows] = variance.clamp_min(0).sqrt().reshape(count, n)
         return FoundZeros(z, deviations, rms)
+
+
+def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
+    """Places of the parameters of terms that q → −q, v → −v turns round: tilts, sin(q1), q1^3, friction q1 v1."""
+    parameters, angles = ParameterVector(model), model.config.angles
+    at = places(parameters, NamedTerms(config.features, config.drag))
+    turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
+    turned += [name for name in config.drag if ONE_SIDED.fullmatch(name)]
+    tilt = parameters.index("potential.tilt").tolist()
+    if baseline_is_named(model.config):
+        tilt += parameters.index(STILL)[1 : 2 * len(angles) : 2].tolist()
+    return torch.tensor([*tilt, *(i for name in turned for i in at[name])], dtype=torch.long)
+
+
+def _turned(f: Product) -> bool:
+    """Whether a product of L changes its sign with q and v."""
+    changes = f.function == "sin" or (f.function == "power" and f.power % 2 == 1)
+    return changes != (len(f.velocities) % 2 == 1)
 
 
 def _rms(x: Tensor) -> float:

@@ -12,10 +12,11 @@ from herglotz.data.sensors import measured
 from herglotz.training import FitConfig, Plan, fit, rivals
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import look
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import Apart, ZerosOf, sensor_zeros
+from herglotz.training.sensor_zeros import Apart, ZerosOf, odd, sensor_zeros
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.verdict import Errors, in_words
@@ -99,6 +100,34 @@ def test_a_planted_zero_is_found_with_its_deviation(planted):
     # fails if terms make up for a part of it; chance exceeds four standard deviations once in 16 000
     assert abs(found.zeros[1] - planted) < 4 * found.deviations[1]
     assert found.deviations[1] < 0.5 * NOISE
+
+
+def test_symmetry_says_where_the_reference_is_too():
+    # fails if a zero of the longest recording stays in the terms: sin(q1) and friction make up for it there
+    data = replace(pendulums(), q=pendulums().q + 0.2)
+    found = sensor_zeros(data, FitConfig(), look(data, FitConfig(), silent()))
+    assert found is not None
+    assert "zeros of all recordings" in str(found)
+    for z, planted, deviation in zip(found.zeros, (0.2, 0.2 + PLANTED), found.deviations, strict=True):
+        assert abs(z - planted) < 4 * deviation
+        assert deviation < NOISE
+
+
+def test_terms_that_turn_round_with_the_motion_are_held():
+    # fails if a term of a symmetric machine is held at 0, or one that a shifted zero makes is not
+    features = ("cos(q1 + q2)", "sin(q1 + q2)", "cos(q2) v1 v2", "sin(q2) v1 v1", "q1^2", "q1^3")
+    settings = FitConfig(level="forced", features=features, drag=("q1 v1", "q1^2 v1", "|v2| v2"))
+    base = replace(seen().base, angles=(False, True), scale=(1.0, 1.0), speed=(1.0, 1.0))
+    model = build_model(replace(base, stiffness=(1.0, 1.0), tilt=(0.0, 0.0), start={}), settings, "none")
+    parameters = ParameterVector(model)
+    turned = torch.zeros(len(parameters.get()), dtype=torch.bool)
+    turned[odd(model, settings)] = True
+    named = {name: x.flatten().tolist() for name, x in parameters.unflatten(turned).items()}
+    assert named["potential.tilt"] == [True, True]
+    assert named["potential.features.sum.coefficient"] == [False, True, False, True]
+    assert named["kinetic.sum.coefficient"] == [False, True]
+    assert named["drag.coefficient"] == [True, False, False]
+    assert int(turned.sum()) == 6
 
 
 def test_a_coordinate_that_no_force_depends_on_has_no_zero():

@@ -1,4 +1,8 @@
-"""Zeros of sensors as unknowns of a fit: y = q + z, with z = 0 in the reference, the recording of most samples."""
+"""Zeros of sensors as unknowns of a fit: y = q + z.
+
+Either z = 0 in the reference, the recording of most samples, or no term of the model is odd: where q and −q move alike,
+symmetry says where 0 is.
+"""
 
 from __future__ import annotations
 
@@ -20,15 +24,20 @@ def reference_of(data: Trajectories) -> int:
 class WithZeros:
     """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
 
-    Each recording but the reference has zeros of its own.
+    Each recording but the reference has zeros of its own, (B · n) with the reference's where parameters are `held`.
     """
 
-    def __init__(self, problem: ShootingProblem):
+    def __init__(
+        self,
+        problem: ShootingProblem,
+        held: Tensor | None = None,  # places of the parameters of odd terms, which stay as they are
+    ):
         data, reference = problem.data, reference_of(problem.data)
         own = torch.arange(len(data), device=data.t.device)
-        which = torch.where(own < reference, own, own - 1).where(own != reference, -1)
-        self.problem, self.which = problem, which[data.trajectory]
-        self.count = (len(data) - 1) * problem.n
+        if held is None:
+            own = torch.where(own < reference, own, own - 1).where(own != reference, -1)
+        self.problem, self.which, self.held = problem, own[data.trajectory], held
+        self.count = (len(data) - (held is None)) * problem.n
 
     def memory(self) -> dict[str, Any]:
         """Of the problem."""
@@ -49,9 +58,12 @@ class WithZeros:
             return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
         columns, diagonal, slope = self.problem.by_zeros(self.which)
         C = columns.flatten(1)
-        return cost, torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)]), torch.cat(
-            [b, slope.flatten()]
-        )  # fmt: skip
+        A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])
+        b = torch.cat([b, slope.flatten()])
+        if self.held is not None:
+            A[self.held], A[:, self.held], b[self.held] = 0.0, 0.0, 0.0
+            A[self.held, self.held] = 1.0
+        return cost, A, b
 
     def _set(self, x: Tensor) -> Tensor:
         """The problem's own unknowns, its zeros being those of x."""
