@@ -238,14 +238,14 @@ def _friction(
     if "friction.input_map" in named:
         for j in range(config.inputs):
             at = i * config.inputs + j
-            what, zero = run.data.input_labels[j][0], _zero(run, j)
-            yield left, f"({what} − {zero})" if float(zero) else what, "", [("friction.input_map", at, 1.0)]
+            yield left, _beside_zero(run, j), "", [("friction.input_map", at, 1.0)]
 
 
-def _zero(run: Run, j: int) -> str:
-    friction = run.model.friction
+def _beside_zero(run: Run, j: int) -> str:
+    """An input, less the value of it at which it makes no force."""
+    friction, what = run.model.friction, run.data.input_labels[j][0]
     zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
-    return f"{zero:.3g}"
+    return f"({what} {'+' if zero < 0 else '−'} {abs(zero):.3g})" if zero else what
 
 
 def _baseline(

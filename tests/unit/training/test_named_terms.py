@@ -100,6 +100,20 @@ def test_the_equation_has_the_names_of_the_file():
     assert "theta in rad, F in N, theta recorded in deg" in " ".join(text.split())
 
 
+@pytest.mark.parametrize(("zero", "text"), [(0.25, "(u − 0.25)"), (-0.25, "(u + 0.25)"), (0.0, "2 u −")])
+def test_the_zero_of_an_input_is_added_or_taken_away(zero, text):
+    # fails if a zero below 0 is printed as "(u − -0.25)"
+    one = (1.0,)
+    config = ModelConfig((False,), "forced", one, one, one, (0.0,), potential_width=0, inputs=1, input_zero=True)
+    t = torch.arange(5, dtype=torch.float64)
+    model = ContactLagrangian(config)
+    with torch.no_grad():
+        model.get_parameter("friction.input_map").fill_(2.0)
+        model.get_parameter("friction.input_zero").fill_(zero)
+    run = SimpleNamespace(model=model, data=Trajectories.of(t, t, u=t))
+    assert text in str(equation_of(run))  # pyright: ignore
+
+
 @pytest.mark.parametrize("names", [("q0", "q1"), ("q2", "q1"), ("v1", "x")])
 def test_names_that_look_like_the_grammar_stay_apart(names):
     # fails if names are put in one after the other: the first one's name is then taken for the second coordinate
