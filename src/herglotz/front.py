@@ -51,4 +51,5 @@ def report(run: Run, folder: str | Path, against: Any) -> list[Path]:
     from herglotz.data import as_trajectories
     from herglotz.report import write_report
 
-    return write_report(run, folder, None if against is None else as_trajectories(against), name=str(folder))
+    other = None if against is None else as_trajectories(against, like=run.data)
+    return write_report(run, folder, other, name=str(folder))

@@ -8,6 +8,8 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is
 
 from herglotz.errors import InputError
 
+LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, and 10^400 is no float either
+
 
 def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
     """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
@@ -51,7 +53,7 @@ def matches(value: Any, hint: Any) -> bool:
         return isinstance(value, (list, tuple)) and all(matches(x, inner[0]) for x in value)
     if origin is dict:
         return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
-    if hint in (int, float) and isinstance(value, bool):
+    if hint in (int, float) and isinstance(value, int) and (isinstance(value, bool) or abs(value) > LARGEST):
         return False
     return isinstance(value, (int, float) if hint is float else hint)
 

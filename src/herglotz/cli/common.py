@@ -9,7 +9,7 @@ import tempfile
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 from herglotz.errors import InputError
 
@@ -116,9 +116,10 @@ def print_json(values: dict[str, Any]) -> None:
     print(json.dumps(_plain(values), indent=2, allow_nan=False, ensure_ascii=False))
 
 
-def say(text: str) -> None:
+def say(text: str, file: TextIO | None = None) -> None:
     """Print a sentence in lines that fit a terminal as it opens; names of files are not broken."""
-    print(textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False))
+    lines = textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
+    print(lines, file=file)
 
 
 def print_table(rows: Sequence[tuple[str, str]]) -> None:

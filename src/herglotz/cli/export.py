@@ -7,6 +7,7 @@ from pathlib import Path
 
 from herglotz.cli.common import KICKS, check_output_file, positive, print_json
 from herglotz.cli.flags import add_force_flag
+from herglotz.errors import InputError
 
 # File extension of each format.
 SUFFIX = {"pt2": ".pt2", "aoti": ".pt2", "onnx": ".onnx", "c": ".h"}
@@ -40,6 +41,11 @@ def add(commands: argparse._SubParsersAction) -> None:
         "--h-range", type=positive, nargs=2, metavar=("LOW", "HIGH"),
         help="range of steps h (default: that of the data); C flags other steps, Python refuses them",
     )  # fmt: skip
+    parser.add_argument(
+        "--name", metavar="PREFIX",
+        help="what every name in a C header begins with, so that headers of two models fit into one program (default: "
+        "the name of the file)",
+    )  # fmt: skip
     add_force_flag(parser)
     parser.add_argument("--json", action="store_true", help="print what was written as JSON")
     parser.set_defaults(run=run)
@@ -53,6 +59,8 @@ def run(arguments: argparse.Namespace) -> int:
     arguments.format = form
     kicks = arguments.source / KICKS
     if kicks.is_file() and arguments.format == "c":
+        if arguments.name is not None:
+            raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
         return _kicks(arguments, kicks)
 
     from herglotz.training import load_run
@@ -62,7 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.export import export_run, load_exported
     from herglotz.export.c_header import read_metadata
 
-    export_run(result, arguments.out, arguments.format, h_range=arguments.h_range)
+    export_run(result, arguments.out, arguments.format, h_range=arguments.h_range, name=arguments.name)
     tuned = result.setting
     if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)

@@ -104,6 +104,9 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     print(result.summary())
     if drawn:
         say(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
+    if exit_code(result):
+        say(f"Next: what the verdict says, or herglotz trust {out}, which says what the data leave open")
+        return
     print(f"Next: herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 

@@ -69,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.training import load_run
 
     result = load_run(arguments.source)
-    data = load(arguments.data, **columns_of(arguments))
+    data = load(arguments.data, like=result.data, **columns_of(arguments))
     if data.time_unit != result.data.time_unit:
         raise InputError(
             f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"
@@ -87,7 +87,7 @@ def run(arguments: argparse.Namespace) -> int:
             print(f"Written: {', '.join(map(str, written))}")
     if found.failed_steps > 0:
         share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
-        print(f"herglotz: note: {share}; the RMS is over the others", file=sys.stderr)
+        say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)
     return 0
 
 

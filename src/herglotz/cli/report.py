@@ -32,15 +32,15 @@ def add(commands: argparse._SubParsersAction) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Write both files and say where."""
     folder = arguments.out or arguments.source
-    check_output_folder(folder)
 
     from herglotz.data import load
     from herglotz.report import write_report
     from herglotz.training import load_run
 
     result, against = load_run(arguments.source), None
+    check_output_folder(folder)
     if arguments.against is not None:
-        against = load(arguments.against, **columns_of(arguments))
+        against = load(arguments.against, like=result.data, **columns_of(arguments))
     for path in write_report(result, folder, against, name=str(arguments.source)):
         print(path)
     return 0

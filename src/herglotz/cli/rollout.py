@@ -6,7 +6,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -56,6 +56,7 @@ class Source:
     inputs: int = 0
     states: str = "(q, p, s)"  # what the box bounds
     degrees: tuple[str, ...] = ()  # coordinates that were recorded in degrees
+    columns: Sequence[Sequence[str]] = ()  # name, role and unit of each column of the fit's table
 
 
 def add(commands: argparse._SubParsersAction) -> None:
@@ -81,8 +82,8 @@ def add(commands: argparse._SubParsersAction) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--inputs", type=existing, metavar="FILE",
-        help="recorded motion whose inputs u drive the model, each at its own time: K samples from the start's time on "
-        "(with --q0: from the first), at their own steps unless --h",
+        help="times and inputs (positions may stand beside them) that drive the model, each at its own time: K samples "
+        "from the start's time on (with --q0: from the first), at their own steps unless --h",
     )  # fmt: skip
     parser.add_argument(
         "--t0", type=finite, metavar="T", help="time of the start (default: of the fitted state; 0 with --q0)"
@@ -120,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.json:
         print_json(_numbers(found, times, seconds, left) | {"file": str(out)})
     else:
-        _report(source, found, times, f"{out}: {arguments.steps} steps", 1e6 * seconds / arguments.steps)
+        _report(source, found, times, f"{out}: {arguments.steps} steps")
     _warn(source, times, left)
     return 0
 
@@ -154,13 +155,13 @@ def _numbers(found: Rollout, times: torch.Tensor, seconds: float, left: int | No
     }
 
 
-def _report(source: Source, found: Rollout, times: torch.Tensor, what: str, per_step: float) -> None:
+def _report(source: Source, found: Rollout, times: torch.Tensor, what: str) -> None:
     from herglotz.data.units import size
 
     each = zip(source.names, source.units, found.final.q.tolist(), strict=True)
     end = ", ".join(f"{name} = {size(x, unit, name in source.degrees, 6)}" for name, unit, x in each)
     h = float(times.diff().mean())
-    say(f"{what} of {h:g} {source.time_unit}, {per_step:.0f} µs each; at t = {float(times[-1]):g}: {end}")
+    say(f"{what} of {h:g} {source.time_unit}; at t = {float(times[-1]):g}: {end}")
 
 
 def _warn(source: Source, times: torch.Tensor, left: int | None) -> None:
@@ -179,7 +180,7 @@ def _warn(source: Source, times: torch.Tensor, left: int | None) -> None:
 
 
 def _note(text: str) -> None:
-    print(f"herglotz: note: {text}", file=sys.stderr)
+    say(f"herglotz: note: {text}", sys.stderr)
 
 
 def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
@@ -204,7 +205,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
         box = Box(run_.box, data.angles, start.q.dtype, by_s=model.s_enters_motion)
         return Source(
             run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.arrival, run_.config.frequencies,
-            model.inputs, _bounded(model.s_enters_motion), data.degrees,
+            model.inputs, _bounded(model.s_enters_motion), data.degrees, data.columns,
         )  # fmt: skip
 
     from herglotz.data.checks import unnamed
@@ -225,7 +226,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     return Source(
         stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span,
         Arrival(**m.get("arrival", {})), inputs=stepper.inputs, states=_bounded(by_s),
-        degrees=tuple(m.get("degrees", ())),
+        degrees=tuple(m.get("degrees", ())), columns=m.get("columns", ()),
     )  # fmt: skip
 
 
@@ -273,7 +274,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
         return torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1), times
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    found = recorded(path, arguments.trajectory, source.time_unit, source.arrival or Arrival())
+    found = recorded(path, arguments.trajectory, source.time_unit, source.arrival or Arrival(), source.columns)
     if arguments.q0 is not None and arguments.t0 is None:
         t0 = float(found.t[0])
     return driven(found, t0, steps, arguments.h)

@@ -42,9 +42,12 @@ def settings_of(arguments: argparse.Namespace) -> FitConfig:
 
 
 def _read(path: Path, kind: type[FitConfig]) -> FitConfig:
+    from herglotz.data.files import read_bytes
+
     file = path / "config.json" if path.is_dir() else path
+    content = read_bytes(file)
     try:
-        values: Any = json.loads(file.read_text(encoding="utf-8"))
+        values: Any = json.loads(content)
         return kind.from_dict({**values, "device": "cpu"})
     except (ValueError, TypeError, RecursionError) as error:
         line = " ".join(str(error).split())[:200]

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.extra_formats import Table
-from herglotz.data.readers import load
+from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame
@@ -38,6 +38,7 @@ def as_trajectories(
     angles: Names | bool | None = None,  # coordinates that are angles in rad; True for all, () for none
     sensor_zeros: Sequence[float] = (),  # what the sensors read at 0, n numbers or n for each recording
     sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth: q = scale · (reading − zero)
+    like: Trajectories | None = None,  # another recording: columns of a table that have its names mean the same
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
 
@@ -59,15 +60,17 @@ def as_trajectories(
         found = data
     elif isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}
-        return _marked(load(data, sensor_zeros=sensor_zeros, sensor_scales=sensor_scales, **columns), angles)
+        sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+        return _marked(load(data, like=like, **sensors, **columns), angles)
     elif hasattr(data, "columns") and h is not None:
         found = in_radians_and_seconds(_array(np.asarray(data), h, time, names))
     elif hasattr(data, "columns") or isinstance(data, Mapping):
-        found = _table(data, Wanted(time, **names))
+        found = _table(data, Wanted(time, **names, known=() if like is None else like.columns))
+        found = found if like is None else angles_like(found, like)
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
-        found = _of_each(data, {"h": h, "time": time, **names, "angles": angles})
+        found = _of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like})
     else:
         found = _array(data, h, time, names)
     return _marked(measured(found, sensor_zeros, sensor_scales), angles)

@@ -18,6 +18,9 @@ ROLES = {
     "input": re.compile(r"u\d*|u_.*|F|(f|forces?|torques?|tau|motor)(\d+|_.*)|forces?|torques?|tau|motor"),
     "velocity": re.compile(r"v|velocity|.*_dot"),  # left aside: a logged velocity is usually filtered
 }
+AS_SHOWN = {  # roles by their names in the table of columns
+    "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
+}  # fmt: skip
 FORCES = re.compile(r"[kmM]?N([ *·.]?m)?")  # units in which no coordinate is measured
 Names = str | Sequence[str]
 
@@ -31,6 +34,8 @@ class Wanted:
     inputs: Names | None = None  # exactly these; () for none
     drop: Names = ()  # left aside
     group: str | None = None  # numbers the trajectories
+    known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
+    motion: bool = True  # False: times and inputs suffice; without coordinates the first input stands in for one
 
     def role(self, name: str) -> str | None:
         """The role that the user gives to this column; None where the user says nothing."""
@@ -48,6 +53,15 @@ class Wanted:
         """All columns that the user names."""
         every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
         return tuple(name for wanted in every if wanted for name in _several(wanted))
+
+    def before(self, name: str) -> str | None:
+        """The role that a column of this name had in the other table; None where it had none."""
+        return next((AS_SHOWN.get(role) for other, role, _ in self.known if other == name), None)
+
+    def in_order(self, found: Sequence[int], names: Sequence[str]) -> tuple[int, ...]:
+        """Column numbers in the order that the other table has their names in, new names last."""
+        rank = {name: k for k, (name, _, _) in enumerate(self.known)}
+        return tuple(sorted(found, key=lambda i: rank.get(names[i], len(rank))))
 
 
 HEADER_DECIDES = Wanted()
@@ -101,7 +115,11 @@ def assign(
     for i, (name, unit) in enumerate(zip(names, units, strict=True)):
         roles[wanted.role(name) or _by_itself(name, unit, wanted)].append(i)
     clock = _clock(where, names, roles["time"])
-    q = tuple(roles["q"] if wanted.coordinates is None else (place[x] for x in _several(wanted.coordinates)))
+    u = wanted.in_order(roles["input"], names)
+    q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
+    q = q if wanted.coordinates is None else tuple(place[x] for x in _several(wanted.coordinates))
+    if not (u or wanted.motion):
+        raise InputError(f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque")
     if not q:
         raise InputError(f"{where}: no coordinate column, only {every}; add a column such as q[rad]")
     if len(roles["trajectory"]) > 1:
@@ -109,7 +127,7 @@ def assign(
         raise InputError(f"{where}: both a column {both}; keep one")
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
-    return Columns(names, units, clock, q, trajectory, action, p, tuple(roles["input"]))
+    return Columns(names, units, clock, q, trajectory, action, p, u)
 
 
 def _several(names: Names) -> Sequence[str]:
@@ -117,10 +135,13 @@ def _several(names: Names) -> Sequence[str]:
 
 
 def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
-    """The role of a column that the user does not name, by its name and unit; `dropped` where others have that role."""
+    """The role of a column that the user does not name, by another table or by its name and unit.
+
+    It is `dropped` where the user gives that role to others.
+    """
     key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "q")
-    role = "input" if role == "q" and FORCES.fullmatch(unit) else role
+    role = wanted.before(name) or ("input" if role == "q" and FORCES.fullmatch(unit) else role)
     taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
     return "dropped" if taken.get(role) is not None else role
 

@@ -58,8 +58,13 @@ def read_csv(
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
     wanted = Wanted(time, coordinates, inputs, drop, group)
-    found = _read_numbers(Path(path), wanted) or _read_rows(Path(path), wanted)
+    found = read_table(path, wanted)
     return found if angles is None else found.with_angles(angles)
+
+
+def read_table(path: PathLike, wanted: Wanted) -> Trajectories:
+    """Read a csv file whose columns have the wanted roles, and others by their names."""
+    return _read_numbers(Path(path), wanted) or _read_rows(Path(path), wanted)
 
 
 def _read_rows(path: Path, wanted: Wanted) -> Trajectories:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,18 +31,23 @@ def even_times(t0: float, h: float, steps: int) -> Tensor:
 
 
 def recorded(
-    path: str | Path | Trajectories, trajectory: int, time_unit: str, unsaid: Arrival = NOT_SAID
+    path: str | Path | Trajectories,
+    trajectory: int,
+    time_unit: str,
+    unsaid: Arrival = NOT_SAID,
+    known: Sequence[Sequence[str]] = (),  # columns of the fit: name, role, unit
 ) -> Trajectories:
     """The recording whose inputs drive the model: the trajectory of that number, or the only one.
 
-    Its inputs are those that act: before they do what it says itself or, where it says nothing, `unsaid`.
+    A file needs times and inputs alone. Its inputs are those that act: before they do what it says itself or, where it
+    says nothing, `unsaid`.
 
     Raises
     ------
     InputError
         If the file holds no inputs, has no such trajectory, or counts time in another unit.
     """
-    found = path if isinstance(path, Trajectories) else load(path)
+    found = path if isinstance(path, Trajectories) else load(path, known=tuple(map(tuple, known)), motion=False)
     path = found.source or "recording"
     found = acting(found, unsaid)
     if found.u is None:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import tempfile
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from herglotz.errors import InputError
 
 PathLike = str | os.PathLike[str]
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or what this user may take of it
+TEMPORARY = ".{}.????????.tmp"  # names that `tempfile.mkstemp` gives to what becomes a file of this name
 
 
 def read_bytes(path: PathLike, most: int = -1) -> bytes:
@@ -28,6 +32,8 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
             raise InputError(f"{path}: is a pipe or a device, not a file; save what it says to a file first")
         with open(path, "rb") as file:
             content = file.read(most)
+    except InputError:
+        raise
     except FileNotFoundError:
         raise InputError(f"{path}: there is no such file; check the name and the folder") from None
     except IsADirectoryError:
@@ -67,7 +73,7 @@ def write_atomically(path: PathLike, content: bytes) -> None:
     Raises
     ------
     InputError
-        If the folder does not exist or is not writable, or the path is a folder.
+        If the folder does not exist or is not writable, the path is a folder, or the disk is full.
     """
     path = Path(path)
     try:
@@ -85,7 +91,17 @@ def write_atomically(path: PathLike, content: bytes) -> None:
         _sync(path.parent)
     except (OSError, ValueError) as error:
         reason = error.strerror if isinstance(error, OSError) else error
-        raise InputError(f"{path}: cannot be written ({reason}); check that its folder exists, writable") from error
+        full = isinstance(error, OSError) and error.errno in NO_ROOM
+        remedy = "make room on its disk, or write to another" if full else "check that its folder exists, writable"
+        raise InputError(f"{path}: cannot be written ({reason}); {remedy}") from error
+
+
+def remove_leftovers(folder: PathLike, names: Iterable[str]) -> None:
+    """Remove what a killed writer of these files has left in a folder that nobody else writes them to now."""
+    for name in names:
+        for path in Path(folder).glob(TEMPORARY.format(name)):
+            with suppress(OSError):
+                path.unlink()
 
 
 def _umask() -> int:

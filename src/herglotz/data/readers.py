@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data.csv_columns import Names, Wanted
-from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.csv_format import read_table, write_csv
 from herglotz.data.extra_formats import read_hdf5, read_mat, read_parquet
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
@@ -37,7 +37,7 @@ FORMATS = (
     Format(
         "IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, False, looks_like_markers,
     ),
-    Format("t[s],q[rad],... (.csv)", ".csv", read_csv, True),
+    Format("t[s],q[rad],... (.csv)", ".csv", lambda path, **columns: read_table(path, Wanted(**columns)), True),
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format(
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
@@ -59,6 +59,7 @@ def load(
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] = (),  # what the sensors read at 0; see `herglotz.data.sensors`
     sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth
+    like: Trajectories | None = None,  # another recording: columns of the same names mean the same
     **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
 ) -> Trajectories:
     """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
@@ -76,8 +77,12 @@ def load(
     sensor_zeros, sensor_scales
         Positions are scale · (reading − zero), both in the file's units: n numbers each, or n for each recording of the
         file, one recording after the other; after what the file itself says.
+    like
+        Another recording, such as `run.data`: columns of a table that have the names of its columns are taken for the
+        same, in the same order, and its angles are angles, where nothing else is said.
     **columns
-        Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`.
+        Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`; motion=False
+        where inputs alone are needed.
 
     Returns
     -------
@@ -89,12 +94,23 @@ def load(
     InputError
         If the format is not known (the message lists those that are), or from the reader of that format.
     """
+    columns.setdefault("known", () if like is None else like.columns)
     found = measured(in_radians_and_seconds(_read(Path(path), Wanted(**columns))), sensor_zeros, sensor_scales)
     if angles is not None:
         found = found.with_angles(angles)
+    elif like is not None:
+        found = angles_like(found, like)
     if show and found.columns:
         print(found.table(), file=sys.stderr)
     return found.unwrapped() if unwrap else found
+
+
+def angles_like(found: Trajectories, other: Trajectories) -> Trajectories:
+    """The set with the angles of another, among coordinates without a unit or in rad; not of degrees."""
+    known = {} if other.degrees else dict(zip(other.names, other.angles, strict=True))
+    rows = zip(found.names, found.units, found.angles, strict=True)
+    return found.with_angles([name for name, unit, own in rows
+                              if (known.get(name, own) if unit in ("1", "rad") else own)])  # fmt: skip
 
 
 def save(path: PathLike, trajectories: Trajectories) -> None:

@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
+from herglotz.scenes import scene as scene_named
 
 LONGEST_GAP = 3  # consecutive samples that one gap deletes at most
 Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
@@ -30,6 +31,8 @@ class Scene(Protocol):
     def units(self) -> tuple[str, ...]: ...  # noqa: D102
     @property
     def angles(self) -> tuple[bool, ...]: ...  # noqa: D102
+    @property
+    def h(self) -> float: ...  # noqa: D102
     @property
     def q_range(self) -> Range: ...  # noqa: D102
     @property
@@ -51,11 +54,11 @@ OF_AN_L_D = (
 
 
 def simulate(
-    scene: Scene,
+    scene: Scene | str,
     *,
-    trajectories: int,
-    steps: int,  # of each trajectory: steps + 1 samples before gaps
-    h: float,  # in the scene's unit of time
+    trajectories: int = 4,
+    steps: int = 100,  # of each trajectory: steps + 1 samples before gaps
+    h: float | None = None,  # in the scene's unit of time; left out: the scene's own
     noise: float = 0.0,  # standard deviation of the Gaussian noise on q, in its units
     gaps: int = 0,  # runs of 1 to 3 consecutive interior samples deleted from each trajectory
     seed: int = 0,
@@ -74,13 +77,13 @@ def simulate(
     Parameters
     ----------
     scene
-        What moves (`herglotz.scene`).
+        What moves: a scene (`herglotz.scene`), or the name of one with its usual parameters.
     trajectories
         Number of motions B.
     steps
         Of each trajectory: steps + 1 samples before gaps.
     h
-        Time between samples, in the scene's unit of time.
+        Time between samples, in the scene's unit of time; left out: the scene's own step.
     noise
         Standard deviation of Gaussian noise on q, in its units.
     gaps
@@ -102,10 +105,12 @@ def simulate(
     Raises
     ------
     InputError
-        If an argument is out of range, or the motion leaves the finite numbers.
+        If there is no such scene, an argument is out of range, or the motion leaves the finite numbers.
     """
+    scene = scene_named(scene) if isinstance(scene, str) else scene
     if not hasattr(scene, "dof"):
         raise InputError(f"simulate takes a scene, got a {type(scene).__name__}; {OF_AN_L_D}")
+    h = scene.h if h is None else h
     _check_counts(trajectories, steps, gaps, seed)
     check_positive("h", h)
     if not 0.0 <= noise < float("inf"):

@@ -313,7 +313,8 @@ class Trajectories:
     def summary(self) -> str:
         """Return one line for people."""
         coordinates = ", ".join(f"{name} [{unit}]" for name, unit in zip(self.names, self.units, strict=True))
-        known = "".join(f", {name}" for name in ("s", "p", "u") if getattr(self, name) is not None)
+        known = "".join(f", {name}" for name in "sp" if getattr(self, name) is not None)
+        known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in self.input_labels)
         plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
         gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
         step = f"step {self.typical_step:.4g}{unit}{gaps}"

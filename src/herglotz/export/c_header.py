@@ -20,7 +20,7 @@ from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
 from herglotz.export.lower.c import StepInC, as_lanes, as_scalars, model_source
-from herglotz.export.metadata import check_metadata, describe
+from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
@@ -59,7 +59,7 @@ TOP = """\
 */
 #ifdef hz_HEADER
 #if hz_HEADER != {guard}
-#error "two different models have the prefix hz_: export one of them under another name"
+#error "two different models have the prefix hz_: export one of them under another name (--name)"
 #endif
 #else
 #define hz_HEADER {guard}
@@ -206,15 +206,9 @@ def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
         If there are none, or they cannot be.
     """
     found = re.search(rf"^ *{re.escape(MARK)}(.*)$", text, re.MULTILINE)
-    try:
-        entries = json.loads(found[1]) if found else None
-    except json.JSONDecodeError:
-        entries = None
-    if not isinstance(entries, dict) or not {"name", "format"} <= set(entries):
-        raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export.export_c")
-    check_metadata(entries, path)
-    if not re.fullmatch(NAME, entries["name"]):
-        raise InputError(f"{path}: metadata: name must be a C identifier, got {entries['name']!r}; export it again")
+    entries = from_json(found and found[1], path)
+    if not re.fullmatch(NAME, entries.get("name", "")):
+        raise InputError(f"{path}: metadata: name must be a C identifier, got {entries.get('name')!r}; export it again")
     return entries
 
 

@@ -53,6 +53,7 @@ class Metadata(_Needed, total=False):
     start: dict[str, float | list[float]] | None
     metrics: dict[str, Any]
     arrival: dict[str, Any]
+    columns: list[list[str]]
     name: str
 
 
@@ -145,7 +146,7 @@ def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
     """
     try:
         entries = json.loads(text or "")
-    except json.JSONDecodeError:
+    except (ValueError, RecursionError):  # no JSON, a number of thousands of digits, or brackets as deep
         entries = None
     if not isinstance(entries, dict) or "format" not in entries:
         raise InputError(f"{path}: has no herglotz metadata; write it with herglotz.export")

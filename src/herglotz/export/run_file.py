@@ -19,7 +19,12 @@ KINDS = {".pt2": "pt2", ".onnx": "onnx", ".h": "c"}  # of a file, by the end of 
 
 
 def export_run(
-    run: Run, path: str | Path, kind: str | None = None, *, h_range: tuple[float, float] | None = None
+    run: Run,
+    path: str | Path,
+    kind: str | None = None,
+    *,
+    h_range: tuple[float, float] | None = None,
+    name: str | None = None,
 ) -> Path:
     """Write the model of a run as one file that steps without this package.
 
@@ -34,16 +39,20 @@ def export_run(
     h_range
         Steps that the file is for; None: those of the data. An end that agrees with the run's own step to six digits
         is taken for it: recorded times carry rounding, and 0.2 means a step of 0.2000000000000002 too.
+    name
+        Prefix of every name in a C header, as of `export_c`; None: that of the file.
 
     Raises
     ------
     InputError
-        If the name has another end, or the format cannot hold the model.
+        If the name has another end, the format cannot hold the model, or a prefix is given for another format than C.
     """
     path = Path(path)
     kind = kind or KINDS.get(path.suffix.lower())
     if kind not in WRITERS:
         raise InputError(f"{path}: the name must end in {', '.join(KINDS)}; other kinds are {', '.join(WRITERS)}")
+    if name is not None and kind != "c":
+        raise InputError(f"{path}: a prefix (name) is of C headers only, not of {kind}; leave it out")
     (q, p, s), t = run.last_fitted()
     span = [run.h if math.isclose(x, run.h, rel_tol=1e-6) else x for x in h_range or run.h_range]
     metadata = {
@@ -54,10 +63,12 @@ def export_run(
         "metrics": run.metrics,
         "card": model_card(run, (span[0], span[-1])),
         "h_range": span,
-        **({"arrival": run.arrival._asdict()} if run.model.inputs else {}),
+        **({"arrival": run.arrival._asdict(), "columns": [*map(list, run.data.columns)]} if run.model.inputs else {}),
     }
     described: dict[str, Any] = {"h": run.h, "box": run.box, "units": run.data.units, "metadata": metadata}
     if run.setting and kind == "c":
         described |= {"dtype": run.setting["dtype"], "tolerance": run.setting["tol"]}
+    if name is not None:
+        described["name"] = name
     WRITERS[kind](run.model, path, **described)
     return path

@@ -146,7 +146,10 @@ class _Reader:
             kind, token, _ = self._next()
             if kind != "coordinate" or token[0] != "q":
                 break
-            w[self._coordinate()] += sign
+            at = self._coordinate()
+            w[at] += sign
+            if not math.isfinite(w[at]):
+                raise self._error(f"the factors of q{at + 1} add up to a number that is too large")
             sign = self._sign()
         if sign is not None or not self._take(")"):
             words = self.text[begin + 1 :].partition(")")[0]
@@ -172,8 +175,8 @@ class _Reader:
         _, token, _ = self._next()
         self.at += 1
         value = float(token)
-        if not math.isfinite(value):
-            raise self._error(f"the number {token} is too large")
+        if not math.isfinite(value) or (value == 0 and re.match(r"[0.]*[1-9]", token)):
+            raise self._error(f"the number {token} is too {'small' if value == 0 else 'large'}")
         if self._next()[0] == "number":
             raise self._error(f"'{token}' and '{self._next()[1]}' stand side by side; write one number")
         return value

@@ -238,14 +238,14 @@ def _friction(
     if "friction.input_map" in named:
         for j in range(config.inputs):
             at = i * config.inputs + j
-            yield left, _beside_zero(run, j), "", [("friction.input_map", at, 1.0)]
+            yield left, _input(run, j), "", [("friction.input_map", at, 1.0)]
 
 
-def _beside_zero(run: Run, j: int) -> str:
-    """An input, less the value of it at which it makes no force."""
-    friction, what = run.model.friction, run.data.input_labels[j][0]
+def _input(run: Run, j: int) -> str:
+    """The input less what its sensor shows where nothing acts."""
+    what, friction = run.data.input_labels[j][0], run.model.friction
     zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
-    return f"({what} {'+' if zero < 0 else '−'} {abs(zero):.3g})" if zero else what
+    return f"({what} {'−' if zero > 0 else '+'} {abs(zero):.3g})" if zero else what
 
 
 def _baseline(

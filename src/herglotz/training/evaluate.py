@@ -129,8 +129,13 @@ def _errors(
     return numbers, free
 
 
-def _gain(free: Tensor, still: Tensor) -> float:
-    """By how many standard errors the free run meets the unseen samples better than the mean of the training part."""
+def _gain(free: Tensor, still: Tensor) -> float | None:
+    """By how many standard errors the free run meets the unseen samples better than the mean of the training part.
+
+    None where the free run breaks off.
+    """
+    if not bool(free.isfinite().all()):
+        return None
     scale = still.square().mean(0).clamp_min(torch.finfo(still.dtype).tiny)
     gain = ((still.square() - free.square()) / scale).flatten()
     return float(gain.mean() / (gain.std() / len(gain) ** 0.5).clamp_min(torch.finfo(gain.dtype).tiny))

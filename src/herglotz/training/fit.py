@@ -13,6 +13,7 @@ from typing import Any
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.checks import check_sizes
+from herglotz.data.files import remove_leftovers
 from herglotz.data.holds import Arrival
 from herglotz.data.lock import locked
 from herglotz.data.waves import with_waves
@@ -28,6 +29,7 @@ from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
 from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
+from herglotz.training.run_folder import FILES, LOG, MANIFEST
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.task import Task
 from herglotz.training.tensorboard import tensorboard_log
@@ -98,6 +100,8 @@ def fit(
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
+        if checkpoint is not None:
+            remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
         if log is not None:
             log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})

@@ -27,7 +27,10 @@ def step_inputs(model: ContactLagrangian, data: Trajectories) -> Tensor | None:
         return None
     where = data.source or "data"
     if data.u is None:
-        raise InputError(f"{where}: the model is driven by {model.inputs} input(s) u and these data hold none; add u")
+        raise InputError(
+            f"{where}: the model is driven by {model.inputs} input(s), and none of these columns is one; name them: "
+            "--inputs NAMES (inputs= in Python)"
+        )
     if data.u.shape[1] != model.inputs:
         raise InputError(f"{where}: {data.u.shape[1]} input(s) u are recorded, the model takes {model.inputs}")
     return data.inputs_of_steps()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +21,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 
+HAIR = 1e-6  # of a step: recorded times are rounded
 Numbers = float | Sequence | np.ndarray | Tensor
 
 
@@ -36,6 +38,8 @@ class Steppable(Protocol):
     def arrival(self) -> Arrival: ...  # noqa: D102
     @property
     def h(self) -> float: ...  # noqa: D102
+    @property
+    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
         """State and time at the last training sample of a trajectory."""
@@ -88,11 +92,23 @@ def free_motion(
     time = time if t0 is None else t0
     dtype = state.q.dtype
     u, times = _inputs(run, inputs, (time, steps, h), (trajectory, q0 is not None and t0 is None))
+    _warn_of_steps(run, times)
     step: Any = times.diff().to(dtype) if isinstance(inputs, (str, Path, Trajectories)) else (h or run.h)
     with torch.no_grad():
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
     arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit)
+
+
+def _warn_of_steps(run: Steppable, times: Tensor) -> None:
+    """Warn of steps that the model was not fitted to, as the command line does."""
+    (low, high), steps = run.h_range, times.diff()
+    if float(steps.min()) < low * (1 - HAIR) or float(steps.max()) > high * (1 + HAIR):
+        warnings.warn(
+            f"steps of {float(steps.mean()):g} {run.data.time_unit} are outside of {low:g} to {high:g}, those that the "
+            "model was fitted to; run.at_step(h) steps the same motion at another h",
+            stacklevel=5,
+        )
 
 
 def _given(run: Steppable, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:
@@ -110,7 +126,7 @@ def _inputs(
     """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
     (time, steps, h), (trajectory, from_first) = span, recording
     if isinstance(inputs, (str, Path, Trajectories)):
-        found = recorded(inputs, trajectory, run.data.time_unit, run.arrival)
+        found = recorded(inputs, trajectory, run.data.time_unit, run.arrival, run.data.columns)
         return driven(found, float(found.t[0]) if from_first else time, steps, h)
     times = even_times(time, h or run.h, steps)
     if inputs is None:

@@ -241,7 +241,7 @@ class Run:
         """
         reading, others = split_options(settings)
         others.setdefault("same_zeros", "sensor_zeros" in reading)
-        return predict(self, as_trajectories(data, **reading), **others)
+        return predict(self, as_trajectories(data, like=self.data, **reading), **others)
 
     def plot(self, name: str = "trajectory") -> Any:
         """A matplotlib `Figure`; `savefig` writes it.

@@ -25,6 +25,7 @@ from herglotz.training.run import Run
 FORMAT = 1  # of the folder; a change that older versions cannot read raises it
 FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
 MANIFEST = "manifest.json"
+LOG = "history.csv"  # for people; nothing reads it back
 REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
 
 
@@ -112,7 +113,7 @@ def save_run(run: Run, folder: str | Path) -> None:
     }
     digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
     contents[MANIFEST] = _json_bytes({"format": FORMAT, "herglotz": herglotz.__version__, "files": digests})
-    contents["history.csv"] = _log(run.history)  # for people; nothing reads it back
+    contents[LOG] = _log(run.history)
     for name, content in contents.items():
         write_atomically(folder / name, content)
 
@@ -136,6 +137,8 @@ def load_run(folder: str | Path) -> Run:
         If a file is missing, damaged, changed, of another run or of another format.
     """
     folder = Path(folder)
+    if folder.is_file():
+        raise InputError(f"{folder}: is a file, and no run; fit data first: herglotz fit {folder} --out RUN")
     if not (folder / "model.pt").is_file():
         raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
     contents = _bound(folder)

@@ -142,7 +142,7 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
     follows = metrics.get("follows_data", True) and worst <= errors.lost
     if not follows or not math.isfinite(free):
         return f"{FAILS}: {errors}. Try {_remedy(metrics, errors.windows > errors.lost)}"
-    if errors.windows > HALF * errors.spread and not metrics.get("gain_over_mean", 0.0) > CLEARLY:
+    if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
     chance = 0.0 if ahead is None else BURIED * ahead.start * errors.spread
     if free > max(errors.lost, chance):

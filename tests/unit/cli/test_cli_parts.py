@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import pytest
 import torch
 
-from herglotz.cli import SIGNALS, _internal, _orderly, main, rollout
+from herglotz.cli import SIGNALS, _internal, _orderly, rollout
 from herglotz.cli.common import print_table
 from herglotz.cli.tune import _whole
 from herglotz.errors import InputError
@@ -70,11 +70,3 @@ def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothin
     assert (found.names, found.units, found.angles, found.time_unit) == (("q1", "q2"), ("1", "1"), (False, False), "s")
     file.metadata = {"box": None, "angles": [True, False]}
     assert rollout.read_source(Path("a.onnx"), 0).units == ("rad", "1")
-
-
-def test_the_time_of_a_step_is_told(
-    tiny_run, tmp_path, monkeypatch, capsys
-):  # fails if it is not in µs, or of all steps
-    monkeypatch.setattr(rollout, "time", SimpleNamespace(perf_counter=iter([1.0, 1.01]).__next__))
-    assert main(["rollout", str(tiny_run), "--steps", "5", "--out", str(tmp_path / "a.npz")]) == 0
-    assert "2000 µs each" in " ".join(capsys.readouterr().out.split())

@@ -13,6 +13,7 @@ from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
 from herglotz.export import compare, load_exported
+from herglotz.export.load import read_header
 from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
@@ -100,13 +101,25 @@ def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--h", "0.05"]) == 0
         note = "note: steps of 0.05 s are outside of 0.2 to 0.2, those that the model was fitted to"
-        assert note in capsys.readouterr().err
+        assert note in " ".join(capsys.readouterr().err.split())
     assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", "0.2", "--force"]) == 0
     assert main(["rollout", out, *motion, "--h", "0.05", "--q0", "0.1", "--p0", "0"]) == 0
     assert "note" not in capsys.readouterr().err
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--q0", "0.1", "--p0", "30"]) == 0
-        assert "note: from step 0 on, the motion leaves the range of states" in capsys.readouterr().err
+        assert "from step 0 on, the motion leaves the range of states" in " ".join(capsys.readouterr().err.split())
+
+
+def test_the_prefix_of_a_header(tiny_run, tmp_path, capsys):
+    # fails if --name is not the prefix, or is taken in silence where it means nothing
+    out = tmp_path / "a.h"
+    assert main(["export", str(tiny_run), "--out", str(out), "--name", "arm"]) == 0
+    assert "arm_step(" in out.read_text()
+    assert read_header(out)[1]["name"] == "arm"
+    assert main(["export", str(tiny_run), "--out", str(tmp_path / "a.onnx"), "--name", "arm"]) == 2
+    assert "is of C headers only" in capsys.readouterr().err
+    assert main(["export", str(tiny_run), "--out", str(out), "--force", "--name", "2 arms"]) == 2
+    assert "must be a C identifier" in capsys.readouterr().err
 
 
 def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys):

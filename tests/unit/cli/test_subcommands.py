@@ -332,4 +332,18 @@ def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # 
     result.metrics["verdict"] = "does not fit: it misses 1"
     save_run(result, tmp_path / "run")
     assert main(["trust", str(tmp_path / "run"), "--out", str(tmp_path)]) == 0
-    assert "warning: the run does not fit its data" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert "warning: the run does not fit its data" in said
+    assert max(map(len, said.splitlines())) <= 80
+    from herglotz.cli.fit import report
+
+    report(result, tmp_path / "run", [])
+    assert "herglotz export" not in capsys.readouterr().out  # fails if such a model is recommended for use
+
+
+@pytest.mark.parametrize("command", ["report", "trust", "predict", "export", "rollout"])
+def test_data_is_no_run(command, tiny_csv, capsys):  # fails if a csv file is called a folder without a model
+    more = {"predict": [str(tiny_csv)], "export": ["--out", "a.h"], "rollout": ["--steps", "5", "--out", "a.csv"]}
+    assert main([command, str(tiny_csv), *more.get(command, [])]) == 2
+    remedy = f"{tiny_csv}: is a file, and no run; fit data first: herglotz fit {tiny_csv} --out RUN"
+    assert remedy in capsys.readouterr().err

@@ -54,6 +54,7 @@ def test_bad_data(tmp_path, capsys, name, command):  # fails if a bad file reach
         ("--seed", "-1", "whole number"),
         ("--seed", str(2**63), "below 2^63"),
         ("--config", "nowhere", "no such file"),
+        ("--config", "/dev/zero", "/dev/zero: is a pipe or a device"),
         ("--frequency", "-1", "must be > 0"),
         ("--device", "tpu9", "unknown device"),
         ("--angles", "phi", "phi"),

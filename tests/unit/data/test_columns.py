@@ -9,7 +9,7 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.flags import columns_of
 from herglotz.cli.parser import build_parser
-from herglotz.data import Trajectories, load, save
+from herglotz.data import Trajectories, as_trajectories, load, save
 from herglotz.data.table import from_frame
 from herglotz.data.units import in_degrees, size
 from herglotz.errors import InputError
@@ -163,3 +163,27 @@ def test_irregular_sampling_is_called_so():  # fails if every long step of an ir
     regular = Trajectories.of(t, np.arange(197.0))
     assert not regular.irregular
     assert regular.summary().endswith("2 gaps")
+
+
+def test_columns_mean_what_they_meant_in_another_recording(tmp_path):
+    # fails if `volts`, which a fit was told to be its input, is a coordinate of the next file, or the order of inputs,
+    # coordinates and angles is the file's
+    text = "t,phi,x[m],volts,amps\n" + rows([0, 1, 2], [3, 3.1, -3.1], [5, 6, 7], [8, 9, 7], [1, 2, 4])
+    told = read(tmp_path, text, inputs=["volts", "amps"], angles="phi")
+    again = "t,amps,x[m],phi,volts,extra\n" + rows(
+        [0, 1, 2], [1, 2, 4], [5, 6, 7], [3, 3.1, -3.1], [8, 9, 7], [0, 0, 0]
+    )
+    found = read(tmp_path, again, like=told, drop="extra")
+    assert (found.names, found.angles, found.units) == (told.names, told.angles, told.units)
+    assert torch.equal(found.u, told.u)  # type: ignore[arg-type]
+    assert torch.equal(found.q, told.q)  # unwrapped across π
+    ramp = np.arange(3.0)
+    frame = {"t": ramp, "volts": ramp, "phi": ramp, "x[m]": ramp, "amps": ramp}
+    assert as_trajectories(frame, like=told).angles == (True, False)
+    assert read(tmp_path, again, like=told, inputs="extra").u[:, 0].tolist() == [0, 0, 0]  # type: ignore[index]
+
+
+def test_an_angle_of_another_recording_in_degrees_is_not_assumed(tmp_path):
+    # fails if numbers without a unit become radians because the first file, in degrees, was converted to them
+    told = read(tmp_path, "t,phi[deg]\n0,10\n1,20\n2,30\n")
+    assert read(tmp_path, "t,phi\n0,10\n1,20\n2,30\n", like=told).units == ("1",)

@@ -49,6 +49,19 @@ def test_a_rollout_beyond_the_recording_is_refused(t0, steps, h, message):  # fa
         driven(RECORDING, t0, steps, h)
 
 
+def test_times_and_inputs_suffice(tmp_path):
+    # fails if a file that drives a model must hold positions, or an input is known by the names of inputs alone
+    path = tmp_path / "drive.csv"
+    path.write_text("t[ms],volts\n0,1\n100,2\n200,4\n")
+    found = recorded(path, 0, "s", known=[["t", "time", "s"], ["volts", "input", ""]])
+    assert (found.t.tolist(), found.u.tolist()) == ([0, 0.1, 0.2], [[1], [2], [4]])  # type: ignore[union-attr]
+    path.write_text("t,torque\n0,1\n1,2\n2,4\n")
+    assert recorded(path, 0, "s").u.tolist() == [[1], [2], [4]]  # type: ignore[union-attr]
+    path.write_text("t,x\n0,1\n1,2\n2,4\n")
+    with pytest.raises(InputError, match="holds no inputs, only t, x; name their columns u, u_\\*, force or torque"):
+        recorded(path, 0, "s")
+
+
 def test_the_recording_of_the_trajectory(tmp_path):  # fails if trajectory 0 drives all, or minutes are read as seconds
     second = Trajectories.of(T, T, u=2 * torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0]).double())
     save(tmp_path / "u.npz", Trajectories.cat([RECORDING, second]))

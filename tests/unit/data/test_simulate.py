@@ -9,6 +9,7 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.errors import InputError
+from herglotz.scenes import scene
 
 
 @dataclass(frozen=True)
@@ -169,3 +170,11 @@ def test_the_real_damped_pendulum():  # fails if scenes and `simulate` disagree 
     velocity = (triples.q2 - triples.q0) / 0.2
     assert (residual + 0.2 * velocity).abs().max() < 0.01
     assert residual.abs().max() > 0.1
+
+
+def test_the_name_of_a_scene_is_enough():  # fails if a name is refused, or the numbers are not those of the command
+    data = simulate("duffing")
+    assert (data.lengths, data.typical_step) == ((101,) * 4, pytest.approx(0.1))
+    assert data.digest() == simulate(scene("duffing"), trajectories=4, steps=100, h=0.1).digest()
+    with pytest.raises(InputError, match="unknown scene 'duff'"):
+        simulate("duff")

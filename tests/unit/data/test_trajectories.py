@@ -303,6 +303,6 @@ def test_digest_sees_contents_only():  # fails if a field does not enter the dig
 
 
 def test_summary():  # fails if a count, a unit or the gaps are missing
-    assert full().summary() == "set: 3 trajectories, 13 samples of x [1], y [1], s, p, u; step 0.1 s, 2 gaps"
+    assert full().summary() == "set: 3 trajectories, 13 samples of x [1], y [1], s, p, input u; step 0.1 s, 2 gaps"
     one = Trajectories.of([0, 1, 2], [0, 1, 2], time_unit="1", names=("x",), units=("m",))
     assert one.summary() == "trajectories: 1 trajectory, 3 samples of x [m]; step 1"

@@ -133,6 +133,8 @@ def test_mistakes_in_texts_are_named():
         "1.1.1 q1": "'1.1' and '.1' stand side by side",
         "2 q1 3": "has two numbers in one product",
         "1e999 q1": "the number 1e999 is too large",
+        "1e-400 q1": "the number 1e-400 is too small",
+        "cos(1e308 q1 + 1e308 q1)": "the factors of q1 add up to a number that is too large",
         "v1^1000000000": "a power must be at most 16, got 1000000000",
         "q99999999999999999999": "there is no coordinate 99999999999999999999",
         "q1 *": r"cannot read 'q1 \*'",

@@ -29,9 +29,9 @@ def test_a_rollout_is_numpy_without_gradients():
 
 def test_a_start_may_be_numbers_or_a_batch():  # fails if a number, a list or an array is refused, or s0 is dropped
     run = fake_run()
-    one = run.rollout(4, q0=1.0, p0=0.2, s0=0.5, h=0.1, t0=3.0)
-    many = run.rollout(4, q0=np.array([[1.0], [0.3]]), p0=[[0.2], [0.0]], h=0.1)
-    assert (one.s[0], one.t[-1], many.q.shape) == (0.5, 3.4, (2, 5, 1))
+    one = run.rollout(4, q0=1.0, p0=0.2, s0=0.5, h=0.2, t0=3.0)
+    many = run.rollout(4, q0=np.array([[1.0], [0.3]]), p0=[[0.2], [0.0]], h=0.2)
+    assert (one.s[0], one.t[-1], many.q.shape) == (0.5, 3.8, (2, 5, 1))
     np.testing.assert_allclose(one.q, many.q[0], atol=1e-12)
     with pytest.raises(InputError, match="q0 and p0 go together"):
         run.rollout(4, q0=1.0)
@@ -39,6 +39,13 @@ def test_a_start_may_be_numbers_or_a_batch():  # fails if a number, a list or an
         run.rollout(4, q0=[1.0, 2.0], p0=[0.0, 0.0])
     with pytest.raises(InputError, match="there is no trajectory 3"):
         run.rollout(4, trajectory=3)
+
+
+def test_steps_beyond_those_of_the_fit_are_warned_of():  # fails if Python is silent where the command line is not
+    run = fake_run()
+    with pytest.warns(UserWarning, match=r"steps of 0.5 s are outside of 0.2 to 0.2, those that the model was fitted"):
+        run.rollout(2, h=0.5)
+    run.rollout(2, h=0.2)  # its own step: warnings are errors here
 
 
 def test_words_are_short():  # fails if a run, data or a prediction fill the screen again (repr had 64 kB)

@@ -10,6 +10,7 @@ from herglotz.data import Trajectories, simulate
 from herglotz.data.roughness import precision
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, verdict
+from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
 from herglotz.training.verdict import AT_THE_NOISE, Errors, in_words
 
@@ -100,6 +101,14 @@ def test_motion_under_much_noise_is_seen():  # fails if noise of half the motion
     buried = Errors(0.7, 0.7, 0.7, noise=0.7, spread=1.0)
     assert in_words(buried, KNOWN, {**GOOD, "gain_over_mean": 5.0}).startswith("fits to the noise")
     assert in_words(buried, KNOWN, {**GOOD, "gain_over_mean": 1.0}).startswith("does not fit: no motion")
+    assert in_words(buried, KNOWN, {**GOOD, "gain_over_mean": None}).startswith("does not fit: no motion")
+
+
+def test_a_free_run_that_breaks_off_has_no_gain():
+    # fails if it is nan, which metrics.json cannot hold: the run is lost at the end of its fit
+    broken = torch.tensor([[0.1], [math.nan]])
+    assert _gain(broken, torch.ones(2, 1)) is None
+    assert (_gain(broken[:1].expand(2, 1), torch.ones(2, 1)) or 0.0) > 0
 
 
 def test_short_data_have_no_precision():

@@ -16,7 +16,7 @@ from herglotz.data import simulate
 from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
 from herglotz.errors import InputError
 from herglotz.export import load_c, load_exported, load_onnx, load_pt2
-from herglotz.export.metadata import check_metadata, describe
+from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, load_run, save_run
 from herglotz.training.run_folder import FILES, MANIFEST
@@ -159,12 +159,20 @@ def test_metadata_of_a_wrong_type(model):
             check_metadata({**good, name: value}, "a.onnx")
 
 
+@pytest.mark.parametrize("text", ["[" * 100_000, '{"format": ' + "1" * 5000 + "}", "{", "", None, "[]"])
+def test_metadata_that_python_does_not_read(text):
+    # fails if brackets beyond Python's recursion, or digits beyond its bound, end in a traceback
+    with pytest.raises(InputError, match=r"a\.onnx: has no herglotz metadata"):
+        from_json(text, "a.onnx")
+
+
 @pytest.mark.parametrize(
     ("name", "key", "value"),
     [
         ("model.pt", "h", "0.1"), ("model.pt", "states", {}), ("model.pt", "train_lengths", [3, 4]),
         ("model.pt", "box", {"q_low": ["a"]}), ("model.pt", "model", {"level": 3}), ("model.pt", "history", None),
         ("model.pt", "parameters", {}), ("config.json", "seed", "zero"), ("config.json", "unheard_of", 1),
+        ("model.pt", "h", 10**400), ("config.json", "train_fraction", 10**400), ("config.json", "seed", 2**63),
         ("metrics.json", "verdict", 7), ("metrics.json", "outlier_samples", ["a"]),
     ],
 )  # fmt: skip

@@ -15,7 +15,8 @@ from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, tune
 from herglotz.tune.config import allowed_failures
 from herglotz.tune.cost import Cost, Timed, measure_costs
 from herglotz.tune.distil import FlowProblem, pairs_of, widened
-from herglotz.tune.reference import draw_starts, record
+from herglotz.tune.local_error import flag_unresolved, local_errors
+from herglotz.tune.reference import JITTER, draw_starts, record
 from herglotz.tune.search import bound_of, choose
 
 H = 0.2
@@ -111,6 +112,34 @@ def test_starts_lie_in_the_box_and_differ_with_the_seed():
     assert not torch.equal(a.q, b.q)
     assert torch.equal(a.q, draw_starts(run, 60, 0).q)
     assert not torch.isin(a.q, run.states.q).all()
+
+
+def test_starts_lie_on_both_sides_of_recorded_states():
+    # fails if states are moved one way only, or further than they should
+    run = run_of()
+    still = replace(run, states=State(*(torch.zeros_like(x) for x in run.states)))
+    for name, x in zip("qp", draw_starts(still, 60, 0), strict=False):
+        most = JITTER * (run.box[f"{name}_high"][0] - run.box[f"{name}_low"][0])
+        assert float(x.min()) < -0.8 * most
+        assert 0.8 * most < float(x.max()) <= most
+
+
+def test_local_errors_are_those_of_two_half_steps():
+    # fails if a list of steps is taken for one step, a scalar for a list, or the error is not relative to the move
+    stepper, start = Stepper(run_of().model), torch.tensor([[0.7]], dtype=torch.float64)
+    steps = torch.tensor([0.1, 0.4, 0.2], dtype=torch.float64)
+    with torch.no_grad():
+        out, even = stepper.rollout(start, start, h=steps), stepper.rollout(start, start, h=H, steps=3)
+        for rollout, sizes in ((out, steps), (even, torch.full_like(steps, H))):
+            found = local_errors(stepper, rollout, steps if rollout is out else H)
+            for k, h in enumerate(sizes.tolist()):
+                half = stepper.rollout(rollout.q[:, k], rollout.p[:, k], rollout.s[:, k], h=h / 2, steps=2).q[0, 2, 0]
+                q0, q1 = rollout.q[0, k : k + 2, 0]
+                assert float(found[0, k]) == pytest.approx(float((q1 - half).abs() / max(abs(q1 - q0), abs(half - q0))))
+    with pytest.raises(InputError, match="h lists 2 steps, but 3 were kept"):
+        local_errors(stepper, out, steps[:2])
+    assert flag_unresolved(stepper, out, steps, float(found.max()) / 2).status.max() > 0
+    assert flag_unresolved(stepper, out, steps, 1.0).status.max() == 0
 
 
 @pytest.mark.parametrize("level", ["conservative", "linear", "affine"])
