@@ -86,6 +86,14 @@ def test_a_wrong_dissipation_fails(factor):
     assert not checks["dissipation"].passed
 
 
+def test_the_null_models_leave_the_run_as_it_was():
+    # fails if a null model of dissipation shares its rate with the run
+    run = run_of()
+    assert "dissipation" in named(run)[0]
+    assert run.model.damping is not None
+    assert run.model.damping.rate.tolist() == pytest.approx(0.2, rel=1e-15)
+
+
 @pytest.mark.parametrize("noise", [0.0, 0.01])
 def test_no_dissipation_where_there_is_none_passes(noise):
     # fails if any rate that follows a little better, by chance or for the rule, refuses a conservative motion
