@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.stepping import OneStepMethod, State
 from herglotz.threads import one_thread
 from herglotz.training import FitConfig, fit
@@ -165,14 +165,23 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
 
 
 def _matrix(name: str, x: Any) -> np.ndarray:
-    """(N,) or (N, m) finite numbers as (N, m) float64."""
+    """(N,) or (N, m) finite numbers as (N, m) float64; the messages are those that scikit-learn looks for."""
+    refuse({
+        f"{name}: this estimator requires {name} to be passed, but the target {name} is None": x is None,
+        f"{name}: sparse input is not supported; give {name}.toarray()": hasattr(x, "toarray"),
+    })  # fmt: skip
     try:
-        found = np.asarray(x, dtype=np.float64)
+        raw = np.asarray(x)
+        found = None if raw.dtype.kind == "c" else raw.astype(np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not numbers ({error})") from None
+    if found is None:
+        raise InputError(f"{name}: Complex data not supported; give real numbers")
     found = found[:, None] if found.ndim == 1 else found
+    if found.shape[1:] == (0,):
+        raise InputError(f"{name}: 0 feature(s) (shape={found.shape}) while a minimum of 1 is required: a column")
     if found.ndim != 2 or not found.size:
         raise InputError(f"{name} must be (N,) or (N, m) with N ≥ 1, got shape {found.shape}")
     if not np.isfinite(found).all():
-        raise InputError(f"{name}: row {int((~np.isfinite(found)).any(1).argmax())} is not finite; drop that row")
+        raise InputError(f"{name}: row {int((~np.isfinite(found)).any(1).argmax())} is NaN or inf; drop that row")
     return found

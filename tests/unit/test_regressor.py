@@ -125,6 +125,21 @@ def test_a_missing_package_is_named(monkeypatch):  # fails if a newcomer sees a 
         importlib.import_module("herglotz.regressor")
 
 
+@pytest.mark.parametrize(
+    ("X", "y", "message"),
+    [
+        ([0.0, 1.0], None, "requires y to be passed, but the target y is None"),
+        ([0.0, 1.0], [1.0, 1j], "y: Complex data not supported"),
+        (np.zeros((2, 0)), [1.0, 2.0], "X: 0 feature"),
+        ([0.0, np.nan], [1.0, 2.0], "X: row 1 is NaN or inf; drop that row"),
+        (types.SimpleNamespace(toarray=None), [1.0], "X: sparse input is not supported"),
+    ],
+)
+def test_what_is_no_table_of_numbers_is_refused(regressor, X, y, message):  # fails if a fit begins, or numpy complains
+    with pytest.raises(InputError, match=message):
+        regressor().fit(X, y)
+
+
 @pytest.mark.skipif(not INSTALLED, reason="scikit-learn is an extra")
 def test_the_checks_of_scikit_learn_that_apply(regressor):
     # fails if a parameter is changed by the constructor, or an unfitted model predicts. The checks that fit X of
@@ -135,7 +150,9 @@ def test_the_checks_of_scikit_learn_that_apply(regressor):
 
     model = regressor(seed=3)
     for name in ("no_attributes_set_in_init", "parameters_default_constructible", "get_params_invariance",
-                 "set_params", "estimator_cloneable", "estimator_repr"):  # fmt: skip
+                 "set_params", "estimator_cloneable", "estimator_repr", "complex_data",
+                 "estimators_empty_data_messages", "estimator_sparse_array", "estimator_sparse_matrix",
+                 "requires_y_none"):  # fmt: skip
         check = getattr(checks, f"check_{name}")
         check("HerglotzRegressor", model if name in ("estimator_cloneable", "estimator_repr") else regressor())
     assert clone(model).get_params() == model.get_params()

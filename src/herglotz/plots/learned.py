@@ -29,6 +29,7 @@ Curves = list[Tensor]  # the curve and, with a posterior, its standard deviation
 def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     """Draw V(q_i) and the force −∂V/∂q_i along each coordinate, the others at their median; and friction, if any.
 
+    Friction is the force against the velocity at rest of all else: −γ m v of the contact term, and named friction.
     Where the mass depends on position, its entries m_jk that do are drawn along each coordinate, too. The first mass
     is 1, so that forces are accelerations of the first coordinate. The range of the training data is shaded: beyond
     it the model extrapolates.
@@ -41,10 +42,13 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
         Adds bands of two standard deviations.
     """
     columns = min(run.data.dof, MOST_COLUMNS)
-    rubs, entries = run.model.friction is not None, _moving_masses(run)
+    rubs = run.model.friction is not None or isinstance(run.model.damping, LinearDamping)
+    entries = _moving_masses(run)
     rows = 2 + rubs + bool(entries)
     momentum = momentum_unit(run)
     force = momentum + "²" if momentum and run.data.time_unit not in ("", "1") else ""  # rad/s, rad/s²
+    length = "" if run.data.units[0] == "1" else run.data.units[0]
+    energy = force.replace(length, f"{length}²", 1) if length else force  # rad²/s²: the first mass is 1
     with styled():
         figure = new_figure(1.2 + 3.9 * columns, 2.3 * rows + 0.5, "What the model has learned, mass 1")
         axes = figure.subplots(rows, columns, squeeze=False)
@@ -52,7 +56,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
             x, low, high = _range(run.states.q[trained_mask(run), i])
             name = with_unit(run.data.names[i], run.data.units[i])
             _panel(axes[0, i], x, _curves(posterior, _potential(run, i, x)), (low, high))
-            axes[0, i].set(xlabel=name, ylabel="potential V")
+            axes[0, i].set(xlabel=name, ylabel=with_unit("potential V", energy))
             _panel(axes[1, i], x, _curves(posterior, _force(run, i, x)), (low, high))
             axes[1, i].set(xlabel=name, ylabel=with_unit(r"force $-\partial V/\partial q$", force))
             if rubs:
@@ -116,11 +120,11 @@ def _friction(run: Run, i: int, v: Tensor) -> Callable[[], Tensor]:
     speeds[:, i] = v.to(speeds)
 
     def f() -> Tensor:
-        assert friction is not None
-        smooth = friction.force(speeds, None).value
-        held = friction.grip(speeds)[0] * speeds.sign() if friction.sticking else 0.0
-        contact = damping.rate * speeds @ m if isinstance(damping, LinearDamping) else 0.0
-        return (smooth - held - contact)[:, i]
+        force = -damping.rate * speeds @ m if isinstance(damping, LinearDamping) else torch.zeros_like(speeds)
+        if friction is not None:
+            held = friction.grip(speeds)[0] * speeds.sign() if friction.sticking else 0.0
+            force = force + friction.force(speeds, None).value - held
+        return force[:, i]
 
     return f
 

@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 MOST_PANELS, DATA = 4, "#B5B5B5"
 # Shares that have a word.
+ROOM_FOR_RMS = 0.2  # of the axis: its caption takes 0.15 of a figure of one panel
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 
@@ -182,7 +183,7 @@ def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, un
     bottom.set_ylim(-1.25 * (reach or 1.0), 1.9 * (reach or 1.0))  # room for the RMS above the points
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
-        if len(part):
+        if len(part) and (where or split == 0.0 or split > ROOM_FOR_RMS):
             text = f"RMS {number(math.sqrt(float(np.mean(part**2))), unit)}"
             place = {"xycoords": bottom.get_xaxis_transform(), "xytext": (5, -2), "va": "top"}
             label(bottom, t[0] + where * (t[-1] - t[0]), 1.0, text, color, **place)

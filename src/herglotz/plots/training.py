@@ -36,7 +36,8 @@ def plot_training(run: Run) -> Figure:
     """
     if not run.history:
         raise InputError("the run has no history of its cost; fit it again to get one")
-    stages = [(name, [float(row["cost"]) for row in rows]) for name, rows in groupby(run.history, lambda r: r["stage"])]
+    every = [(name, [float(row["cost"]) for row in rows]) for name, rows in groupby(run.history, lambda r: r["stage"])]
+    stages = [stage for stage in every if len(stage[1]) > 1] or every  # a single cost: the stage had nothing to do
     shown = stages[-MOST_PANELS:]
     columns = min(COLUMNS, len(shown))
     rows = math.ceil(len(shown) / columns)

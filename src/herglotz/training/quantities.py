@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import torch
@@ -33,7 +34,15 @@ class Quantity:
     std: float
 
     def __str__(self) -> str:
-        return f"{self.value:.5g} ± {self.std:.2g} {self.unit}".rstrip()
+        return f"{rounded(self.value, self.std)} ± {self.std:.2g} {self.unit}".rstrip()
+
+
+def rounded(value: float, std: float) -> str:
+    """The value to the second digit of its standard deviation, at most five digits, with a minus sign."""
+    digits = 5
+    if value and 0 < std < math.inf:
+        digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std))
+    return ("−" if value < 0 else "") + f"{abs(value):.{min(max(digits, 1), 5)}g}"
 
 
 def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
@@ -52,6 +61,8 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
 
 
 def _unit(name: str, run: Run, i: int) -> str:
+    if name == "friction.input_zero":
+        return run.data.input_labels[i][1]
     if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
         return ""
     length, time = DIMENSIONS[name]

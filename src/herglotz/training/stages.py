@@ -155,7 +155,8 @@ class Stages:
             began = time.monotonic()
             result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", told))
             if self.lines:
-                took = f"{result.iterations} iterations, {time.monotonic() - began:.1f} s"
+                count, seconds = result.iterations, time.monotonic() - began
+                took = f"{count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s"
                 print(f"{name}: {took}", file=sys.stderr, flush=True)
             self._store(name, result)
         start = len(self.history)

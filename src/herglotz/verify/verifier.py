@@ -9,6 +9,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces, partials
+from herglotz.mechanics.legendre import beyond, unheld_residual
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
@@ -176,12 +177,20 @@ def _not_judged(known: Subject) -> str:
 
 
 def _forces(known: Subject, w: SampledRollout) -> Forces | None:
-    """Return F⁻ and F⁺ at the steps that are ok; None where the subject has no forces."""
+    """Return F⁻ and F⁺ at the steps that are ok; None where the subject has no forces.
+
+    Of a coordinate that dry friction holds, F⁻ has what holds it: all of D1 + c p0 + F⁻ that friction can.
+    """
     if known.L_d is None:
         return None
-    q0, q1, s0 = w.q[:, :-1][w.ok], w.q[:, 1:][w.ok], w.s[:, :-1][w.ok]
+    q0, q1, p0, s0 = (*(w.q[:, k : w.steps + k][w.ok] for k in (0, 1)), w.p[:, :-1][w.ok], w.s[:, :-1][w.ok])
     with torch.no_grad():
-        return partials(known.L_d, q0, q1, s0, known.h).force
+        P = partials(known.L_d, q0, q1, s0, known.h)
+        force = P.force
+        if force is None or force.held is None:
+            return force
+        F = unheld_residual(P, p0)
+        return replace(force, minus=force.minus - F + beyond(F, force.held))
 
 
 def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:

@@ -35,6 +35,7 @@ from herglotz.plots import (
     save_figure,
     save_figures,
 )
+from herglotz.plots.motion import plot_prediction
 from herglotz.stepping import State
 from herglotz.training import Bands, Run
 
@@ -117,13 +118,13 @@ def test_the_plan_has_a_box_for_every_reason():
 def test_a_mass_that_depends_on_position_is_drawn():
     # fails if the mass is not m(q), an entry that is constant is drawn, or a constant mass gets a row
     run = fake_run(dof=2, steps=20)
-    assert len(plot_learned(run).axes) == 2 * 2
+    assert len(plot_learned(run).axes) == 3 * 2
     one = (1.0, 1.0)
     config = ModelConfig((True, True), "linear", one, one, one, (0.0, 0.0), potential_width=0,
                          known=("0.3 cos(q1 - q2) v1 v2",))  # fmt: skip
     figure = plot_learned(replace(run, model=ContactLagrangian(config)))
-    assert len(figure.axes) == 3 * 2
-    drawn = figure.axes[4].lines  # the line at 0, and m12 = 0.3 cos(q1 − q2) with q2 at its median
+    assert len(figure.axes) == 4 * 2
+    drawn = figure.axes[6].lines  # the line at 0, and m12 = 0.3 cos(q1 − q2) with q2 at its median
     assert len(drawn) == 2
     q1, m12 = drawn[1].get_xdata(), np.asarray(drawn[1].get_ydata())
     q2 = float(run.states.q[:, 1].median())
@@ -265,7 +266,10 @@ def test_stages_are_separate_lines():  # fails if costs of different objectives 
 
 def test_what_is_learned_is_the_models_own():  # fails if a panel shows another function, or another coordinate's
     run = fake_run(steps=40)
-    potential, force = plot_learned(run).axes
+    potential, force, friction = plot_learned(run).axes
+    assert [ax.get_ylabel() for ax in (potential, friction)] == ["potential V (rad²/s²)", "friction (rad/s²)"]
+    v, f = (np.asarray(x) for x in friction.lines[1].get_data())
+    np.testing.assert_allclose(f, -0.201 * v, atol=1e-12)  # fails if damping by the contact form is not friction
     x, V = (np.asarray(v) for v in potential.lines[1].get_data())
     _, f = (np.asarray(v) for v in force.lines[1].get_data())
     np.testing.assert_allclose(f[1:-1], -(V[2:] - V[:-2]) / (x[2] - x[0]), atol=2e-3 * np.abs(f).max())
@@ -296,3 +300,21 @@ def test_no_display_and_no_pyplot_needed():  # fails if pyplot, and with it a wi
     code = "import sys, herglotz.plots; sys.exit('matplotlib.pyplot' in sys.modules)"
     environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "MPLBACKEND")}
     assert subprocess.run([sys.executable, "-c", code], env=environment, check=False).returncode == 0
+
+
+def test_a_stage_with_nothing_to_do_has_no_panel():  # fails if one cost is drawn as a curve over −0.03 to 0.03
+    run = fake_run(steps=12)
+    costs = [{"stage": "states", "iteration": k, "cost": 9.0 - k} for k in range(3)]
+    once = [{"stage": "whole", "iteration": 3, "cost": 7.0}]
+    assert len(plot_training(replace(run, history=costs + once)).axes) == 1
+    assert len(plot_training(replace(run, history=once)).axes) == 1
+
+
+def test_a_short_warm_up_has_no_caption():  # fails if the RMS of a few samples is written under that of the free run
+    run = fake_run(steps=60)
+
+    def captions(warmup):
+        texts = plot_prediction(run.predict(run.data, warmup=warmup)).axes[1].texts
+        return [text.get_text() for text in texts if text.get_text().startswith("RMS")]
+
+    assert (len(captions(6)), len(captions(40))) == (1, 2)

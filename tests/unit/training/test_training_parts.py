@@ -9,7 +9,7 @@ from herglotz.data import Trajectories
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.equation import _baseline
-from herglotz.training.quantities import DIMENSIONS, _unit
+from herglotz.training.quantities import DIMENSIONS, _unit, rounded
 from herglotz.training.structure import dictionary, start_of_features
 from herglotz.training.task import drag_starts_the_fit
 
@@ -29,6 +29,16 @@ def test_units_of_parameters():  # fails if a power of time or length is another
         "kinetic.log_mass": "",
     }
     assert _unit("potential.tilt", run, 1) == "rad/s²"  # type: ignore[arg-type]
+    run.data.input_labels = (("torque", "N m"),)
+    assert _unit("friction.input_zero", run, 0) == "N m"  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("value", "std", "shown"),
+    [(0.30096, 0.4, "0.3"), (1.00131, 0.0013, "1.0013"), (-0.000289, 0.00022, "−0.00029"), (5.0, float("nan"), "5")],
+)
+def test_no_digits_beyond_the_deviation(value, std, shown):  # fails if 0.30096 ± 0.4 claims five digits
+    assert rounded(value, std) == shown
 
 
 @pytest.mark.parametrize(

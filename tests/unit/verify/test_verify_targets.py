@@ -1,6 +1,7 @@
 """What `verify` takes, what it refuses, and what its report looks like."""
 
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -10,7 +11,7 @@ from herglotz.export import export_pt2, load_pt2
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.verify import Check, Report, verify
+from herglotz.verify import Check, Report, verifier, verify
 
 BOX = {"q_low": [-1.0], "q_high": [1.0], "p_low": [-1.0], "p_high": [1.0], "s_low": [-0.5], "s_high": [0.5]}
 
@@ -168,3 +169,26 @@ def test_a_report_is_json():
 def test_an_empty_report_does_not_pass():
     # fails if no check at all counts as success
     assert not Report("nothing", ()).passed
+
+
+def test_joints_that_friction_holds_verify():
+    # fails if what holds a joint still is left out of F⁻ (the row of the forced contact map then misses by 1e-3), or if
+    # any force may hold it: friction of half the size cannot
+    model = ContactLagrangian(
+        ModelConfig(
+            (False,), "forced", (1.0,), (1.0,), (1.0,), (0.0,), rate=0.1, potential_width=0, coulomb=True, sticking=True
+        )
+    )  # fmt: skip
+    with torch.no_grad():
+        model.get_parameter("friction.coulomb").fill_(2.0)
+    report = verify(model, h=0.05)
+    assert report.passed, report.table()
+    assert report["contact"].value < 1e-12
+    known = verifier.subject(model, 0.05, 256, 0)
+    w = verifier.sampled_rollout(known, 4)
+    held = (w.q[:, 1:] == w.q[:, :-1])[..., 0]
+    assert 0.1 < float(held.double().mean()) < 1
+    with torch.no_grad():
+        model.get_parameter("friction.coulomb").fill_(1.0)
+    w = replace(w, status=torch.where(held, w.status, torch.ones_like(w.status)))  # the others: as if they had failed
+    assert not verifier.contact(w, 1e-11, verifier._forces(known, w)).passed
