@@ -14,6 +14,7 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
@@ -41,8 +42,9 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import joining, prune
+from herglotz.training.pruning import joining
 from herglotz.training.stages import Stages
+from herglotz.training.subsets import likelier
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
@@ -96,7 +98,7 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._one_rate(self._last_terms(self._pruned(found)))
+        return self._one_rate(self._last_terms(self._likeliest(self._pruned(found))))
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
@@ -217,11 +219,13 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1) -> Found | None:
-        """The fit with other terms, steps or samples, from this one."""
+    def _refit(
+        self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1, states: Tensor | None = None
+    ) -> Found | None:
+        """The fit with other terms, steps or samples, from this one, or from these states (S, d) of its segments."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps, every)
         assert problem.path is not None
-        states = problem.path.x[:, 0, : problem.d]
+        states = problem.path.x[:, 0, : problem.d] if states is None else states
         fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
@@ -249,16 +253,34 @@ class DictionarySearch:
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""
         count = self.data.q.numel()
-        terms = self._needed(found, math.log(count))
+        terms = found.needed(math.log(count), self.own, self.floor)
         less = None if terms == found.terms else self._refit(found, terms)
         allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
         return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+
+    def _likeliest(self, found: Found) -> Found:
+        """With the subset of one coordinate's candidates that the criterion prefers, where residuals are noise."""
+        if self.data.dof > 1 or not found.terms.names or (found.coloured and found.rms > self.floor):
+            return found
+        every = replace(self.all, dry=found.terms.dry)  # what shapes dry friction of 0 has no effect
+        stages, problem = self._problem(found, every, found.config.substeps)
+        for better in likelier(found, problem, every, stages.task.config, self.floor):
+            other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
+            if other is not None and self._likelier(other, found):
+                return self._likeliest(self._longer(other))
+        return found
+
+    def _likelier(self, other: Found, found: Found) -> bool:
+        """Whether the Bayesian information criterion prefers the other terms."""
+        count, more = self.data.q.numel(), len(other.terms.names) - len(found.terms.names)
+        gain = count * math.log(max(found.rms, self.floor) / max(other.rms, self.floor))
+        return gain > more * math.log(count) / 2
 
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""
         count = self.data.q.numel()
         for worth in (4**self.order * count, count):  # as much as halved steps may bring, then twice the misfit
-            terms = self._needed(found, worth)
+            terms = found.needed(worth, self.own, self.floor)
             less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
             if less is None or less.rms > (1 + worth / count) ** 0.5 * max(found.rms, self.floor):
                 continue  # far from the minimum it costs more
@@ -270,7 +292,7 @@ class DictionarySearch:
     def _last_terms(self, found: Found) -> Found:
         """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
         while found.terms.names and found.coloured:
-            terms = self._needed(found, 4**self.order * self.data.q.numel(), one_less=True)
+            terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
             less = None if terms == found.terms else self._refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
             if less is None or not self._as_good(less, found):
@@ -300,20 +322,6 @@ class DictionarySearch:
         own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
         return not own <= MARGIN * its
 
-    def _needed(self, found: Found, worth: float, *, one_less: bool = False) -> NamedTerms:
-        """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least."""
-        problem = found.fit.problem
-        at = places(problem.parameters, found.terms)
-        if not at:
-            return found.terms
-        x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])
-        _, A, _ = problem.normal_equations(x)
-        A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
-        free = torch.tensor([i for own in at.values() for i in own])
-        simplest = torch.tensor([i for name in self.own for i in at.get(name, ())], dtype=torch.long)
-        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, simplest)[0].tolist())
-        return found.terms.only([name for name, own in at.items() if stay & set(own)])
-
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
@@ -332,15 +340,4 @@ class DictionarySearch:
             return False
         if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
             return False
-        return self._change(found, 2 * m) > max(FINER * found.rms, FINE * self.floor)
-
-    def _change(self, found: Found, substeps: int) -> float:
-        """RMS change of the fitted motion by so many model steps in a recorded one."""
-        _, problem = self._problem(found, found.terms, substeps)
-        fit = found.fit
-        path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
-        if path is None:
-            return math.inf
-        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
-        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
-        return float(change.square().mean().sqrt())
+        return found.changed_by(self._problem(found, found.terms, 2 * m)[1]) > max(FINER * found.rms, FINE * self.floor)
