@@ -18,7 +18,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import coarse, precision
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
@@ -44,7 +44,7 @@ from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import joining
 from herglotz.training.stages import Stages
-from herglotz.training.subsets import likelier
+from herglotz.training.subsets import likelier, price_of
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
@@ -75,7 +75,8 @@ class DictionarySearch:
         self.precision = precision(data)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
-        self.order = 4 if plain and self.precision < SMOOTH * self.spread else 2
+        self.coarse = coarse(data)
+        self.order = 4 if plain and (self.coarse or self.precision < SMOOTH * self.spread) else 2
 
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
@@ -105,11 +106,16 @@ class DictionarySearch:
         local = local_polynomials(self.data)
         if local is None:
             return None
-        start = smoothed(self.data, local)
+        start, bare = smoothed(self.data, local), None
+        if self.coarse and self.data.dof == 1:  # accelerations are not read off such samples
+            bare = self._grown(*self._bare(), 1, start)
+            if bare is not None and bare.whole and bare.rms <= self.precision:
+                return self._finer(bare)
         families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
-        found = found or self._grown(*self._bare(), 1, start)
+        if found is None or (bare is not None and bare.rms < found.rms):
+            found, linear = bare or self._grown(*self._bare(), 1, start), []
         if found is None:
             return None
         found = self._finer(self._held(self._simpler(found)))
@@ -262,19 +268,18 @@ class DictionarySearch:
         """With the subset of one coordinate's candidates that the criterion prefers, where residuals are noise."""
         if self.data.dof > 1 or not found.terms.names or (found.coloured and found.rms > self.floor):
             return found
-        every = replace(self.all, dry=found.terms.dry)  # what shapes dry friction of 0 has no effect
-        stages, problem = self._problem(found, every, found.config.substeps)
-        for better in likelier(found, problem, every, stages.task.config, self.floor):
+        stages, problem = self._problem(found, self.all, found.config.substeps)
+        for better in likelier(found, problem, self.all, stages.task.config, self.floor):
             other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
             if other is not None and self._likelier(other, found):
-                return self._likeliest(self._longer(other))
+                return self._likeliest(self._held(self._longer(other)))
         return found
 
     def _likelier(self, other: Found, found: Found) -> bool:
-        """Whether the Bayesian information criterion prefers the other terms."""
-        count, more = self.data.q.numel(), len(other.terms.names) - len(found.terms.names)
-        gain = count * math.log(max(found.rms, self.floor) / max(other.rms, self.floor))
-        return gain > more * math.log(count) / 2
+        """Whether the criterion of `subsets` prefers the other terms."""
+        count = self.data.q.numel()
+        price, its = (price_of(len(f.terms.names), len(self.all.names), math.log(count)) for f in (found, other))
+        return count * math.log(max(found.rms, self.floor) / max(other.rms, self.floor)) > its - price
 
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""

@@ -22,6 +22,14 @@ from herglotz.training.problems.shooting import ShootingProblem
 TRIED = 3  # subsets that are proposed: the quadratic model orders them, and fits decide
 
 
+def price_of(size: int, of: int, worth: float) -> float:
+    """What so many terms out of `of` candidates have to lower the cost by: ½ `worth` each, and log of the choices.
+
+    The extended criterion of Chen & Chen (2008): of many subsets some lower the cost much by chance.
+    """
+    return size * worth / 2 + math.log(math.comb(of, size))
+
+
 class Better(NamedTuple):
     """Terms that may be likelier than those of a fit, and where to start with them."""
 
@@ -37,13 +45,17 @@ def likelier(
 
     The problem stands at the fit, its absent terms at 0; misfits below `floor` are rounding.
     """
-    at = places(problem.parameters, every)
-    if DRY in at:
-        at[DRY] += problem.parameters.index("friction.breakaway").tolist()
-    x = problem.pack(problem.parameters.get(), found.fit.path.x[:, 0, : problem.d])
+    parameters, held = problem.parameters, torch.tensor([], dtype=torch.long)
+    at = places(parameters, every)
+    if DRY in found.terms.names:
+        at[DRY] += parameters.index("friction.breakaway").tolist()
+    elif DRY in at:  # what shapes a force of 0 has no effect yet
+        held = torch.cat([parameters.index(shape) for shape in ("friction.breakaway", "friction.log")])
+    x = problem.pack(parameters.get(), found.fit.path.x[:, 0, : problem.d])
     cost, A, b = problem.normal_equations(x)
     if not math.isfinite(float(cost)):
         return []
+    A[held], A[:, held], b[held] = 0.0, 0.0, 0.0
     by, names, better = (problem.sigma / max(found.rms, floor)) ** 2, list(at), []
     for subset in subsets(by * A, by * b, x, list(at.values()), math.log(problem.data.q.numel()))[:TRIED]:
         terms = every.only([names[k] for k in subset.kept])
@@ -58,7 +70,7 @@ class Subset(NamedTuple):
     """Some of the terms, and the unknowns where they fit best."""
 
     kept: tuple[int, ...]  # which of the groups stay
-    criterion: float  # cost, and ½ `worth` for each term that stays
+    criterion: float  # cost, and the price of the terms that stay
     x: Tensor  # (P,)
 
 
@@ -67,7 +79,7 @@ def subsets(
     b: Tensor,  # (P,) Jᵀr
     x: Tensor,  # (P,) where both were made
     groups: Sequence[Sequence[int]],  # indices of the coefficients of each term
-    worth: float,  # twice the cost above which a term stays; log N by the Bayesian information criterion
+    worth: float,  # twice the price of a term that is named beforehand; log N by the Bayesian information criterion
 ) -> list[Subset]:
     """All 2^K subsets of K terms, the likeliest first: those that stay follow the absence of the others.
 
@@ -88,7 +100,8 @@ def subsets(
     keep = stays[:, owner].to(A)
     C = torch.linalg.pinv(keep[:, :, None] * G * keep[:, None, :], hermitian=True)
     c = (C @ (keep * pull)[..., None])[..., 0] * keep
-    cost = (best[at] @ pull - (c * pull).sum(-1)) / 2 + worth / 2 * stays.sum(-1)
+    price = torch.tensor([price_of(size, len(groups), worth) for size in range(len(groups) + 1)]).to(A)
+    cost = (best[at] @ pull - (c * pull).sum(-1)) / 2 + price[stays.sum(-1)]
     found = []
     for k in cost.argsort().tolist():
         moved = best.clone()

@@ -39,7 +39,9 @@ def test_every_subset_has_the_cost_of_its_own_fit():
             free = [0, *(i for k in kept for i in groups[k])]
             z = torch.zeros(6, dtype=torch.float64)
             z[free] = torch.linalg.solve(A[free][:, free], (A @ best)[free])
-            assert found[kept].criterion == pytest.approx(value(z) + 2.3 * size, rel=1e-6)
+            assert found[kept].criterion == pytest.approx(
+                value(z) + 2.3 * size + math.log(math.comb(4, size)), rel=1e-6
+            )
             torch.testing.assert_close(found[kept].x, z, rtol=1e-5, atol=1e-5)
 
 
