@@ -3,9 +3,9 @@
 The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
 trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
-leave. That criterion takes residuals for white noise. Where they are none, because a force or the rule's accuracy is
-missing, any term may take over some of it: there terms stay only if held-out blocks of time ask for them as well. Model
-steps are halved while that changes the motion by as much as the data miss it.
+leave, and of one coordinate all subsets are compared (`subsets`). That criterion takes residuals for white noise. Where
+they are none, because a force or the rule's accuracy is missing, any term may take over some of it: there terms stay
+only if held-out blocks of time ask for them. Model steps are halved while that changes the motion as data miss it.
 """
 
 from __future__ import annotations
@@ -54,6 +54,7 @@ FINER = 0.3  # halved steps that change the motion by more than this share of th
 LIKELIER = 1.0  # log-likelihood that halved steps have to bring
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
+MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 FINE = 0.1  # of the misfit that is rounding: steps of exact data that change the motion by less do not show in it
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
@@ -106,16 +107,17 @@ class DictionarySearch:
         local = local_polynomials(self.data)
         if local is None:
             return None
-        start, bare = smoothed(self.data, local), None
-        if self.coarse and self.data.dof == 1:  # accelerations are not read off such samples
-            bare = self._grown(*self._bare(), 1, start)
-            if bare is not None and bare.whole and bare.rms <= self.precision:
-                return self._finer(bare)
+        start, one = smoothed(self.data, local), self.data.dof == 1
+        bare = self._grown(*self._bare(), 1, start) if one and self.coarse else None
+        if bare is not None and bare.whole and bare.rms <= self.precision:
+            return self._finer(bare)  # accelerations that are read off coarse samples mislead
         families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
-        if found is None or (bare is not None and bare.rms < found.rms):
-            found, linear = bare or self._grown(*self._bare(), 1, start), []
+        if bare is None and (found is None or (one and found.coloured and found.rms > MISLED * self.precision)):
+            bare = self._grown(*self._bare(), 1, start)
+        if bare is not None and (found is None or (bare.whole, -bare.rms) > (found.whole, -found.rms)):
+            found, linear = bare, []
         if found is None:
             return None
         found = self._finer(self._held(self._simpler(found)))
@@ -131,8 +133,8 @@ class DictionarySearch:
     def _as_likely(self, less: Found, found: Found) -> bool:
         """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
         count, fewer = self.data.q.numel(), len(found.terms.names) - len(less.terms.names)
-        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
         missed = max(less.rms, self.floor) / max(found.rms, self.floor)
+        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
         return longer and count * math.log(missed) < fewer * math.log(count) / 2
 
     def _from_part(self, part: Trajectories) -> Found | None:
@@ -188,7 +190,7 @@ class DictionarySearch:
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
         values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
-        whole = fit.problem.grid.segments == len(self.data)
+        whole = fit.problem.grid.segments == len(self.data) and fit.noise < self.spread
         base = started(task.base, self.data, values, task.config)
         return Found(terms, task.config, values, base, fit, whole, self.spread)
 

@@ -30,7 +30,7 @@ class Found:
     values: dict
     base: Baseline
     fit: TrajectoryFit
-    whole: bool  # every trajectory is one segment
+    whole: bool  # every trajectory is one segment, and followed
     spread: float  # of q, RMS
 
     @property
