@@ -34,7 +34,11 @@ def test_a_linear_start_that_follows_nothing_is_not_kept():
     t = 0.05 * torch.arange(201, dtype=torch.float64)
     phi = (1 + 0.02 * 12.0 / 0.1 * (1 - torch.exp(-0.1 * t))).log() / 0.02
     phi = phi + 0.01 * torch.randn(201, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
-    data, _ = Trajectories.of(t, phi[:, None], names=("phi",), angles=(True,)).unwrapped().split_time(0.67)
+    data, _ = (
+        Trajectories.of(t, phi[:, None], names=("phi",), angles=(True,))
+        .unwrapped()
+        .split_time(FitConfig().train_fraction)
+    )
     found = search(data, estimate_baseline(data), FitConfig().resolved(data), outliers=False)
     assert found.config.drag == ("|v1| v1",)
     assert found.sigma == pytest.approx(0.01, rel=0.2)
