@@ -22,7 +22,8 @@ the inputs recorded beside the positions. Printed: the RMS error of each coordin
 the free run did not reach because a step failed.
 
 A recorded step that is longer than those the model was fitted to is crossed in equal model steps. A recording that is
-sampled faster is thinned, its inputs averaged: K counts the samples that are left.
+sampled faster is thinned, its inputs averaged: K counts the samples that are left. A note says where the free run
+leaves the range of positions and momenta that the model was fitted to: which, how far, since when.
 
 --out FILE writes the predicted motion, and FILE.png beside it: data, free run and their difference.
 Where the recordings of the fit differ in what their sensors read at 0, those zeros that suit the first samples best
@@ -67,6 +68,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import load
     from herglotz.training import load_run
+    from herglotz.training.recorded_range import warning
 
     result = load_run(arguments.source)
     data = load(arguments.data, like=result.data, **columns_of(arguments))
@@ -88,6 +90,8 @@ def run(arguments: argparse.Namespace) -> int:
     if found.failed_steps > 0:
         share = f"{100 * found.failed_steps:.3g} % of the predicted samples were not reached: a step failed"
         say(f"herglotz: note: {share}; the RMS is over the others", sys.stderr)
+    if found.beyond:
+        say(f"herglotz: note: {warning(found.beyond, found.data.time_unit)}", sys.stderr)
     return 0
 
 

@@ -6,8 +6,8 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from herglotz.data.holds import Arrival
     from herglotz.export import ExportedStepper
     from herglotz.stepping import Rollout, State, Stepper
+    from herglotz.training.recorded_range import Beyond
 
 DESCRIPTION = """\
 Step a model K times and write t, q, s and p as .csv or .npz. It starts from the last state that the fit
@@ -49,6 +50,7 @@ class Source:
     units: tuple[str, ...]
     angles: tuple[bool, ...]
     time_unit: str
+    limits: Mapping[str, Sequence[float]] | None  # lowest and highest q, p, s of the fit
     box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
     h_range: tuple[float, float] | None  # steps of the fit
     arrival: Arrival | None = None  # what happened to the inputs of the fit before they acted
@@ -104,6 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import save
     from herglotz.data.units import in_degrees
+    from herglotz.training.recorded_range import beyond
 
     source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
@@ -118,11 +121,13 @@ def run(arguments: argparse.Namespace) -> int:
     save(out, in_degrees(motion, source.degrees) if out.suffix.lower() == ".csv" else motion)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
     left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
+    far = beyond(source.limits, motion, motion.t, motion.q, found.p.double()) if source.limits else []
     if arguments.json:
-        print_json(_numbers(found, times, seconds, left) | {"file": str(out)})
+        left_by = {"beyond": [asdict(each) for each in far]}
+        print_json(_numbers(found, times, seconds, left) | left_by | {"file": str(out)})
     else:
         _report(source, found, times, f"{out}: {arguments.steps} steps")
-    _warn(source, times, left)
+    _warn(source, times, left, far)
     return 0
 
 
@@ -164,11 +169,13 @@ def _report(source: Source, found: Rollout, times: torch.Tensor, what: str) -> N
     say(f"{what} of {h:g} {source.time_unit}; at t = {float(times[-1]):g}: {end}")
 
 
-def _warn(source: Source, times: torch.Tensor, left: int | None) -> None:
+def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[Beyond]) -> None:
     """Say on stderr where the motion or its steps are beyond the data of the fit."""
     if left is not None:
+        each = "".join(f"; {one.words(source.time_unit)}" for one in far)
         _note(
-            f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted to"
+            f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted "
+            f"to{each}"
         )
     low, high = source.h_range or (0.0, math.inf)
     steps = times.diff()
@@ -204,8 +211,8 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
         model, labels = run_.model, (data.names, data.units, data.angles, data.time_unit)
         box = Box(run_.box, data.angles, start.q.dtype, by_s=model.s_enters_motion)
         return Source(
-            run_.stepper, start, t0, run_.h, *labels, box, run_.h_range, run_.arrival, run_.config.frequencies,
-            model.inputs, _bounded(model.s_enters_motion), data.degrees, data.columns,
+            run_.stepper, start, t0, run_.h, *labels, run_.box, box, run_.h_range, run_.arrival,
+            run_.config.frequencies, model.inputs, _bounded(model.s_enters_motion), data.degrees, data.columns,
         )  # fmt: skip
 
     from herglotz.data.checks import unnamed
@@ -224,7 +231,7 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     span, stepper.metadata["h_range"] = m.get("h_range"), None  # a note beside the motion, as for a run: no refusal
     t0 = (stored or {}).get("t", 0.0)
     return Source(
-        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), box, span,
+        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), m["box"], box, span,
         Arrival(**m.get("arrival", {})), inputs=stepper.inputs, states=_bounded(by_s),
         degrees=tuple(m.get("degrees", ())), columns=m.get("columns", ()),
     )  # fmt: skip

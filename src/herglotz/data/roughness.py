@@ -49,6 +49,15 @@ def precision(data: Trajectories) -> float:
     return min(roughness(data, degree) for degree in DEGREES)
 
 
+def coarse(data: Trajectories) -> bool:
+    """Whether `precision` is that of the polynomials, and the noise may be far below: the last degree still halves it.
+
+    Of white noise the two highest degrees leave the same, within a tenth.
+    """
+    *_, lower, highest = (roughness(data, degree) for degree in DEGREES)
+    return highest < lower / 2
+
+
 def precisions(data: Trajectories) -> Tensor:
     """`precision` of every coordinate, (n,)."""
     return torch.stack([_residuals(data, degree) for degree in DEGREES]).amin(0)

@@ -21,6 +21,7 @@ from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.quantities import held_out_rms, quantities
+from herglotz.training.recorded_range import recorded, warning
 from herglotz.training.summary import rows as summary_rows
 from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
@@ -145,6 +146,7 @@ def _data(run: Run) -> tuple[Block, ...]:
             "precision, found in the data",
             "not found" if precision is None else f"{precision:.3g} {common_unit(data.units)}".rstrip(),
         ),
+        ("range that was trained on", recorded(run.box, data) or "not known"),
         ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),
         ("sha256", data.digest()),
     ]
@@ -185,6 +187,8 @@ def _against(run: Run, data: Trajectories) -> tuple[Block, ...]:
         *((f"RMS {k}", v) for k, v in (found.metrics()["rms_per_coordinate"] or {}).items()),
     )]  # fmt: skip
     rows.append(("steps that failed", f"{100 * found.failed_steps:.3g} %"))
+    left = warning(found.beyond, data.time_unit)
+    rows += [("beyond the recorded range", left)] if left else []
     return (data.summary(), Table(("", ""), tuple(rows)), Picture(plot_prediction(found), "Free run on the recording."))
 
 

@@ -3,9 +3,9 @@
 The linear problem (`linear_start`) is made of smoothed positions (`data.smoothing`), and pruned. From there
 trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
-leave. That criterion takes residuals for white noise. Where they are none, because a force or the rule's accuracy is
-missing, any term may take over some of it: there terms stay only if held-out blocks of time ask for them as well. Model
-steps are halved while that changes the motion by as much as the data miss it.
+leave, and of one coordinate all subsets are compared (`subsets`). That criterion takes residuals for white noise. Where
+they are none, because a force or the rule's accuracy is missing, any term may take over some of it: there terms stay
+only if held-out blocks of time ask for them. Model steps are halved while that changes the motion as data miss it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,11 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import coarse, precision
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
@@ -41,8 +42,9 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import joining, prune
+from herglotz.training.pruning import joining
 from herglotz.training.stages import Stages
+from herglotz.training.subsets import likelier, price_of
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
@@ -52,6 +54,7 @@ FINER = 0.3  # halved steps that change the motion by more than this share of th
 LIKELIER = 1.0  # log-likelihood that halved steps have to bring
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
+MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 FINE = 0.1  # of the misfit that is rounding: steps of exact data that change the motion by less do not show in it
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
@@ -73,7 +76,8 @@ class DictionarySearch:
         self.precision = precision(data)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
-        self.order = 4 if plain and self.precision < SMOOTH * self.spread else 2
+        self.coarse = coarse(data)
+        self.order = 4 if plain and (self.coarse or self.precision < SMOOTH * self.spread) else 2
 
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
@@ -96,18 +100,24 @@ class DictionarySearch:
             if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._one_rate(self._last_terms(self._pruned(found)))
+        return self._one_rate(self._last_terms(self._likeliest(self._pruned(found))))
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
         local = local_polynomials(self.data)
         if local is None:
             return None
-        start = smoothed(self.data, local)
+        start, one = smoothed(self.data, local), self.data.dof == 1
+        bare = self._grown(*self._bare(), 1, start) if one and self.coarse else None
+        if bare is not None and bare.whole and bare.rms <= self.precision:
+            return self._finer(bare)  # accelerations that are read off coarse samples mislead
         families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
-        found = found or self._grown(*self._bare(), 1, start)
+        if bare is None and (found is None or (one and found.coloured and found.rms > MISLED * self.precision)):
+            bare = self._grown(*self._bare(), 1, start)
+        if bare is not None and (found is None or (bare.whole, -bare.rms) > (found.whole, -found.rms)):
+            found, linear = bare, []
         if found is None:
             return None
         found = self._finer(self._held(self._simpler(found)))
@@ -123,8 +133,8 @@ class DictionarySearch:
     def _as_likely(self, less: Found, found: Found) -> bool:
         """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
         count, fewer = self.data.q.numel(), len(found.terms.names) - len(less.terms.names)
-        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
         missed = max(less.rms, self.floor) / max(found.rms, self.floor)
+        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
         return longer and count * math.log(missed) < fewer * math.log(count) / 2
 
     def _from_part(self, part: Trajectories) -> Found | None:
@@ -180,7 +190,7 @@ class DictionarySearch:
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
         values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
-        whole = fit.problem.grid.segments == len(self.data)
+        whole = fit.problem.grid.segments == len(self.data) and fit.noise < self.spread
         base = started(task.base, self.data, values, task.config)
         return Found(terms, task.config, values, base, fit, whole, self.spread)
 
@@ -217,11 +227,13 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1) -> Found | None:
-        """The fit with other terms, steps or samples, from this one."""
+    def _refit(
+        self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1, states: Tensor | None = None
+    ) -> Found | None:
+        """The fit with other terms, steps or samples, from this one, or from these states (S, d) of its segments."""
         stages, problem = self._problem(found, terms, substeps or found.config.substeps, every)
         assert problem.path is not None
-        states = problem.path.x[:, 0, : problem.d]
+        states = problem.path.x[:, 0, : problem.d] if states is None else states
         fit = stages.optimise(problem, problem.parameters.get(), states, "terms", near=True)
         return None if fit is None else self._found(terms, stages, fit)
 
@@ -249,16 +261,33 @@ class DictionarySearch:
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""
         count = self.data.q.numel()
-        terms = self._needed(found, math.log(count))
+        terms = found.needed(math.log(count), self.own, self.floor)
         less = None if terms == found.terms else self._refit(found, terms)
         allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
         return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
+
+    def _likeliest(self, found: Found) -> Found:
+        """With the subset of one coordinate's candidates that the criterion prefers, where residuals are noise."""
+        if self.data.dof > 1 or not found.terms.names or (found.coloured and found.rms > self.floor):
+            return found
+        stages, problem = self._problem(found, self.all, found.config.substeps)
+        for better in likelier(found, problem, self.all, stages.task.config, self.floor):
+            other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
+            if other is not None and self._likelier(other, found):
+                return self._likeliest(self._held(self._longer(other)))
+        return found
+
+    def _likelier(self, other: Found, found: Found) -> bool:
+        """Whether the criterion of `subsets` prefers the other terms."""
+        count = self.data.q.numel()
+        price, its = (price_of(len(f.terms.names), len(self.all.names), math.log(count)) for f in (found, other))
+        return count * math.log(max(found.rms, self.floor) / max(other.rms, self.floor)) > its - price
 
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""
         count = self.data.q.numel()
         for worth in (4**self.order * count, count):  # as much as halved steps may bring, then twice the misfit
-            terms = self._needed(found, worth)
+            terms = found.needed(worth, self.own, self.floor)
             less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
             if less is None or less.rms > (1 + worth / count) ** 0.5 * max(found.rms, self.floor):
                 continue  # far from the minimum it costs more
@@ -270,7 +299,7 @@ class DictionarySearch:
     def _last_terms(self, found: Found) -> Found:
         """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
         while found.terms.names and found.coloured:
-            terms = self._needed(found, 4**self.order * self.data.q.numel(), one_less=True)
+            terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
             less = None if terms == found.terms else self._refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
             if less is None or not self._as_good(less, found):
@@ -300,20 +329,6 @@ class DictionarySearch:
         own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
         return not own <= MARGIN * its
 
-    def _needed(self, found: Found, worth: float, *, one_less: bool = False) -> NamedTerms:
-        """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least."""
-        problem = found.fit.problem
-        at = places(problem.parameters, found.terms)
-        if not at:
-            return found.terms
-        x = problem.pack(found.fit.theta, found.fit.path.x[:, 0, : problem.d])
-        _, A, _ = problem.normal_equations(x)
-        A = A * (problem.sigma / max(found.rms, self.floor)) ** 2
-        free = torch.tensor([i for own in at.values() for i in own])
-        simplest = torch.tensor([i for name in self.own for i in at.get(name, ())], dtype=torch.long)
-        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, simplest)[0].tolist())
-        return found.terms.only([name for name, own in at.items() if stay & set(own)])
-
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
@@ -332,15 +347,4 @@ class DictionarySearch:
             return False
         if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
             return False
-        return self._change(found, 2 * m) > max(FINER * found.rms, FINE * self.floor)
-
-    def _change(self, found: Found, substeps: int) -> float:
-        """RMS change of the fitted motion by so many model steps in a recorded one."""
-        _, problem = self._problem(found, found.terms, substeps)
-        fit = found.fit
-        path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
-        if path is None:
-            return math.inf
-        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
-        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
-        return float(change.square().mean().sqrt())
+        return found.changed_by(self._problem(found, found.terms, 2 * m)[1]) > max(FINER * found.rms, FINE * self.floor)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.named_terms import NamedTerms, places
+from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.pruning import prune
 from herglotz.training.trajectory_fit import TrajectoryFit
@@ -28,7 +30,7 @@ class Found:
     values: dict
     base: Baseline
     fit: TrajectoryFit
-    whole: bool  # every trajectory is one segment
+    whole: bool  # every trajectory is one segment, and followed
     spread: float  # of q, RMS
 
     @property
@@ -49,6 +51,33 @@ class Found:
         together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
         with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
         return float(with_next) > COLOURED / r.numel() ** 0.5
+
+    def needed(self, worth: float, simplest: Collection[str], floor: float, *, one_less: bool = False) -> NamedTerms:
+        """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least.
+
+        The `simplest` go only where no other one can; misfits below `floor` are rounding.
+        """
+        problem = self.fit.problem
+        at = places(problem.parameters, self.terms)
+        if not at:
+            return self.terms
+        x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
+        _, A, _ = problem.normal_equations(x)
+        A = A * (problem.sigma / max(self.rms, floor)) ** 2
+        free = torch.tensor([i for own in at.values() for i in own])
+        late = torch.tensor([i for name in simplest for i in at.get(name, ())], dtype=torch.long)
+        stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, late)[0].tolist())
+        return self.terms.only([name for name, own in at.items() if stay & set(own)])
+
+    def changed_by(self, problem: ShootingProblem) -> float:
+        """RMS change of the fitted motion by the steps of another problem with the same terms and segments."""
+        fit = self.fit
+        path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
+        if path is None:
+            return math.inf
+        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
+        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
+        return float(change.square().mean().sqrt())
 
     @property
     def apart(self) -> bool:

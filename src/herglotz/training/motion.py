@@ -20,6 +20,7 @@ from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
+from herglotz.training.recorded_range import Beyond, beyond, farthest, warning
 
 HAIR = 1e-6  # of a step: recorded times are rounded
 Numbers = float | Sequence | np.ndarray | Tensor
@@ -40,6 +41,8 @@ class Steppable(Protocol):
     def h(self) -> float: ...  # noqa: D102
     @property
     def h_range(self) -> tuple[float, float]: ...  # noqa: D102
+    @property
+    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
         """State and time at the last training sample of a trajectory."""
@@ -58,6 +61,7 @@ class Motion:
     names: tuple[str, ...]
     units: tuple[str, ...]
     time_unit: str
+    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
 
     @property
     def ok(self) -> bool:
@@ -67,7 +71,8 @@ class Motion:
     def __repr__(self) -> str:
         failed = "" if self.ok else f", {int((self.status != 0).sum())} steps failed"
         names, shape = ", ".join(self.names), tuple(self.q.shape)
-        return f"Motion(t {self.t[0]:g} to {self.t[-1]:g} {self.time_unit}, q {shape} of {names}{failed})"
+        left = f"; {warning(self.beyond, self.time_unit)}" if self.beyond else ""
+        return f"Motion(t {self.t[0]:g} to {self.t[-1]:g} {self.time_unit}, q {shape} of {names}{failed}{left})"
 
 
 @one_thread()
@@ -97,7 +102,9 @@ def free_motion(
     with torch.no_grad():
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
     arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
-    return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit)
+    motions = zip(found.q.reshape(-1, *found.q.shape[-2:]), found.p.reshape(-1, *found.p.shape[-2:]), strict=True)
+    left = farthest(beyond(run.box, run.data, times, q, p) for q, p in motions)
+    return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
 
 
 def _warn_of_steps(run: Steppable, times: Tensor) -> None:

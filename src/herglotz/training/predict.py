@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
 
 import torch
@@ -23,6 +24,7 @@ from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.recorded_range import Beyond, beyond, farthest
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 WARMUP = 20  # samples from which the state is estimated
@@ -44,6 +46,8 @@ class Trained(Protocol):
     def h_range(self) -> tuple[float, float]: ...  # noqa: D102
     @property
     def stepper(self) -> Stepper: ...  # noqa: D102
+    @property
+    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, repr=False)
@@ -60,6 +64,7 @@ class Prediction:
     most_substeps: int  # largest number of model steps in a recorded step
     outside: float  # share of model steps that are shorter or longer than those of the training data
     zeros: tuple[float, ...] = ()  # of the sensors, (n,), that were taken off the recording; empty: 0
+    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
 
     def __repr__(self) -> str:
         rms = "failed" if self.rms is None else f"{self.rms:.3g}"
@@ -125,6 +130,7 @@ class Prediction:
             "most_substeps": self.most_substeps,
             "steps_outside_training": self.outside,
             "zeros": dict(zip(self.data.names, self.zeros, strict=True)) if self.zeros else None,
+            "beyond": [asdict(each) for each in self.beyond],
         }
 
 
@@ -191,7 +197,14 @@ def predict(
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
     n = data.dof
     state = State(states[:, :n], states[:, n : 2 * n], states[:, 2 * n])
-    return Prediction(data, state, warmup, every, most, outside, zeros[best])
+    found = Prediction(data, state, warmup, every, most, outside, zeros[best])
+    return replace(found, beyond=_beyond(run.box, found))
+
+
+def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyond, ...]:
+    """What the free runs leave the range of the fit by."""
+    rows = [found.free.nonzero()[:, 0][found.data.trajectory[found.free] == b] for b in range(len(found.data))]
+    return farthest(beyond(box, found.data, found.data.t[r], found.states.q[r], found.states.p[r]) for r in rows)
 
 
 def arrival_of(run: Trained) -> Arrival:

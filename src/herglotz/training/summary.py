@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from herglotz.data import Trajectories
 from herglotz.data.units import common_unit, size
 from herglotz.training.config import FitConfig
+from herglotz.training.recorded_range import recorded
 
 MOST_FEATURES, COLUMNS = 5, 80
 MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
@@ -37,6 +38,7 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     found = [
         ("data", data.summary()),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
+        ("recorded range", recorded(run.box, data)),
         ("named terms", run.config.features and _terms(run.config.features, data.names)),
         (
             "extrapolation RMS",
@@ -94,15 +96,10 @@ def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
 
 def model_card(run: Judged, h_range: tuple[float, float]) -> str:
     """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
-    ends = [run.box[f"q_{end}"] for end in ("low", "high")]
-    ranges = ", ".join(
-        f"{name} {low:.4g} to {high:.4g}" + ("" if unit == "1" else f" {unit}")
-        for name, unit, low, high in zip(run.data.names, run.data.units, *ends, strict=True)
-    )
     low, high = h_range
     return "\n".join([
         f"Model of {run.data.source or 'a recording'} (sha256 {run.data.digest()[:16]})", summary(run),
-        f"For steps of {low:.4g} to {high:.4g} {run.data.time_unit}, and positions {ranges}.",
+        f"For steps of {low:.4g} to {high:.4g} {run.data.time_unit}, and positions {recorded(run.box, run.data)}.",
         "Outside of these the model extrapolates. The first coordinate's mass is 1.",
     ])  # fmt: skip
 

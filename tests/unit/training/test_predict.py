@@ -206,3 +206,25 @@ def test_coordinates_are_found_by_name():
     both = replace(data, q=torch.cat([5 + 0 * data.q, data.q], 1), names=("x", "theta"), units=("m", "rad"),
                    angles=(False, True))  # fmt: skip
     assert predict(named, both).rms < 1e-9  # type: ignore[operator]
+
+
+def test_a_free_run_beyond_the_recorded_range_is_noted():
+    # fails if the warm-up counts, another trajectory or time is named, or the range has no say at all
+    model = model_of("conservative")
+    run, data = run_of(model), recording(model)
+    x = predict(run, data).states
+    ends = {"q_low": [-2.5], "q_high": [2.5], "p_low": [-9.0], "p_high": [9.0]}
+    assert predict(replace(run, box=ends), data).beyond == ()
+    q = x.q[:, 0].reshape(2, -1)[:, 20:]
+    top, b = float(q.max()), int(q.amax(1).argmax())
+    ends["q_high"] = [top - 0.1]
+    found = predict(replace(run, box=ends), data)
+    (left,) = found.beyond
+    assert left.by == pytest.approx(0.1 / (2.5 + top - 0.1))
+    first = b * data.lengths[0] + 20 + int((q[b] > top - 0.1).nonzero()[0])
+    assert (left.trajectory, left.since) == (b, float(data.t[first]))
+    assert found.metrics()["beyond"][0]["coordinate"] == data.names[0]
+    start = [x[first - 1].numpy() for x in found.states[:2]]
+    motion = replace(run, box=ends).rollout(80, q0=start[0], p0=start[1])
+    assert motion.beyond[0].since == pytest.approx(H)
+    assert "leaves the range" in repr(motion)

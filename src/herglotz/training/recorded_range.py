@@ -1,0 +1,88 @@
+"""Where a motion leaves the range of positions and momenta that a fit was trained on: there the model extrapolates."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data import Trajectories
+from herglotz.data.units import size
+
+QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """One quantity that leaves its recorded range."""
+
+    coordinate: str
+    quantity: str  # "position" or "momentum"
+    by: float  # largest distance from the range, over its width
+    since: float  # time of the first sample outside
+    low: float  # the recorded range
+    high: float
+    unit: str  # of a position; "" of a momentum
+    trajectory: int = 0
+
+    def words(self, time_unit: str) -> str:
+        """One clause for people: what leaves which range, how far, and since when."""
+        ends = f"{size(self.low, '', digits=3)} to {size(self.high, self.unit, digits=3)}"
+        time = size(self.since, time_unit, digits=4)
+        where = f" in trajectory {self.trajectory}" if self.trajectory else ""
+        by = f"{100 * self.by:.2g} % of its width"
+        return f"the {self.quantity} of {self.coordinate} ({ends}) by {by}, since t = {time}{where}"
+
+
+def beyond(
+    box: Mapping[str, Sequence[float]],  # lowest and highest q and p of the fit; nothing is beyond an empty one
+    like: Trajectories,  # names, units and angles of the coordinates
+    t: Tensor,  # (N,)
+    q: Tensor,  # (N, n) a motion; NaN after a failed step
+    p: Tensor,  # (N, n)
+) -> list[Beyond]:
+    """Every position and momentum of one motion that leaves its range; angles count modulo 2π."""
+    found = []
+    for key, x in (("q", q), ("p", p)) if box else ():
+        for i, name in enumerate(like.names):
+            low, high = box[f"{key}_low"][i], box[f"{key}_high"][i]
+            y = x[:, i].double()
+            if key == "q" and like.angles[i]:
+                y = y - 2 * math.pi * torch.round((y - (low + high) / 2) / (2 * math.pi))
+            out = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
+            if bool((out > 0).any()):
+                by = float(out.max()) / max(high - low, torch.finfo(torch.float64).tiny)
+                since, unit = float(t[(out > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
+                found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit))
+    return found
+
+
+def farthest(motions: Iterable[Sequence[Beyond]]) -> tuple[Beyond, ...]:
+    """Of the motions of several trajectories, for each quantity the one that leaves its range farthest."""
+    every = [replace(each, trajectory=b) for b, found in enumerate(motions) for each in found]
+    first: dict[tuple[str, str], Beyond] = {}
+    for each in sorted(every, key=lambda each: -each.by):
+        first.setdefault((each.coordinate, each.quantity), each)
+    return tuple(first.values())
+
+
+def warning(found: Sequence[Beyond], time_unit: str) -> str:
+    """One sentence; "" where nothing leaves its range."""
+    if not found:
+        return ""
+    each = "; ".join(one.words(time_unit) for one in found)
+    return f"the motion leaves the range that the model was fitted to, beyond which it extrapolates: {each}"
+
+
+def recorded(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:
+    """The range that a fit was trained on, in words; "" where it is not known."""
+    if not box:
+        return ""
+    parts = []
+    for i, (name, unit) in enumerate(zip(like.names, like.units, strict=True)):
+        q, p = ([f"{box[f'{key}_{end}'][i]:.3g}" for end in ("low", "high")] for key in "qp")
+        parts.append(f"{name} {q[0]} to {q[1]}{'' if unit == '1' else f' {unit}'}, its momentum {p[0]} to {p[1]}")
+    return "; ".join(parts)

@@ -1,0 +1,61 @@
+"""A motion that leaves what was recorded is said to: which quantity, how far, since when."""
+
+import math
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.training.recorded_range import beyond, farthest, recorded, warning
+
+BOX = {"q_low": [-1.0, 2.0], "q_high": [1.0, 4.0], "p_low": [-3.0, -1.0], "p_high": [3.0, 1.0]}
+LIKE = Trajectories.of(
+    torch.arange(4.0, dtype=torch.float64), torch.zeros(4, 2, dtype=torch.float64), names=("x", "phi"),
+    units=("m", "rad"), angles=(False, True),
+)  # fmt: skip
+INSIDE = torch.tensor([[0.0, 3.0]], dtype=torch.float64).repeat(4, 1)
+
+
+def test_a_motion_inside_is_not_noted():
+    # fails if an angle is not counted modulo 2π, the ends of a range do not belong to it, or NaN counts as outside
+    q = INSIDE.clone()
+    q[1], q[2, 1] = torch.tensor([1.0, 4.0]), 3.0 + 6 * math.pi
+    q[3] = torch.nan
+    assert beyond(BOX, LIKE, LIKE.t, q, 0 * INSIDE) == []
+    assert beyond({}, LIKE, LIKE.t, 100 + q, q) == []
+
+
+def test_what_leaves_how_far_and_since_when():
+    # fails if q and p, the low and the high end, the width, or the first time outside are mixed up
+    q, p = INSIDE.clone(), 0 * INSIDE
+    q[2:, 0] = torch.tensor([-1.5, -2.0])
+    p[1, 1] = 5.0
+    found = beyond(BOX, LIKE, 10 + LIKE.t, q, p)
+    assert [(x.coordinate, x.quantity, x.by, x.since) for x in found] == [
+        ("x", "position", 0.5, 12.0), ("phi", "momentum", 2.0, 11.0),
+    ]  # fmt: skip
+    text = warning(found, "s")
+    assert "the position of x (-1 to 1 m) by 50 % of its width, since t = 12 s" in text
+    assert "the momentum of phi (-1 to 1) by 2e+02 % of its width, since t = 11 s" in text
+    assert warning([], "s") == ""
+
+
+def test_of_several_motions_the_farthest_is_told():
+    # fails if the nearest one, or another trajectory's number, is told
+    q = INSIDE.clone()
+    q[3, 0] = 2.0
+    p = torch.zeros_like(q)
+    near, far = beyond(BOX, LIKE, LIKE.t, q, p), beyond(BOX, LIKE, LIKE.t, q * torch.tensor([2.0, 1.0]), p + 2)
+    x, phi = farthest([[], near, far, near])
+    assert (x.coordinate, x.quantity, x.by, x.trajectory) == ("x", "position", 1.5, 2)
+    assert (phi.coordinate, phi.quantity, phi.by, phi.trajectory) == ("phi", "momentum", 0.5, 2)
+
+
+def test_the_recorded_range_in_words():  # fails if low and high, or the unit, are lost
+    assert recorded(BOX, LIKE) == "x -1 to 1 m, its momentum -3 to 3; phi 2 to 4 rad, its momentum -1 to 1"
+
+
+def test_zero_width_is_no_division_by_zero():  # fails if a coordinate that never moved divides by 0
+    box = {"q_low": [0.0, 0.0], "q_high": [0.0, 0.0], "p_low": [0.0, 0.0], "p_high": [0.0, 0.0]}
+    (found,) = beyond(box, LIKE, LIKE.t, torch.tensor([[0.0, 0.0]] * 3 + [[1.0, 0.0]]), torch.zeros(4, 2))
+    assert found.by == pytest.approx(1 / torch.finfo(torch.float64).tiny)
