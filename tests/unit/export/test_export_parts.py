@@ -1,10 +1,14 @@
 """Small parts of what is exported: the compensated sum and the range of steps."""
 
+from types import SimpleNamespace
+
 import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.export.compare import draw
 from herglotz.export.inputs import check_range
+from herglotz.export.lower.interpret import MATHEMATICS
 from herglotz.export.step import _added
 
 
@@ -28,3 +32,25 @@ def test_steps_at_the_ends_of_the_range_are_taken(dtype):
             with pytest.raises(InputError, match="where the model was fitted; got"):
                 check_range(torch.tensor([span[0], wrong, span[1]], dtype=dtype), span)
     check_range(torch.tensor(9.0), None)
+
+
+@pytest.mark.parametrize("boxed", [True, False])
+def test_states_to_compare_at_fill_the_box(boxed):
+    # fails if an end of the box is lost: a file is then compared with its run at one state, or at half of them
+    ends = {"q": ([-3.0, 1.0], [-2.0, 5.0]), "p": ([0.0, -1.0], [2.0, 1.0]), "s": ([4.0], [4.5])}
+    box = {f"{name}_{end}": values[k] for name, values in ends.items() for k, end in enumerate(("low", "high"))}
+    file = SimpleNamespace(metadata={"box": box if boxed else None}, dof=2, dtype=torch.float64)
+    for name, x in zip("qps", draw(file, 2000, torch.Generator().manual_seed(0)), strict=True):
+        low, high = torch.tensor(ends[name] if boxed else ([-1.0], [1.0]), dtype=torch.float64)
+        share = (x.reshape(2000, -1) - low) / (high - low)
+        assert 0 <= float(share.min()) < 0.01 < 0.99 < float(share.max()) <= 1
+
+
+@pytest.mark.parametrize("name", MATHEMATICS)
+def test_functions_of_constants_are_those_of_torch(name):
+    # fails if a constant that is computed when C is written is another one than torch computes
+    function = {"fabs": torch.abs, "softplus": torch.nn.functional.softplus}.get(name) or getattr(torch, name)
+    for x in (-0.7, -0.0, 0.3, 0.9):
+        if x >= 0 or name != "sqrt":
+            expected = float(function(torch.tensor(x, dtype=torch.float64)))
+            assert MATHEMATICS[name](x) == pytest.approx(expected, rel=1e-14, abs=0)
