@@ -5,11 +5,16 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from herglotz.data import simulate
 from herglotz.errors import InputError
+from herglotz.export import export_run
 from herglotz.export.compare import draw
 from herglotz.export.inputs import check_range
+from herglotz.export.load import read_header
 from herglotz.export.lower.interpret import MATHEMATICS
 from herglotz.export.step import _added
+from herglotz.scenes import scene
+from herglotz.training import fit
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -54,3 +59,18 @@ def test_functions_of_constants_are_those_of_torch(name):
         if x >= 0 or name != "sqrt":
             expected = float(function(torch.tensor(x, dtype=torch.float64)))
             assert MATHEMATICS[name](x) == pytest.approx(expected, rel=1e-14, abs=0)
+
+
+def test_a_run_says_in_the_file_what_it_is_for(tmp_path):
+    # fails if the steps of the data or those asked for are lost, or rounding makes the run's own step foreign
+    data = simulate(scene("damped_oscillator"), trajectories=1, steps=12, h=0.2, seed=0)
+    run = fit(data, level="linear", objective="residual", iterations=2, progress=False)
+    entries = read_header(export_run(run, tmp_path / "a.h"))[1]
+    assert entries["h_range"] == pytest.approx(run.h_range, rel=1e-6)
+    assert entries["name"] == "a"
+    assert entries["start"]["q"] == run.last_fitted()[0].q.tolist()
+    asked = read_header(export_run(run, tmp_path / "b.h", h_range=(0.1, run.h * (1 - 1e-7)), name="arm"))[1]
+    assert (asked["h_range"], asked["name"]) == ([0.1, run.h], "arm")
+    for path, kind in (("a.txt", None), ("a.h", "fmu")):
+        with pytest.raises(InputError, match="the name must end in"):
+            export_run(run, tmp_path / path, kind)
