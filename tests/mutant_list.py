@@ -321,6 +321,7 @@ ALIKE: list[tuple[str, str, int, str, str]] = [
     ("data/simulate.py", "bad = ~(torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s))", 58, "", "the last axis of (B, n) is the first after B"),
     ("training/foresight.py", "start.append(((z[..., P:] @ state) * z[..., P:]).sum(-1).mean(-1))", 62, "", "the last axis of (N, n) is the first after N"),
     ("export/lower/program.py", "if value is None and -1.0 in (a, b):", 21, "", "C then says -1.0 * x, the same number as -x"),
+    ("tune/kick_composition.py", "c = torch.exp(-self.rate * self.h + nan)", 34, "-", "nan is 0 or not a number"),
     ("tune/reference.py", "moved.append((x + JITTER * (high - low) * kick).clamp(low, high))", 16, "-", "kick is drawn from both sides alike"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 13, "/", "x / 1 is x * 1"),
     ("mechanics/partials.py", "a, b, s = q0 * 1, q1 * 1, s0 * 1", 21, "/", "x / 1 is x * 1"),

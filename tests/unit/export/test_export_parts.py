@@ -1,6 +1,7 @@
 """Small parts of what is exported: the compensated sum and the range of steps."""
 
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -12,7 +13,9 @@ from herglotz.export.compare import draw
 from herglotz.export.inputs import check_range
 from herglotz.export.load import read_header
 from herglotz.export.lower.interpret import MATHEMATICS
+from herglotz.export.newton import FLOOR, NewtonIteration, first_carry
 from herglotz.export.step import _added
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import fit
 
@@ -74,3 +77,25 @@ def test_a_run_says_in_the_file_what_it_is_for(tmp_path):
     for path, kind in (("a.txt", None), ("a.h", "fmu")):
         with pytest.raises(InputError, match="the name must end in"):
             export_run(run, tmp_path / path, kind)
+
+
+class NoDecrease(torch.nn.Module):
+    """A step equation whose |F| is 1 everywhere, with a Newton step of the size of q's rounding."""
+
+    def forward(self, q, p, s, h, trial):  # noqa: ARG002
+        return trial, 0 * s, 1 + 0 * s, p, s, s, None
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+@pytest.mark.parametrize("size", [0.0, 1.0])
+@pytest.mark.parametrize("h", [1e-9, 1.0])
+def test_what_rounding_leaves_ends_the_iteration(scale, size, h):
+    # fails if rounding is relative to the least of the move, of q and of h times the speed, instead of the largest
+    iteration: Any = NewtonIteration(ContactLagrangian(ModelConfig(speed=(1.0,))))
+    iteration.equation = NoDecrease()
+    one = torch.ones(1, 1, dtype=torch.float64)
+    move = 0.5 * FLOOR * torch.finfo(torch.float64).eps * one
+    _, _, x, _, _, fraction, _, *values = first_carry(move)
+    carry = (torch.tensor(1), torch.tensor([False]), x, move, one[0], fraction, scale * one[0], *values)
+    done = iteration(size * one, one, one[0], h * one[0], *carry)[1]
+    assert done.tolist() == [max(scale, size, h) == 1.0]
