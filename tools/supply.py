@@ -5,7 +5,7 @@
 * `lock` lets pip resolve the package with its extra `dev`, and writes lock.txt: versions, and the sha256 of the files
   for this Python and platform.
 * `check-lock` lets pip fetch what lock.txt names and compare the hashes. Nothing is installed; on another Python or
-  platform nothing is checked.
+  platform, or where pip reaches no package index that has the files, nothing is checked, and that is said.
 """
 
 from __future__ import annotations
@@ -37,6 +37,7 @@ HERE = f"{platform.python_implementation()} {platform.python_version().rpartitio
 ALLOWED = {"0BSD", "Apache-2.0", "BSD", "BSD License", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "MIT",
            "LLVM-exception", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Python Software Foundation License", "Zlib"}  # fmt: skip
 CUDA = ("nvidia-", "cuda-")  # proprietary parts of torch's CUDA builds, which herglotz does not need
+NO_FILE = re.compile("No matching distribution found for .*")  # pip reaches no index, or one without such a file
 ONE_LINE = 60  # letters; a longer field holds the licence's text, not its name
 
 
@@ -107,18 +108,20 @@ def lock() -> str:
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder) / "report.json"
         ours = ("--report", str(report), "--constraint", str(ROOT / "constraints.txt"))
-        _resolve(*ours, *(line for line in lines if not line.startswith("herglotz[")))
+        said = _resolve(*ours, *(line for line in lines if not line.startswith("herglotz[")))
+        if said:
+            sys.exit(said)
         taken = json.loads(report.read_text(encoding="utf-8"))["install"]
     return f"# {HERE}. Written by `python tools/supply.py lock`; SECURITY.md says what for.\n" + "".join(sorted(
         f"{canonicalize_name(one['metadata']['name'])}=={one['metadata']['version']}"
         f" --hash=sha256:{one['download_info']['archive_info']['hashes']['sha256']}\n" for one in taken))  # fmt: skip
 
 
-def _resolve(*words: str) -> None:
-    """Run `pip install` without installing; a package that is there already is fetched all the same."""
+def _resolve(*words: str) -> str:
+    """What went wrong in `pip install` without installing; a package that is there already is fetched all the same."""
     pip = [sys.executable, "-m", "pip", "install", "--quiet", "--dry-run", "--ignore-installed", "--only-binary=:all:"]
-    if code := subprocess.run([*pip, *words], check=False).returncode:
-        sys.exit(code)  # pip said why
+    done = subprocess.run([*pip, *words], check=False, stderr=subprocess.PIPE, text=True)
+    return (done.stderr or f"pip ended with {done.returncode}") if done.returncode else ""
 
 
 def check_lock() -> None:
@@ -128,7 +131,11 @@ def check_lock() -> None:
     if made_for != HERE:
         print(f"lock.txt is for {made_for}, this is {HERE}: nothing checked")
         return
-    _resolve("--require-hashes", "--requirement", str(LOCK))
+    if said := _resolve("--require-hashes", "--requirement", str(LOCK)):
+        if not (missing := NO_FILE.search(said)):
+            sys.exit(said)
+        print(f"lock.txt: not checked: no package index, or not the lock's. {missing[0]}")
+        return
     print(f"lock.txt: pip gets {text.count('--hash')} packages with these hashes")
 
 

@@ -167,10 +167,15 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
         if not joints and rms > MISSED * noise:
             return without(f"it misses steps by {rms:.2g}, noise by {noise:.2g}: a force is missing from it")
         return Structure(replace(rich, order=2, objective="trajectory"), found, f"{words}: noise")
-    if rms > max(BETTER * float(fit.errors(x).square().mean().sqrt()), EXPLAINED * size):
+    if not explains_steps(rms, float(fit.errors(x).square().mean().sqrt()), size):
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
     return Structure(replace(rich, objective=objective), found, f"{words}: exact", larger=joints)
+
+
+def explains_steps(order4: float, order2: float, size: float) -> bool:
+    """Whether the rule of order 4 is what one-step errors ask for, or leaves none."""
+    return order4 <= max(BETTER * order2, EXPLAINED * size)
 
 
 def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> Baseline:

@@ -1,11 +1,23 @@
 """Small parts of what is exported: the compensated sum and the range of steps."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
+from herglotz.data import simulate
 from herglotz.errors import InputError
+from herglotz.export import export_run
+from herglotz.export.compare import draw
 from herglotz.export.inputs import check_range
+from herglotz.export.load import read_header
+from herglotz.export.lower.interpret import MATHEMATICS
+from herglotz.export.newton import FLOOR, NewtonIteration, first_carry
 from herglotz.export.step import _added
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.scenes import scene
+from herglotz.training import fit
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
@@ -28,3 +40,62 @@ def test_steps_at_the_ends_of_the_range_are_taken(dtype):
             with pytest.raises(InputError, match="where the model was fitted; got"):
                 check_range(torch.tensor([span[0], wrong, span[1]], dtype=dtype), span)
     check_range(torch.tensor(9.0), None)
+
+
+@pytest.mark.parametrize("boxed", [True, False])
+def test_states_to_compare_at_fill_the_box(boxed):
+    # fails if an end of the box is lost: a file is then compared with its run at one state, or at half of them
+    ends = {"q": ([-3.0, 1.0], [-2.0, 5.0]), "p": ([0.0, -1.0], [2.0, 1.0]), "s": ([4.0], [4.5])}
+    box = {f"{name}_{end}": values[k] for name, values in ends.items() for k, end in enumerate(("low", "high"))}
+    file = SimpleNamespace(metadata={"box": box if boxed else None}, dof=2, dtype=torch.float64)
+    for name, x in zip("qps", draw(file, 2000, torch.Generator().manual_seed(0)), strict=True):
+        low, high = torch.tensor(ends[name] if boxed else ([-1.0], [1.0]), dtype=torch.float64)
+        share = (x.reshape(2000, -1) - low) / (high - low)
+        assert 0 <= float(share.min()) < 0.01 < 0.99 < float(share.max()) <= 1
+
+
+@pytest.mark.parametrize("name", MATHEMATICS)
+def test_functions_of_constants_are_those_of_torch(name):
+    # fails if a constant that is computed when C is written is another one than torch computes
+    function = {"fabs": torch.abs, "softplus": torch.nn.functional.softplus}.get(name) or getattr(torch, name)
+    for x in (-0.7, -0.0, 0.3, 0.9):
+        if x >= 0 or name != "sqrt":
+            expected = float(function(torch.tensor(x, dtype=torch.float64)))
+            assert MATHEMATICS[name](x) == pytest.approx(expected, rel=1e-14, abs=0)
+
+
+def test_a_run_says_in_the_file_what_it_is_for(tmp_path):
+    # fails if the steps of the data or those asked for are lost, or rounding makes the run's own step foreign
+    data = simulate(scene("damped_oscillator"), trajectories=1, steps=12, h=0.2, seed=0)
+    run = fit(data, level="linear", objective="residual", iterations=2, progress=False)
+    entries = read_header(export_run(run, tmp_path / "a.h"))[1]
+    assert entries["h_range"] == pytest.approx(run.h_range, rel=1e-6)
+    assert entries["name"] == "a"
+    assert entries["start"]["q"] == run.last_fitted()[0].q.tolist()
+    asked = read_header(export_run(run, tmp_path / "b.h", h_range=(0.1, run.h * (1 - 1e-7)), name="arm"))[1]
+    assert (asked["h_range"], asked["name"]) == ([0.1, run.h], "arm")
+    for path, kind in (("a.txt", None), ("a.h", "fmu")):
+        with pytest.raises(InputError, match="the name must end in"):
+            export_run(run, tmp_path / path, kind)
+
+
+class NoDecrease(torch.nn.Module):
+    """A step equation whose |F| is 1 everywhere, with a Newton step of the size of q's rounding."""
+
+    def forward(self, q, p, s, h, trial):  # noqa: ARG002
+        return trial, 0 * s, 1 + 0 * s, p, s, s, None
+
+
+@pytest.mark.parametrize("scale", [0.0, 1.0])
+@pytest.mark.parametrize("size", [0.0, 1.0])
+@pytest.mark.parametrize("h", [1e-9, 1.0])
+def test_what_rounding_leaves_ends_the_iteration(scale, size, h):
+    # fails if rounding is relative to the least of the move, of q and of h times the speed, instead of the largest
+    iteration: Any = NewtonIteration(ContactLagrangian(ModelConfig(speed=(1.0,))))
+    iteration.equation = NoDecrease()
+    one = torch.ones(1, 1, dtype=torch.float64)
+    move = 0.5 * FLOOR * torch.finfo(torch.float64).eps * one
+    _, _, x, _, _, fraction, _, *values = first_carry(move)
+    carry = (torch.tensor(1), torch.tensor([False]), x, move, one[0], fraction, scale * one[0], *values)
+    done = iteration(size * one, one, one[0], h * one[0], *carry)[1]
+    assert done.tolist() == [max(scale, size, h) == 1.0]

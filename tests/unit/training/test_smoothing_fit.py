@@ -14,7 +14,7 @@ from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, Prior, SmoothingProblem, fit
 from herglotz.training.cross_validation import left_out_errors, without_rows
 from herglotz.training.problems.grid import segment_grid
-from herglotz.training.smoothing_fit import _hat
+from herglotz.training.smoothing_fit import ROUNDS, _hat
 
 NOISE = 0.01
 RTOL = 1e-10  # of the largest entry; differences and closed forms differ by 2e-14 to 3e-12 (AVX-512, AVX2, SSE)
@@ -142,12 +142,15 @@ def disturbed(kick, seed=0, count=8, steps=60):
 
 
 def test_both_noises_are_found():
-    # fails if the pushes are taken for noise of the data (trajectories that must not leave the model do: 0.037)
+    # fails if the pushes are taken for noise of the data (trajectories that must not leave the model do: 0.037), or the
+    # rounds go on when both noises have settled
     data = disturbed(kick=0.02)
     run = fit(data, FitConfig(objective="smoothing", train_fraction=1.0, departures=(2e-3,)), progress=False)
     model = run.model.config
     process = run.metrics["process"] * run.metrics["sigma"] * model.speed[0] / model.scale[0]
     assert run.metrics["objective"] == "smoothing"
+    rounds = {row["stage"] for row in run.history if "noise" in row["stage"]}
+    assert 2 <= len(rounds) < ROUNDS
     assert run.metrics["sigma"] == pytest.approx(NOISE, rel=0.1)
     assert process == pytest.approx(0.02, rel=0.3)
     assert run.metrics["rate"] == pytest.approx(0.2, rel=0.3)

@@ -19,7 +19,14 @@ from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.pruning import prune
-from herglotz.training.structure import KINETIC, dictionary, start_of_features, structure_is_free, structured
+from herglotz.training.structure import (
+    KINETIC,
+    dictionary,
+    explains_steps,
+    start_of_features,
+    structure_is_free,
+    structured,
+)
 from herglotz.training.task import build_model
 
 
@@ -79,6 +86,14 @@ def test_features_that_are_named_start_where_the_data_say():
                   {"objective": "raw"}):  # fmt: skip
         told = FitConfig(**{"features": ("pendulums",), "level": "linear", **other})
         assert start_of_features(data, base, told) is base
+
+
+@pytest.mark.parametrize(
+    ("order4", "order2", "kept"), [(0.4, 1.0, True), (0.6, 1.0, False), (5e-8, 5e-8, True), (2e-7, 2e-7, False)]
+)
+def test_order_4_is_kept_where_it_is_better_or_exact(order4, order2, kept):
+    # fails if one of the two is not enough: exact data of a rule of order 2 have no error that order 4 could halve
+    assert explains_steps(order4, order2, 1.0) is kept
 
 
 def test_the_data_decide():
