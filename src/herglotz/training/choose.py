@@ -124,7 +124,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
-        "substeps": "the fit needed shorter steps: halved ones met the data better" if named else AS_SET,
+        "substeps": "the fit needed shorter steps: halved ones change the motion" if named else AS_SET,
         **seen.why_arrival,
         "zeros": seen.apart or "no recording was found to differ from the others",
         "forces": _forces_reason(seen),

@@ -51,7 +51,7 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-LIKELIER = 1.0  # log-likelihood that halved steps have to bring
+LIKELIER = 1.0  # log-likelihood that halved steps may cost: longer ones bias what other motions are made of
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
@@ -334,9 +334,9 @@ class DictionarySearch:
         while self._too_long(found):
             other = self._refit(found, found.terms, 2 * found.config.substeps)
             count = self.data.q.numel()  # likelihoods of as many parameters compare as they are
-            if other is None or not count * math.log(found.rms / max(other.rms, FINE * self.floor)) > LIKELIER:
+            if other is None or not count * math.log(found.rms / max(other.rms, FINE * self.floor)) > -LIKELIER:
                 self.in_vain = found.config.substeps, found.rms
-                break  # other values of the parameters make up for the longer steps
+                break  # terms that stand for the longer steps
             found = self._longer(other)
         return found
 
