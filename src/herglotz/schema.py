@@ -53,9 +53,14 @@ def matches(value: Any, hint: Any) -> bool:
         return isinstance(value, (list, tuple)) and all(matches(x, inner[0]) for x in value)
     if origin is dict:
         return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
-    if hint in (int, float) and isinstance(value, int) and (isinstance(value, bool) or abs(value) > LARGEST):
-        return False
-    return isinstance(value, (int, float) if hint is float else hint)
+    return _is_number(value, hint) if hint in (int, float) else isinstance(value, hint)
+
+
+def _is_number(value: Any, hint: type) -> bool:
+    """Whether a value is a number of this type that torch takes; no truth value is one."""
+    if isinstance(value, int):
+        return not isinstance(value, bool) and abs(value) <= LARGEST
+    return isinstance(value, hint)
 
 
 def _named(hint: Any) -> str:

@@ -118,13 +118,16 @@ def assign(
     u = wanted.in_order(roles["input"], names)
     q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
     q = q if wanted.coordinates is None else tuple(place[x] for x in _several(wanted.coordinates))
-    if not (u or wanted.motion):
-        raise InputError(f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque")
-    if not q:
-        raise InputError(f"{where}: no coordinate column, only {every}; add a column such as q[rad]")
-    if len(roles["trajectory"]) > 1:
-        both = " and a column ".join(names[i] for i in roles["trajectory"])
-        raise InputError(f"{where}: both a column {both}; keep one")
+    both = " and a column ".join(names[i] for i in roles["trajectory"])
+    refuse(
+        {
+            f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (
+                u or wanted.motion
+            ),
+            f"{where}: no coordinate column, only {every}; add a column such as q[rad]": not q,
+            f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
+        }
+    )
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
     return Columns(names, units, clock, q, trajectory, action, p, u)

@@ -33,8 +33,8 @@ if TYPE_CHECKING:
     from herglotz.training.predict import Prediction
 
 MOST_PANELS, DATA = 4, "#B5B5B5"
-# Shares that have a word.
 ROOM_FOR_RMS = 0.2  # of the axis: its caption takes 0.15 of a figure of one panel
+# Shares that have a word.
 FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds", 3 / 4: "three quarters"}
 
 

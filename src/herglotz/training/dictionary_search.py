@@ -11,6 +11,7 @@ only if held-out blocks of time ask for them. Model steps are halved while that 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -19,12 +20,11 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
 from herglotz.data.roughness import coarse, precision
-from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.cross_validation import MARGIN
 from herglotz.training.found_terms import Found
-from herglotz.training.linear_terms import linear_starts
+from herglotz.training.linear_terms import LinearStart, linear_starts
 from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
@@ -97,7 +97,7 @@ class DictionarySearch:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
             white = more is not None and not (found.coloured and more.coloured)  # what the criterion takes for granted
-            if more is None or not more.rms < found.rms or not (white or self._beaten(found, more)):
+            if more is None or not more.rms < found.rms or not (white or found.beaten_by(more, self.floor)):
                 break
             found = self._finer(self._held(self._longer(more)))
         return self._one_rate(self._last_terms(self._likeliest(self._pruned(found))))
@@ -107,35 +107,35 @@ class DictionarySearch:
         local = local_polynomials(self.data)
         if local is None:
             return None
-        start, one = smoothed(self.data, local), self.data.dof == 1
-        bare = self._grown(*self._bare(), 1, start) if one and self.coarse else None
-        if bare is not None and bare.whole and bare.rms <= self.precision:
-            return self._finer(bare)  # accelerations that are read off coarse samples mislead
-        families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
-        linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
-        found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
-        if bare is None and (found is None or (one and found.coloured and found.rms > MISLED * self.precision)):
-            bare = self._grown(*self._bare(), 1, start)
-        if bare is not None and (found is None or (bare.whole, -bare.rms) > (found.whole, -found.rms)):
-            found, linear = bare, []
-        if found is None:
-            return None
-        found = self._finer(self._held(self._simpler(found)))
-        for simple in linear[1:]:
-            if found.coloured:
+        start = smoothed(self.data, local)
+        found, simpler = self._first(start, local)
+        for simple in simpler:
+            if found is None or found.coloured:
                 break  # of residuals that are no noise likelihoods tell nothing
             other = self._grown(simple.terms, simple.values, 1, start)
             other = None if other is None else self._finer(self._held(other))
-            if other is not None and self._as_likely(other, found):
+            if other is not None and other.as_likely(found, self.floor):
                 return other
         return found
 
-    def _as_likely(self, less: Found, found: Found) -> bool:
-        """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
-        count, fewer = self.data.q.numel(), len(found.terms.names) - len(less.terms.names)
-        missed = max(less.rms, self.floor) / max(found.rms, self.floor)
-        longer = less.fit.problem.grid.length >= found.fit.problem.grid.length
-        return longer and count * math.log(missed) < fewer * math.log(count) / 2
+    def _first(self, start: Trajectories, local: LocalPolynomials) -> tuple[Found | None, Sequence[LinearStart]]:
+        """From the linear problem, or from the baseline's own terms where that misleads; then starts of fewer terms."""
+        bare = self._grown(*self._bare(), 1, start) if self.coarse and self.data.dof == 1 else None
+        if bare is not None and bare.whole and bare.rms <= self.precision:
+            return self._finer(bare), []  # accelerations that are read off coarse samples mislead
+        families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
+        linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
+        found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
+        if bare is None and self._misled(found):
+            bare = self._grown(*self._bare(), 1, start)
+        if bare is not None and (found is None or (bare.whole, -bare.rms) > (found.whole, -found.rms)):
+            found, linear = bare, []
+        return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[1:])
+
+    def _misled(self, found: Found | None) -> bool:
+        """Whether the linear problem gave no model, or one coordinate's that misses far more than the noise."""
+        alone = self.data.dof == 1
+        return found is None or (alone and found.coloured and found.rms > MISLED * self.precision)
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""
@@ -321,13 +321,7 @@ class DictionarySearch:
 
     def _as_good(self, less: Found, found: Found) -> bool:
         """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
-        return less.rms <= 2**0.5 * max(found.rms, self.floor) and not self._beaten(less, found)
-
-    def _beaten(self, found: Found, other: Found) -> bool:
-        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding."""
-        # their spread has no say: it is wide where errors grow with time, as on an axis without a spring
-        own, its = (float(f.held_out.clamp_min(self.floor).square().mean().sqrt()) for f in (found, other))
-        return not own <= MARGIN * its
+        return less.rms <= 2**0.5 * max(found.rms, self.floor) and not less.beaten_by(found, self.floor)
 
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.cross_validation import MARGIN
 from herglotz.training.named_terms import NamedTerms, places
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
@@ -68,6 +69,19 @@ class Found:
         late = torch.tensor([i for name in simplest for i in at.get(name, ())], dtype=torch.long)
         stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, late)[0].tolist())
         return self.terms.only([name for name, own in at.items() if stay & set(own)])
+
+    def beaten_by(self, other: Found, floor: float) -> bool:
+        """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding."""
+        # their spread has no say: it is wide where errors grow with time, as on an axis without a spring
+        own, its = (float(f.held_out.clamp_min(floor).square().mean().sqrt()) for f in (self, other))
+        return not own <= MARGIN * its
+
+    def as_likely(self, other: Found, floor: float) -> bool:
+        """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
+        count, fewer = self.fit.problem.data.q.numel(), len(other.terms.names) - len(self.terms.names)
+        missed = max(self.rms, floor) / max(other.rms, floor)
+        longer = self.fit.problem.grid.length >= other.fit.problem.grid.length
+        return longer and count * math.log(missed) < fewer * math.log(count) / 2
 
     def changed_by(self, problem: ShootingProblem) -> float:
         """RMS change of the fitted motion by the steps of another problem with the same terms and segments."""
