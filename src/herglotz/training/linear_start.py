@@ -13,6 +13,7 @@ fit and does not end one.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -110,8 +111,11 @@ class LinearFit:
             inverse = torch.linalg.pinv(Jk)
             top = (inverse @ R).flatten(0, 1)
             bottom = torch.einsum("tij,tjkf->tikf", inverse, J).flatten(0, 2)
+            # In units of the motion: in others the smaller of both parts would be lost in the rounding of the larger.
+            unit = float(top[:, 0].norm() / bottom[:, 0].norm())
+            top = top / unit if 0 < unit < math.inf else top
             size = bottom.square().sum(0).add(top.square().sum(0)).sqrt()
-            size = size.clamp_min(1e-12 * float(size.max()))
+            size = torch.where(size > 0, size, 1.0)  # columns differ by powers of the unit of length
             # All of R and J in one thin factor: R = Q₁ U, J = Q₂ U with Q₁ᵀQ₁ + Q₂ᵀQ₂ = 1; x = U⁻¹ y, least |Q₁ y|.
             Q, U = torch.linalg.qr(torch.cat([top, bottom]) / size)
             if not bool(torch.isfinite(Q).all()):  # each has a scale of its own, and some had none

@@ -118,7 +118,7 @@ class LinearTerms:
         """
         fit, overlap = self.fit, self.overlap
         X = torch.linalg.solve_ex(fit.J @ x, fit.R)[0].flatten(0, 1)[:, columns][:, 1:]
-        size = r.square().mean().clamp_min((1e-9 * float(X.abs().max())) ** 2 + 1e-300)
+        size = r.square().mean().clamp_min((1e-9 * float((X * x[columns][1:]).abs().max())) ** 2 + 1e-300)
         place = self._linear_places(columns)
         free = torch.tensor([i for own in place.values() for i in own])
         simplest = torch.tensor([i for name in self.own for i in place[name]], dtype=torch.long)

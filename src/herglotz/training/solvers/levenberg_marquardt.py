@@ -187,9 +187,12 @@ def levenberg_marquardt(
 
 
 def _floored(scale: Tensor) -> Tensor:
-    """Keep the scaling positive where a parameter has had no influence yet (behind a zero-initialised layer)."""
+    """Keep the scaling positive where a parameter has had no influence yet (behind a zero-initialised layer).
+
+    Those that have some keep their own, however small: it is a power of the unit of length.
+    """
     largest = float(scale.max())
-    return scale.clamp_min(1e-10 * largest if largest > 0 else 1.0)
+    return torch.where(scale > 0, scale, largest if largest > 0 else 1.0)
 
 
 Equations = tuple[Tensor, "Tensor | ByProducts", Tensor]
