@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.csv_columns import HEADER_CELL, Names, Wanted
 from herglotz.data.extra_formats import Table
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
@@ -63,7 +63,8 @@ def as_trajectories(
         sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
         return _marked(load(data, like=like, **sensors, **columns), angles)
     elif hasattr(data, "columns") and h is not None:
-        found = in_radians_and_seconds(_array(np.asarray(data), h, time, names))
+        columns = names["coordinates"] or [str(name) for name in data.columns]
+        found = _array(np.asarray(data), h, time, names | {"coordinates": columns})
     elif hasattr(data, "columns") or isinstance(data, Mapping):
         found = _table(data, Wanted(time, **names, known=() if like is None else like.columns))
         found = found if like is None else angles_like(found, like)
@@ -124,9 +125,20 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
         raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
     n = len(q)
     t = np.arange(n) * float(h) if h is not None else _floats("time", time)
-    called = (called,) if isinstance(called, str) else called
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
-    return Trajectories.of(t, q, names=called, u=u, source="array")
+    return in_radians_and_seconds(Trajectories.of(t, q, u=u, source="array", **_labels(called)))
+
+
+def _labels(called: Names | None) -> dict[str, Any]:
+    """What names of coordinates say, as cells of a header do: `x[m]` is x, in m. Nothing where there are none."""
+    if called is None:
+        return {}
+    heads = [HEADER_CELL.fullmatch(name) for name in ((called,) if isinstance(called, str) else called)]
+    refuse({f"{called!r} names no coordinate; write name or name[unit]": None in heads})
+    names = tuple(head[1] for head in heads if head)
+    units = tuple((head[2] or "").strip() or "1" for head in heads if head)
+    columns = tuple((name, "coordinate", unit) for name, unit in zip(names, units, strict=True))
+    return {"names": names, "units": units, "angles": [unit == "rad" for unit in units], "columns": columns}
 
 
 def _index(index: Any) -> np.ndarray:

@@ -65,6 +65,18 @@ def test_tables():  # fails if a Series' index is not its time, or a DataFrame's
     assert as_trajectories([frame, frame], time="clock", inputs=()).lengths == (4, 4)
 
 
+def test_the_name_of_a_series_holds_its_unit():  # fails if x[m] is a name of four letters, or degrees stay degrees
+    found = as_trajectories(Series([1, 2, 3, 4], T, "x[m]"))
+    assert (found.names, found.units, found.angles) == (("x",), ("m",), (False,))
+    found = as_trajectories(Series([10, 20, 30, 40], T, "theta [deg]"))
+    assert (found.names, found.units, found.angles, found.degrees) == (("theta",), ("rad",), (True,), ("theta",))
+    assert found.q[:, 0].tolist() == pytest.approx(np.radians([10, 20, 30, 40]))
+    frame = Series(Q, T, None)
+    frame.columns = ["x[m]", "phi"]  # type: ignore[attr-defined]
+    found = as_trajectories(frame, h=0.1)
+    assert (found.names, found.units) == (("x", "phi"), ("m", "1"))
+
+
 @pytest.mark.parametrize(
     ("data", "options", "message"),
     [
@@ -76,6 +88,7 @@ def test_tables():  # fails if a Series' index is not its time, or a DataFrame's
         (Trajectories.of(T, Q), {"h": 0.1}, "have their columns already"),
         (Trajectories.of(T, Q), {"time": T}, "have their columns already"),
         ([Q, Q], {"time": T}, "time and inputs of several arrays"),
+        (Q, {"h": 0.1, "coordinates": ("x[", "y")}, "names no coordinate; write name or name"),
     ],
 )
 def test_mistakes(data, options, message):  # fails if a mistake is a traceback, or an option is ignored
