@@ -11,6 +11,7 @@ from herglotz.training.identifiability import PHYSICAL, WORDS
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
 
+INPUT_MAP = "friction.input_map"
 # Powers of the coordinate's unit and of time in each parameter's unit; the first coordinate's mass is 1.
 DIMENSIONS = {
     "potential.stiffness": (0, -2),
@@ -19,6 +20,7 @@ DIMENSIONS = {
     "friction.viscous": (0, -1),
     "friction.coulomb": (1, -2),
     "friction.breakaway": (1, -2),
+    INPUT_MAP: (1, -2),  # per unit of the input
 }
 LOGARITHMS = ("kinetic.log", "friction.log")  # stored as logarithms: such a value has no unit
 
@@ -56,6 +58,8 @@ def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
             words = WORDS.get(name, name)
             words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
             whose = f" of {run.data.names[i]}" if values.numel() == run.data.dof > 1 else ""
+            if name == INPUT_MAP and values.numel() > 1:
+                whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
             found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
     return found
 
@@ -66,9 +70,18 @@ def _unit(name: str, run: Run, i: int) -> str:
     if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
         return ""
     length, time = DIMENSIONS[name]
-    own = run.data.units[min(i, run.data.dof - 1)]
+    row, per = i, ""
+    if name == INPUT_MAP:
+        row, (of, unit) = i // run.model.inputs, _source(run, i)
+        per = f" per {unit or of}"
+    own = run.data.units[min(row, run.data.dof - 1)]
     above = own if length and own != "1" else "1"
-    return f"{above}/{run.data.time_unit}" + ("²" if time == -2 else "")
+    return f"{above}/{run.data.time_unit}" + ("²" if time == -2 else "") + per
+
+
+def _source(run: Run, i: int) -> tuple[str, str]:
+    """Name and unit of the input that entry i of the map from inputs to forces, row by row, belongs to."""
+    return run.data.input_labels[i % run.model.inputs]
 
 
 def held_out_rms(run: Run) -> list[list[float]]:

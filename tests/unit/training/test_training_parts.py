@@ -18,6 +18,7 @@ T = torch.arange(60, dtype=torch.float64) * 0.1
 
 def test_units_of_parameters():  # fails if a power of time or length is another: mass 1, forces are accelerations
     run = SimpleNamespace(data=SimpleNamespace(units=("m", "rad"), dof=2, time_unit="s"))
+    run.data.input_labels, run.model = (("torque", "N m"), ("gate", "")), SimpleNamespace(inputs=2)
     found = {name: _unit(name, run, 0) for name in (*DIMENSIONS, "kinetic.log_mass")}  # type: ignore[arg-type]
     assert found == {
         "potential.stiffness": "1/s²",
@@ -26,10 +27,12 @@ def test_units_of_parameters():  # fails if a power of time or length is another
         "friction.viscous": "1/s",
         "friction.coulomb": "m/s²",
         "friction.breakaway": "m/s²",
+        "friction.input_map": "m/s² per N m",
         "kinetic.log_mass": "",
     }
     assert _unit("potential.tilt", run, 1) == "rad/s²"  # type: ignore[arg-type]
-    run.data.input_labels = (("torque", "N m"),)
+    entries = [_unit("friction.input_map", run, i) for i in (1, 2, 3)]  # type: ignore[arg-type]
+    assert entries == ["m/s² per gate", "rad/s² per N m", "rad/s² per gate"]  # fails if rows and columns are swapped
     assert _unit("friction.input_zero", run, 0) == "N m"  # type: ignore[arg-type]
 
 
