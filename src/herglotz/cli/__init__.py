@@ -1,7 +1,7 @@
 """The command line: one module a subcommand.
 
-A user's mistake is one line on stderr and exit code 2; a failed verification is exit code 1; Ctrl-C and SIGTERM are
-130; a fault of the package itself is 70, with a line that says how to report it. Only the
+A user's mistake is one line on stderr (wrapped at a terminal) and exit code 2; a failed verification is exit code 1;
+Ctrl-C and SIGTERM are 130; a fault of the package itself is 70, with a line that says how to report it. Only the
 subcommands that need PyTorch import it, so that help is immediate.
 """
 
@@ -18,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import herglotz
+from herglotz.cli.common import complain
 from herglotz.cli.parser import build_parser
 from herglotz.errors import InputError
 
@@ -103,7 +104,7 @@ def _internal(error: Exception, argv: Sequence[str] | None) -> str:
 
 
 def _say(message: str, code: int) -> int:
-    print("herglotz:", " ".join(message.split()), file=sys.stderr)
+    complain(message)
     return code
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import tempfile
 import textwrap
 from collections.abc import Sequence
@@ -120,6 +121,15 @@ def say(text: str, file: TextIO | None = None) -> None:
     """Print a sentence in lines that fit a terminal as it opens; names of files are not broken."""
     lines = textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     print(lines, file=file)
+
+
+def complain(message: str) -> None:
+    """Print what went wrong on stderr: wrapped for a person at a terminal, one line for logs and other programs."""
+    line = f"herglotz: {' '.join(message.split())}"
+    if sys.stderr.isatty():
+        say(line, sys.stderr)
+    else:
+        print(line, file=sys.stderr)
 
 
 def print_table(rows: Sequence[tuple[str, str]]) -> None:

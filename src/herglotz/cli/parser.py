@@ -9,6 +9,7 @@ from typing import NoReturn
 
 import herglotz
 from herglotz.cli import export, fit, plot, predict, report, rollout, select, simulate, trust, tune, verify
+from herglotz.cli.common import complain
 
 DESCRIPTION = """\
 Learn a discrete contact Lagrangian from measured positions, step it, and prove that it is a contact integrator.
@@ -69,7 +70,8 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to read on; exit with code 2."""
-        self.exit(2, f"herglotz: error: {' '.join(message.split())}; see '{self.prog} --help'\n")
+        complain(f"error: {message}; see '{self.prog} --help'")
+        self.exit(2)
 
 
 def build_parser() -> Parser:
