@@ -6,6 +6,8 @@ import math
 from collections.abc import Collection, Sequence
 from dataclasses import replace
 
+from torch import Tensor
+
 from herglotz.data.trajectories import DEGREES, Trajectories
 
 # How many of each unit of time make a second.
@@ -43,6 +45,13 @@ def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:
         units=tuple("deg" if x else unit for x, unit in zip(turned, data.units, strict=True)),
         angles=tuple(angle and not x for x, angle in zip(turned, data.angles, strict=True)),
     )
+
+
+def as_recorded(data: Trajectories) -> tuple[Trajectories, Tensor]:
+    """The set in deg where the table had degrees, for figures, and how many such units one of the fit's is, (n,)."""
+    turned = [180 / math.pi if name in data.degrees and unit == "rad" else 1.0
+              for name, unit in zip(data.names, data.units, strict=True)]  # fmt: skip
+    return in_degrees(data, data.degrees), data.q.new_tensor(turned)
 
 
 def common_unit(units: Sequence[str]) -> str:

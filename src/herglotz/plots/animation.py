@@ -11,7 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from PIL import Image
 
+from herglotz.data import Trajectories
 from herglotz.data.files import PathLike, write_atomically
+from herglotz.data.units import as_recorded
 from herglotz.errors import InputError
 from herglotz.plots.motion import DATA
 from herglotz.plots.style import DPI, INK, MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, styled, with_unit
@@ -53,7 +55,9 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
         captions(left, [("data", "#777777"), ("fit", MODEL), ("free run", UNSEEN)])
         recorded = left.plot([], [], "o-", color=DATA, lw=3, ms=9)[0]
         moving = left.plot([], [], "o-", lw=1.4, ms=5)[0]
-        cursor = _series(right, run, (t, q, model), boundary)
+        shown, factor = as_recorded(data)
+        by = factor.cpu().numpy()
+        cursor = _series(right, shown, (t, q * by, model * by), boundary)
         figure.set_dpi(DPI // 2)
         artists = (recorded, moving, cursor)
         for artist in artists:
@@ -84,7 +88,7 @@ def _at(time: float, t: np.ndarray, q: np.ndarray) -> np.ndarray:
     return np.array([np.interp(time, t, column) for column in q.T])
 
 
-def _series(ax: Axes, run: Run, motion: tuple[np.ndarray, np.ndarray, np.ndarray], boundary: float):
+def _series(ax: Axes, data: Trajectories, motion: tuple[np.ndarray, np.ndarray, np.ndarray], boundary: float):
     """Draw the coordinates against time; return the line that moves."""
     (t, q, model), seen = motion, motion[0] <= boundary
     for i in range(min(q.shape[1], MOST_PANELS)):
@@ -93,9 +97,9 @@ def _series(ax: Axes, run: Run, motion: tuple[np.ndarray, np.ndarray, np.ndarray
         ax.plot(t[t >= boundary], model[t >= boundary, i], color=UNSEEN, lw=1)
     if boundary < t[-1]:
         ax.axvspan(boundary, t[-1], color=SHADE, lw=0, zorder=0)
-    ax.set(xlim=(t[0], t[-1]), xlabel=with_unit("time", run.data.time_unit))
-    names = run.data.names[:MOST_PANELS]
-    ax.set_ylabel(", ".join(with_unit(name, unit) for name, unit in zip(names, run.data.units, strict=False)))
+    ax.set(xlim=(t[0], t[-1]), xlabel=with_unit("time", data.time_unit))
+    names = data.names[:MOST_PANELS]
+    ax.set_ylabel(", ".join(with_unit(name, unit) for name, unit in zip(names, data.units, strict=False)))
     return ax.axvline(t[0], color=INK, lw=1)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
+from herglotz.data.units import as_recorded
 from herglotz.plots.motion import trained_mask
 from herglotz.plots.style import MODEL, MUTED, SHADE, UNSEEN, captions, new_figure, styled, with_unit
 
@@ -21,8 +22,8 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
 
     At most four panels: coordinates of one trajectory, then of the next. Panels of one unit have one scale.
     """
-    data = run.data.unwrapped()
-    inside, held = bands.inside(data.q, level), ~trained_mask(run)
+    inside, held = bands.inside(run.data.unwrapped().q, level), ~trained_mask(run)
+    data, factor = as_recorded(run.data.unwrapped())
     part, word = (held, "held-out ") if bool(held.any()) else (~held, "")
     share = 100 * float(inside[part].double().mean())
     title = f"{share:.0f} % of the {word}samples lie in the {100 * level:g} % band"
@@ -32,10 +33,11 @@ def plot_bands(run: Run, bands: Bands, level: float = 0.9) -> Figure:
         figure = new_figure(8.0, 1.2 + 1.9 * len(cells), title)
         axes, reaches = figure.subplots(len(cells), 1, squeeze=False)[:, 0], []
         for (b, i), ax in zip(cells, axes, strict=True):
+            by = float(factor[i])
             rows = slice(data.offsets[b], data.offsets[b] + data.lengths[b])
-            t, residual = data.t[rows].cpu(), (data.q - bands.q)[rows, i].cpu()
-            model = width * bands.std[rows, i].cpu()
-            measured = (model.square() + (width * float(bands.sigma[i])) ** 2).sqrt()
+            t, residual = data.t[rows].cpu(), (data.q - bands.q * factor)[rows, i].cpu()
+            model = width * bands.std[rows, i].cpu() * by
+            measured = (model.square() + (width * float(bands.sigma[i]) * by) ** 2).sqrt()
             trained = run.train_lengths[b]
             if trained < len(t):
                 ax.axvspan(float(t[trained - 1] + t[trained]) / 2, float(t[-1]), color=SHADE, lw=0, zorder=0)

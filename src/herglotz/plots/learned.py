@@ -13,7 +13,7 @@ from torch import Tensor
 from herglotz.models.terms import LinearDamping
 from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
-from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, styled, with_unit
+from herglotz.plots.style import MODEL, MUTED, SERIES, SUPPORT, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping.field import FieldOf
 
 if TYPE_CHECKING:
@@ -54,11 +54,10 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
         axes = figure.subplots(rows, columns, squeeze=False)
         for i in range(columns):
             x, low, high = _range(run.states.q[trained_mask(run), i])
-            name = with_unit(run.data.names[i], run.data.units[i])
             _panel(axes[0, i], x, _curves(posterior, _potential(run, i, x)), (low, high))
-            axes[0, i].set(xlabel=name, ylabel=with_unit("potential V", energy))
+            axes[0, i].set_ylabel(with_unit("potential V", energy))
             _panel(axes[1, i], x, _curves(posterior, _force(run, i, x)), (low, high))
-            axes[1, i].set(xlabel=name, ylabel=with_unit(r"force $-\partial V/\partial q$", force))
+            axes[1, i].set_ylabel(with_unit(r"force $-\partial V/\partial q$", force))
             if rubs:
                 v, low, high = _range(_speeds(run)[:, i])
                 _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))
@@ -66,7 +65,9 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
                 axes[2, i].set_ylabel(with_unit("friction", force))
             for (j, k), color in zip(entries, SERIES, strict=False):
                 _panel(axes[-1, i], x, _curves(posterior, _mass(run, i, x, (j, k))), (low, high), color)
-                axes[-1, i].set(xlabel=name, ylabel="mass")
+                axes[-1, i].set_ylabel("mass")
+            for ax in (*axes[:2, i], *axes[2 + rubs :, i]):
+                position_axis(ax, run.data, i)
         band = [] if posterior is None else [("band: ±2 standard deviations", MODEL)]
         captions(axes[0, 0], [("shaded: where the data are", "#666666"), *band])
         axes[0, 0].margins(y=0.3)

@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
+from herglotz.data.units import as_recorded
 from herglotz.errors import InputError
 from herglotz.plots.style import (
     INK,
@@ -41,6 +42,7 @@ FRACTIONS = {1 / 4: "quarter", 1 / 3: "third", 1 / 2: "half", 2 / 3: "two thirds
 def plot_data(data: Trajectories) -> Figure:
     """Draw the samples alone, up to four trajectories (or the coordinates of a single one); gaps stay open."""
     cells = _cells(data, None)
+    data, _ = as_recorded(data)
     with styled():
         figure = new_figure(*_size(len(cells), 2.4), data.summary())
         for ax, (b, i) in zip(_axes(figure, len(cells), 1), cells, strict=True):
@@ -96,7 +98,8 @@ class _Motion(NamedTuple):
 
 
 def _drawn(motion: _Motion, title: str, trajectory: int | None = None) -> Figure:
-    data = motion.data
+    data, factor = as_recorded(motion.data)
+    motion = motion._replace(data=data, model=motion.model * factor)
     cells = _cells(data, trajectory)
     with styled():
         figure = new_figure(*_size(len(cells), 3.9), title)
@@ -112,7 +115,8 @@ def _prediction_title(found: Prediction) -> str:
     each = found.rms_per_coordinate
     if each is None:
         return "The free run fails at its first step"
-    names = zip(found.data.names, each, found.data.units, strict=True)
+    data, factor = as_recorded(found.data)
+    names = zip(data.names, [rms * by for rms, by in zip(each, factor.tolist(), strict=True)], data.units, strict=True)
     text = "Free run: RMS " + ", ".join(f"{name} {number(rms, unit)}" for name, rms, unit in names)
     lost = found.failed_steps
     return text if lost == 0 else f"{text}; {100 * lost:.3g} % not reached"
@@ -120,8 +124,8 @@ def _prediction_title(found: Prediction) -> str:
 
 def trajectory_title(run: Run) -> str:
     """Return the message of the figure: the distance of the free run from data that the fit has not seen."""
-    data, unit = run.data, one_unit(run.data.units)
-    error = (run.prediction - data.q).detach()
+    data, factor = as_recorded(run.data)
+    unit, error = one_unit(data.units), (run.prediction * factor - data.q).detach()
     unseen = ~trained_mask(run)
     lost = ~torch.isfinite(error).all(-1)
     if bool(lost.any()):

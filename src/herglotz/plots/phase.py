@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
-from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, styled, with_unit
+from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, captions, new_figure, position_axis, styled, with_unit
 from herglotz.stepping import Rollout, State, Stepper
 
 if TYPE_CHECKING:
@@ -52,10 +52,11 @@ def _draw_panel(run: Run, i: int, ax: Axes) -> None:
     for mask, color in ((fine & seen, MODEL), (fine & ~seen, UNSEEN)):
         ax.plot(q[mask], p[mask], ".", ms=3.2, color=color, zorder=3)
     ax.plot(q[list(data.offsets)], p[list(data.offsets)], "o", ms=5, mfc="white", mec=INK, mew=1.0, zorder=4)
-    ax.set(xlim=(q_low, q_high), ylim=(p_low, p_high), xlabel=with_unit(data.names[i], data.units[i]))
+    ax.set(xlim=(q_low, q_high), ylim=(p_low, p_high))
     ax.set_ylabel(with_unit(f"momentum p_{data.names[i]}", unit and f"{unit}, mass 1"))
     if data.angles[i]:
         _mark_pi(ax, q_low, q_high)
+    position_axis(ax, data, i)
     if i == 0:
         unseen = [("● unseen", UNSEEN)] if bool((~seen).any()) else []
         flow = [] if driven else [("→ flow of the model", "#666666")]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,7 +13,9 @@ import matplotlib as mpl
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
+from matplotlib.ticker import MaxNLocator
 
+from herglotz.data import Trajectories
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 
@@ -110,6 +113,17 @@ def captions(ax: Axes, entries: list[tuple[str, str]], where: str = "upper left"
 def with_unit(name: str, unit: str) -> str:
     """Return an axis label: `theta (rad)`, or the name alone for a number without unit."""
     return name if unit in ("", "1") else f"{name} ({unit})"
+
+
+def position_axis(ax: Axes, data: Trajectories, i: int) -> None:
+    """Name the lower axis after coordinate i, in rad or a length; its ticks are in deg where the table was."""
+    in_degrees = data.names[i] in data.degrees
+    if in_degrees:
+        low, high = ax.get_xlim()
+        ticks = MaxNLocator(6, steps=[1, 1.5, 2, 3, 4.5, 5, 9, 10]).tick_values(math.degrees(low), math.degrees(high))
+        at = [x for x in ticks.tolist() if math.degrees(low) <= x <= math.degrees(high)]
+        ax.set_xticks([math.radians(x) for x in at], [f"{x:g}".replace("-", "−") for x in at])
+    ax.set_xlabel(with_unit(data.names[i], "deg" if in_degrees else data.units[i]))
 
 
 def one_unit(units: Sequence[str]) -> str:
