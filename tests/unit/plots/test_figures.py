@@ -1,5 +1,6 @@
 """Every figure is drawn from a run, says what it should, and is written as a PNG; nothing global changes."""
 
+import math
 import os
 import struct
 import subprocess
@@ -35,7 +36,7 @@ from herglotz.plots import (
     save_figure,
     save_figures,
 )
-from herglotz.plots.motion import plot_prediction
+from herglotz.plots.motion import plot_prediction, trajectory_title
 from herglotz.stepping import State
 from herglotz.training import Bands, Run
 
@@ -275,6 +276,27 @@ def test_what_is_learned_is_the_models_own():  # fails if a panel shows another 
     np.testing.assert_allclose(f[1:-1], -(V[2:] - V[:-2]) / (x[2] - x[0]), atol=2e-3 * np.abs(f).max())
     seen = run.data.q[: run.train_lengths[0]]
     assert x[0] < float(seen.min()) < float(seen.max()) < x[-1]
+
+
+def test_what_was_recorded_in_degrees_is_drawn_in_degrees():
+    # fails if a figure shows radians to a reader whose file has degrees, or a unit that its numbers are not in
+    run = fake_run()
+    run = replace(run, data=replace(run.data, columns=(("theta", "coordinate", "deg"),)))
+    factor, bands = 180 / math.pi, Bands(run.prediction, 0.02 * torch.ones_like(run.prediction), torch.full((1,), 0.01))
+    upper, lower = plot_trajectory(run).axes
+    assert (upper.get_ylabel(), lower.get_ylabel()) == ("theta (deg)", "residual (deg)")
+    assert upper.lines[0].get_ydata() == pytest.approx(factor * run.data.q[:, 0].numpy())
+    assert trajectory_title(run).split()[3] == "deg"
+    plain = plot_bands(fake_run(), bands).axes[0]
+    turned = plot_bands(run, bands).axes[0]
+    assert turned.get_ylabel() == "residual of theta (deg)"
+    assert turned.lines[1].get_ydata() == pytest.approx(factor * plain.lines[1].get_ydata())
+    assert turned.get_ylim() == pytest.approx([factor * y for y in plain.get_ylim()])  # the band, too
+    for ax in (plot_phase_portrait(run).axes[0], *plot_learned(run).axes[:2]):  # curves of radians, ticks in degrees
+        assert ax.get_xlabel() == "theta (deg)"
+        shown = [float(x.get_text().replace("−", "-")) for x in ax.get_xticklabels()]
+        assert shown == pytest.approx([factor * x for x in ax.get_xticks()])
+    assert plot_data(run.data).axes[0].get_ylabel() == "theta (deg)"
 
 
 def test_data_alone_leaves_gaps_open():  # fails if a line is drawn across missing samples
