@@ -121,7 +121,7 @@ def position_axis(ax: Axes, data: Trajectories, i: int) -> None:
     if in_degrees:
         low, high = ax.get_xlim()
         ticks = MaxNLocator(6, steps=[1, 1.5, 2, 3, 4.5, 5, 9, 10]).tick_values(math.degrees(low), math.degrees(high))
-        at = [x for x in ticks.tolist() if math.degrees(low) <= x <= math.degrees(high)]
+        at = [x for x in map(float, ticks) if math.degrees(low) <= x <= math.degrees(high)]
         ax.set_xticks([math.radians(x) for x in at], [f"{x:g}".replace("-", "−") for x in at])
     ax.set_xlabel(with_unit(data.names[i], "deg" if in_degrees else data.units[i]))
 

@@ -290,7 +290,7 @@ def test_what_was_recorded_in_degrees_is_drawn_in_degrees():
     plain = plot_bands(fake_run(), bands).axes[0]
     turned = plot_bands(run, bands).axes[0]
     assert turned.get_ylabel() == "residual of theta (deg)"
-    assert turned.lines[1].get_ydata() == pytest.approx(factor * plain.lines[1].get_ydata())
+    assert turned.lines[1].get_ydata() == pytest.approx(factor * np.asarray(plain.lines[1].get_ydata()))
     assert turned.get_ylim() == pytest.approx([factor * y for y in plain.get_ylim()])  # the band, too
     for ax in (plot_phase_portrait(run).axes[0], *plot_learned(run).axes[:2]):  # curves of radians, ticks in degrees
         assert ax.get_xlabel() == "theta (deg)"
