@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.units import size
 
+HAIR = 1e-6  # of a step: recorded times are rounded
 QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
 
 
@@ -75,6 +76,15 @@ def warning(found: Sequence[Beyond], time_unit: str) -> str:
         return ""
     each = "; ".join(one.words(time_unit) for one in found)
     return f"the motion leaves the range that the model was fitted to, beyond which it extrapolates: {each}"
+
+
+def other_steps(times: Tensor, h_range: tuple[float, float], time_unit: str) -> str:
+    """One sentence where steps are shorter or longer than those of the fit; "" where none is."""
+    (low, high), steps = h_range, times.diff()
+    if low * (1 - HAIR) <= float(steps.min()) and float(steps.max()) <= high * (1 + HAIR):
+        return ""
+    mean = f"steps of {float(steps.mean()):g} {time_unit}"
+    return f"{mean} are outside of {low:g} to {high:g}, those that the model was fitted to"
 
 
 def recorded(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:
