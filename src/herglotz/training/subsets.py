@@ -52,16 +52,16 @@ def likelier(
     elif DRY in at:  # what shapes a force of 0 has no effect yet
         held = torch.cat([parameters.index(shape) for shape in ("friction.breakaway", "friction.log")])
     x = problem.pack(parameters.get(), found.fit.path.x[:, 0, : problem.d])
-    cost, A, b = problem.normal_equations(x)
-    if not math.isfinite(float(cost)):
+    cost, A, b = (y.double() for y in problem.normal_equations(x))
+    if not (bool(cost.isfinite()) and bool(A.isfinite().all())):
         return []
     A[held], A[:, held], b[held] = 0.0, 0.0, 0.0
     by, names, better = (problem.sigma / max(found.rms, floor)) ** 2, list(at), []
-    for subset in subsets(by * A, by * b, x, list(at.values()), math.log(problem.data.q.numel()))[:TRIED]:
+    for subset in subsets(by * A, by * b, x.double(), list(at.values()), math.log(problem.data.q.numel()))[:TRIED]:
         terms = every.only([names[k] for k in subset.kept])
         if terms == found.terms:
             break
-        theta, states = problem.unpack(subset.x)
+        theta, states = problem.unpack(subset.x.to(x))
         better.append(Better(terms, values_of(problem.parameters, theta, config, problem.data.angles), states))
     return better
 

@@ -59,7 +59,7 @@ def test_whole_numbers():  # fails if `none` is a number, or a slip a traceback
 @pytest.mark.parametrize(("step", "said"), [(0.1, False), (0.2, False), (0.0999, True), (0.2001, True)])
 def test_steps_beyond_those_of_the_fit_are_told(step, said, capsys):  # fails if a step at the end of the range is
     source = SimpleNamespace(h_range=(0.1, 0.2), time_unit="s")
-    rollout._warn(source, step * torch.arange(4, dtype=torch.float64), None, ())  # type: ignore[arg-type]
+    rollout._warn(source, step * torch.arange(4, dtype=torch.float64), None, [])  # type: ignore[arg-type]
     assert ("are outside of 0.1 to 0.2" in capsys.readouterr().err) is said
 
 

@@ -306,3 +306,12 @@ def test_summary():  # fails if a count, a unit or the gaps are missing
     assert full().summary() == "set: 3 trajectories, 13 samples of x [1], y [1], s, p, input u; step 0.1 s, 2 gaps"
     one = Trajectories.of([0, 1, 2], [0, 1, 2], time_unit="1", names=("x",), units=("m",))
     assert one.summary() == "trajectories: 1 trajectory, 3 samples of x [m]; step 1"
+
+
+def test_inputs_before_the_first_sample_that_is_kept_act_on_none():
+    # fails if the first sample cannot be left out, or the input beside it acts at the end of the trajectory before
+    t = torch.arange(5.0).repeat(2)
+    data = Trajectories.of(t, t[:, None], (5, 5), u=torch.arange(10.0)[:, None])
+    kept = data.keep(torch.tensor([False, True, False, True, True, False, True, True, True, True]))
+    assert kept.u is not None
+    assert kept.u.flatten().tolist() == [1.5, 3.0, 4.0, 6.0, 7.0, 8.0, 9.0]

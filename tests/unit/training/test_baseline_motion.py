@@ -77,7 +77,7 @@ def test_expected_triples_weigh_by_their_own_error(data):
 
 def test_unseen_energies_are_followed(data):
     # fails if the fit of exact data leaves its correction free where no triple has been
-    run = fit(data, FitConfig(train_fraction=1.0, iterations=60), progress=False)
+    run = fit(data, FitConfig(train_fraction=1.0, iterations=60, objective="residual"), progress=False)
     assert run.model.config.correction_depth == 1
     assert run.metrics["follows_data"]
     test = simulate(scene("damped_pendulum"), trajectories=5, steps=31, h=1.0, seed=1000).q.reshape(5, 32, 1)
@@ -89,7 +89,7 @@ def test_unseen_energies_are_followed(data):
 
 def test_restarts_race_and_the_one_ahead_goes_on(data):
     # fails if all start from the same weights, another than the least cost goes on, or the race costs more iterations
-    run = fit(data, FitConfig(iterations=18, restarts=3), progress=False)
+    run = fit(data, FitConfig(iterations=18, restarts=3, objective="residual"), progress=False)
     rows = [row for row in run.history if "one-step" in row["stage"]]
     ends = {row["stage"]: row["cost"] for row in rows}
     race = [cost for stage, cost in ends.items() if "start" in stage]

@@ -211,7 +211,7 @@ def test_combinations_that_do_not_fit_are_named(settings, message):
 def test_a_driven_model_wants_its_inputs():
     # fails if a driven model is fitted to data that hold none, or another number of them
     data = driven_data(trajectories=1)
-    with pytest.raises(InputError, match="hold none; add u"):
+    with pytest.raises(InputError, match="none of these columns is one; name them"):
         step_inputs(driven_truth(), replace(data, u=None))
     assert data.u is not None
     with pytest.raises(InputError, match="2 input\\(s\\) u are recorded, the model takes 1"):

@@ -117,7 +117,7 @@ def test_a_wrong_plan_is_refused_in_words():
 
 
 def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or of decisions that have no effect
-    plan = replace(choose(*seen(0.01)), network="none", sigma=0.0123, fitted_before=True)
+    plan = replace(choose(*seen(0.01)), network="none", sigma=0.0123, fitted_before=True, substeps=1)
     words = {name: taken for name, taken, _ in plan.decisions("rad")}
     assert words["fitted to"] == "whole trajectories (trajectory)"
     assert words["noise assumed"] == "0.0123 rad"

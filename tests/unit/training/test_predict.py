@@ -185,7 +185,7 @@ def test_mistakes_say_what_to_do():
     run, data = run_of(model), recording(model)
     two = replace(data, q=data.q.expand(-1, 2), names=("a", "b"), units=("rad", "rad"), angles=(True, True))
     cases = [
-        ({"data": replace(data, u=None)}, "other.csv: the model is driven by 1 input.*add u"),
+        ({"data": replace(data, u=None)}, "other.csv: the model is driven by 1 input.*name them"),
         ({"data": replace(data, units=("m",), angles=(False,))}, "q is in m, the run was fitted in rad; convert"),
         ({"data": two}, "other.csv: the coordinates are a, b; the run was fitted to q: rename"),
         ({"warmup": 80}, "other.csv: trajectory 0 has 81 samples; a warm-up of 80 needs at least 82: use --warmup 40"),

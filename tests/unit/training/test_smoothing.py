@@ -93,7 +93,7 @@ def test_inputs_drive_the_smoother():
     u = torch.cat([u, torch.zeros_like(u[:, :1])], 1).flatten(0, 1)
     found = smooth(model, replace(data, u=u), NOISE, process=0.01)
     assert float((found.states.q - q).square().mean().sqrt()) < 0.5 * NOISE
-    with pytest.raises(InputError, match="hold none; add u"):
+    with pytest.raises(InputError, match="none of these columns is one; name them"):
         smooth(model, data, NOISE)
 
 
