@@ -22,7 +22,7 @@ class Beyond:
 
     coordinate: str
     quantity: str  # "position" or "momentum"
-    by: float  # largest distance from the range, over its width
+    by: float  # largest distance from the range, over its width; infinite where that is 0
     since: float  # time of the first sample outside
     low: float  # the recorded range
     high: float
@@ -31,11 +31,12 @@ class Beyond:
 
     def words(self, time_unit: str) -> str:
         """One clause for people: what leaves which range, how far, and since when."""
-        ends = f"{size(self.low, '', digits=3)} to {size(self.high, self.unit, digits=3)}"
+        high, moved = size(self.high, self.unit, digits=3), self.low < self.high
+        ends = f"{size(self.low, '', digits=3)} to {high}" if moved else f"{high} throughout"
         time = size(self.since, time_unit, digits=4)
         where = f" in trajectory {self.trajectory}" if self.trajectory else ""
-        by = f"{100 * self.by:.2g} % of its width"
-        return f"the {self.quantity} of {self.coordinate} ({ends}) by {by}, since t = {time}{where}"
+        by = f" by {100 * self.by:.2g} % of its width" if moved else ""
+        return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
 def beyond(
@@ -55,7 +56,7 @@ def beyond(
                 y = y - 2 * math.pi * torch.round((y - (low + high) / 2) / (2 * math.pi))
             out = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
             if bool((out > 0).any()):
-                by = float(out.max()) / max(high - low, torch.finfo(torch.float64).tiny)
+                by = float(out.max()) / (high - low) if high > low else math.inf
                 since, unit = float(t[(out > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
                 found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit))
     return found
