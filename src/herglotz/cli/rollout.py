@@ -171,19 +171,16 @@ def _report(source: Source, found: Rollout, times: torch.Tensor, what: str) -> N
 
 def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[Beyond]) -> None:
     """Say on stderr where the motion or its steps are beyond the data of the fit."""
+    from herglotz.training.recorded_range import other_steps
+
     if left is not None:
         each = "".join(f"; {one.words(source.time_unit)}" for one in far)
         _note(
             f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted "
             f"to{each}"
         )
-    low, high = source.h_range or (0.0, math.inf)
-    steps = times.diff()
-    if float(steps.min()) < low * (1 - 1e-6) or float(steps.max()) > high * (1 + 1e-6):
-        _note(
-            f"steps of {float(steps.mean()):g} {source.time_unit} are outside of {low:g} to {high:g}, those that the "
-            "model was fitted to"
-        )
+    if words := other_steps(times, source.h_range or (0.0, math.inf), source.time_unit):
+        _note(words)
 
 
 def _note(text: str) -> None:

@@ -132,13 +132,12 @@ def _errors(
 def _gain(free: Tensor, still: Tensor) -> float | None:
     """By how many standard errors the free run meets the unseen samples better than the mean of the training part.
 
-    None where the free run breaks off.
+    None where the free run breaks off, or ends so far away that its square is no number.
     """
-    if not bool(free.isfinite().all()):
-        return None
     scale = still.square().mean(0).clamp_min(torch.finfo(still.dtype).tiny)
     gain = ((still.square() - free.square()) / scale).flatten()
-    return float(gain.mean() / (gain.std() / len(gain) ** 0.5).clamp_min(torch.finfo(gain.dtype).tiny))
+    found = float(gain.mean() / (gain.std() / len(gain) ** 0.5).clamp_min(torch.finfo(gain.dtype).tiny))
+    return found if math.isfinite(found) else None
 
 
 def _rms(x: Tensor) -> float | None:

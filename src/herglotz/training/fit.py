@@ -22,6 +22,7 @@ from herglotz.threads import one_thread
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary_search import ROUNDING
+from herglotz.training.distributed import is_first
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look
@@ -100,7 +101,7 @@ def fit(
     check_sizes(data.source or "data", data.q, data.names)
     checkpoint = None if out is None else Path(out) / "checkpoint.pt"
     with tensorboard_log(tensorboard) as log, nullcontext() if out is None else locked(out):
-        if checkpoint is not None:
+        if checkpoint is not None and is_first():  # only its process holds the lock
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
         if log is not None:

@@ -20,9 +20,8 @@ from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
-from herglotz.training.recorded_range import Beyond, beyond, farthest, warning
+from herglotz.training.recorded_range import Beyond, beyond, farthest, other_steps, warning
 
-HAIR = 1e-6  # of a step: recorded times are rounded
 Numbers = float | Sequence | np.ndarray | Tensor
 
 
@@ -97,7 +96,8 @@ def free_motion(
     time = time if t0 is None else t0
     dtype = state.q.dtype
     u, times = _inputs(run, inputs, (time, steps, h), (trajectory, q0 is not None and t0 is None))
-    _warn_of_steps(run, times)
+    if words := other_steps(times, run.h_range, run.data.time_unit):
+        warnings.warn(f"{words}; run.at_step(h) steps the same motion at another h", stacklevel=4)
     step: Any = times.diff().to(dtype) if isinstance(inputs, (str, Path, Trajectories)) else (h or run.h)
     with torch.no_grad():
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
@@ -105,17 +105,6 @@ def free_motion(
     motions = zip(found.q.reshape(-1, *found.q.shape[-2:]), found.p.reshape(-1, *found.p.shape[-2:]), strict=True)
     left = farthest(beyond(run.box, run.data, times, q, p) for q, p in motions)
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
-
-
-def _warn_of_steps(run: Steppable, times: Tensor) -> None:
-    """Warn of steps that the model was not fitted to, as the command line does."""
-    (low, high), steps = run.h_range, times.diff()
-    if float(steps.min()) < low * (1 - HAIR) or float(steps.max()) > high * (1 + HAIR):
-        warnings.warn(
-            f"steps of {float(steps.mean()):g} {run.data.time_unit} are outside of {low:g} to {high:g}, those that the "
-            "model was fitted to; run.at_step(h) steps the same motion at another h",
-            stacklevel=5,
-        )
 
 
 def _given(run: Steppable, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:

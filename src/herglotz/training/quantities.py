@@ -42,7 +42,7 @@ class Quantity:
 def rounded(value: float, std: float) -> str:
     """The value to the second digit of its standard deviation, at most five digits, with a minus sign."""
     digits = 5
-    if value and 0 < std < math.inf:
+    if value and math.isfinite(value) and 0 < std < math.inf:
         digits = 2 + math.floor(math.log10(abs(value))) - math.floor(math.log10(std))
     return ("−" if value < 0 else "") + f"{abs(value):.{min(max(digits, 1), 5)}g}"
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.units import size
 
+HAIR = 1e-6  # of a step: recorded times are rounded
 QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
 
 
@@ -21,7 +22,7 @@ class Beyond:
 
     coordinate: str
     quantity: str  # "position" or "momentum"
-    by: float  # largest distance from the range, over its width
+    by: float  # largest distance from the range, over its width; infinite where that is 0
     since: float  # time of the first sample outside
     low: float  # the recorded range
     high: float
@@ -30,11 +31,12 @@ class Beyond:
 
     def words(self, time_unit: str) -> str:
         """One clause for people: what leaves which range, how far, and since when."""
-        ends = f"{size(self.low, '', digits=3)} to {size(self.high, self.unit, digits=3)}"
+        high, moved = size(self.high, self.unit, digits=3), self.low < self.high
+        ends = f"{size(self.low, '', digits=3)} to {high}" if moved else f"{high} throughout"
         time = size(self.since, time_unit, digits=4)
         where = f" in trajectory {self.trajectory}" if self.trajectory else ""
-        by = f"{100 * self.by:.2g} % of its width"
-        return f"the {self.quantity} of {self.coordinate} ({ends}) by {by}, since t = {time}{where}"
+        by = f" by {100 * self.by:.2g} % of its width" if moved else ""
+        return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
 def beyond(
@@ -54,7 +56,7 @@ def beyond(
                 y = y - 2 * math.pi * torch.round((y - (low + high) / 2) / (2 * math.pi))
             out = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
             if bool((out > 0).any()):
-                by = float(out.max()) / max(high - low, torch.finfo(torch.float64).tiny)
+                by = float(out.max()) / (high - low) if high > low else math.inf
                 since, unit = float(t[(out > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
                 found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit))
     return found
@@ -75,6 +77,15 @@ def warning(found: Sequence[Beyond], time_unit: str) -> str:
         return ""
     each = "; ".join(one.words(time_unit) for one in found)
     return f"the motion leaves the range that the model was fitted to, beyond which it extrapolates: {each}"
+
+
+def other_steps(times: Tensor, h_range: tuple[float, float], time_unit: str) -> str:
+    """One sentence where steps are shorter or longer than those of the fit; "" where none is."""
+    (low, high), steps = h_range, times.diff()
+    if low * (1 - HAIR) <= float(steps.min()) and float(steps.max()) <= high * (1 + HAIR):
+        return ""
+    mean = f"steps of {float(steps.mean()):g} {time_unit}"
+    return f"{mean} are outside of {low:g} to {high:g}, those that the model was fitted to"
 
 
 def recorded(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:

@@ -1,12 +1,13 @@
-"""Sensors whose zeros differ from recording to recording: y = q + z, with z = 0 in the recording of most samples.
+"""Sensors whose zeros differ from recording to recording: y = q + z. The recording of most samples is the reference.
 
 A model cannot follow such recordings together, though each of them alone: friction makes up for some of the difference,
-and nothing then asks for the zeros any more. Three steps avoid that:
+and nothing then asks for the zeros any more. Four steps avoid that:
 
 1. The reference is fitted alone: with terms of its own, for those of all recordings hide the difference, and where they
    miss more than the noise, with those of all recordings.
 2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
-3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations.
+3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations; z = 0 in
+   the reference.
 4. The same with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt: a zero that
    the reference has itself makes such terms, which friction then distorts. It is kept where it misses no more.
 
@@ -16,7 +17,6 @@ Whether the recordings are used as they are or with these zeros, free runs over 
 from __future__ import annotations
 
 import math
-import re
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import NamedTuple
@@ -30,6 +30,7 @@ from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
+from herglotz.models.drag import DragFeature, parse_drag
 from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.features import Product, parse
 from herglotz.training.config import FitConfig
@@ -58,7 +59,6 @@ NUDGE = 1e-3  # of the spread: differences for the derivatives by the zeros
 FLAT = 1e-3  # of the largest singular value: directions of the zeros that no force depends on
 ROUNDS = 10  # of Gauss–Newton
 CLEARLY = 5.0  # standard deviations by which a zero differs from 0
-ONE_SIDED = re.compile(r"q\d+ v\d+")  # friction that is not the same on both sides of 0
 SETTLED = 0.1  # of the misfit: zeros that move by less have no say in the terms
 
 
@@ -66,7 +66,7 @@ SETTLED = 0.1  # of the misfit: zeros that move by less have no say in the terms
 class Apart:
     """Recordings that named terms do not follow together, or only with terms that zeros of the sensors replace."""
 
-    reference: int  # the recording whose zeros are 0
+    reference: int  # the recording of most samples; its zeros are 0 unless symmetry says where they are
     together: float  # misfit of the reference by the fit to all recordings, in units of q
     alone: float  # by the fit of the same terms to itself
     zeros: tuple[float, ...] = ()  # (B · n) recording after recording; empty where they do not explain the difference
@@ -129,8 +129,9 @@ def refined(apart: Apart, seen: Look) -> Apart | None:
     found = of.symmetric(model, of.moved(model, start))
     if float((found.z / seen.kept.balance).abs().max()) < SETTLED * of.sigma:
         return None
-    z = found.z + found.z.new_tensor(apart.zeros).reshape(found.z.shape)
-    return apart.of(clearly(found._replace(z=z)))
+    zeros, before = (found.z.new_tensor(x).reshape(found.z.shape) for x in (apart.zeros, apart.deviations))
+    deviations = torch.where(found.deviations > 0, found.deviations, before)  # of the reference, where it stayed put
+    return apart.of(clearly(FoundZeros(found.z + zeros, deviations, found.rms)))
 
 
 class FoundZeros(NamedTuple):
@@ -223,11 +224,11 @@ class ZerosOf:
 
 
 def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
-    """Places of the parameters of terms that q → −q, v → −v turns round: tilts, sin(q1), q1^3, friction q1 v1."""
+    """Places of the parameters of terms that q → −q, v → −v turns round: tilts, loads, sin(q1), q1^3, friction q v."""
     parameters, angles = ParameterVector(model), model.config.angles
     at = places(parameters, NamedTerms(config.features, config.drag))
     turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
-    turned += [name for name in config.drag if ONE_SIDED.fullmatch(name)]
+    turned += [name for name in config.drag if _pushes_on(parse_drag(name, angles))]
     tilt = parameters.index("potential.tilt").tolist()
     if baseline_is_named(model.config):
         tilt += parameters.index(STILL)[1 : 2 * len(angles) : 2].tolist()
@@ -238,6 +239,11 @@ def _turned(f: Product) -> bool:
     """Whether a product of L changes its sign with q and v."""
     changes = f.function == "sin" or (f.function == "power" and f.power % 2 == 1)
     return changes != (len(f.velocities) % 2 == 1)
+
+
+def _pushes_on(f: DragFeature) -> bool:
+    """Whether a force q^a |v|^b v^c keeps its direction where q and v change their signs: it is no mirror image."""
+    return (f.a + f.c) % 2 == 0
 
 
 def _rms(x: Tensor) -> float:

@@ -16,7 +16,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import Apart, ZerosOf, odd, sensor_zeros
+from herglotz.training.sensor_zeros import Apart, FoundZeros, ZerosOf, odd, refined, sensor_zeros
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.verdict import Errors, in_words
@@ -116,7 +116,7 @@ def test_symmetry_says_where_the_reference_is_too():
 def test_terms_that_turn_round_with_the_motion_are_held():
     # fails if a term of a symmetric machine is held at 0, or one that a shifted zero makes is not
     features = ("cos(q1 + q2)", "sin(q1 + q2)", "cos(q2) v1 v2", "sin(q2) v1 v1", "q1^3 v2", "q1^2", "q1^3")
-    settings = FitConfig(level="forced", features=features, drag=("q1 v1", "q1^2 v1", "|v2| v2"))
+    settings = FitConfig(level="forced", features=features, drag=("q1 v1", "q1^2 v1", "|v2| v2", "load 2"))
     base = replace(seen().base, angles=(False, True), scale=(1.0, 1.0), speed=(1.0, 1.0))
     model = build_model(replace(base, stiffness=(1.0, 1.0), tilt=(0.0, 0.0), start={}), settings, "none")
     parameters = ParameterVector(model)
@@ -126,8 +126,31 @@ def test_terms_that_turn_round_with_the_motion_are_held():
     assert named["potential.tilt"] == [True, True]
     assert named["potential.features.sum.coefficient"] == [False, True, False, True]
     assert named["kinetic.sum.coefficient"] == [False, True, False]
-    assert named["drag.coefficient"] == [True, False, False]
-    assert int(turned.sum()) == 6
+    assert named["drag.coefficient"] == [True, False, False, True]
+    assert int(turned.sum()) == 7
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_the_tilts_of_the_baseline_are_held_at_both_orders(order):
+    # fails if q1² or cos(q2) of the baseline is taken for its tilt, q1 or sin(q2), where both are features
+    settings = FitConfig(level="forced", order=order)
+    base = replace(seen().base, angles=(False, True), scale=(1.0, 1.0), speed=(1.0, 1.0), start={})
+    model = build_model(replace(base, stiffness=(2.0, 3.0), tilt=(0.5, 0.7)), settings, "none")
+    parameters = ParameterVector(model)
+    held = parameters.get()[odd(model, settings)].tolist()
+    assert held == pytest.approx([0.5, 0.7])
+
+
+def test_a_round_that_leaves_the_zero_of_the_reference_keeps_its_deviation(monkeypatch):
+    # fails if the reference's zero of the round before is lost, or told as 0
+    found = FoundZeros(torch.tensor([[0.0], [0.01]]), torch.tensor([[0.0], [0.001]]), NOISE)
+    monkeypatch.setattr(ZerosOf, "moved", lambda *_: found)
+    monkeypatch.setattr(ZerosOf, "symmetric", lambda _, model, found: found)  # noqa: ARG005
+    more = refined(Apart(0, 0.01, 0.01, (0.2, 0.3), (0.002, 0.003), "rad"), seen())
+    assert more is not None
+    assert more.zeros == pytest.approx((0.2, 0.31))
+    assert more.deviations == pytest.approx((0.002, 0.001))
+    assert "zeros of all recordings: 0.2 ± 0.002, 0.31 ± 0.001" in str(more)
 
 
 def test_a_coordinate_that_no_force_depends_on_has_no_zero():

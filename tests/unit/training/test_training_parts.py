@@ -38,7 +38,13 @@ def test_units_of_parameters():  # fails if a power of time or length is another
 
 @pytest.mark.parametrize(
     ("value", "std", "shown"),
-    [(0.30096, 0.4, "0.3"), (1.00131, 0.0013, "1.0013"), (-0.000289, 0.00022, "−0.00029"), (5.0, float("nan"), "5")],
+    [
+        (0.30096, 0.4, "0.3"),
+        (1.00131, 0.0013, "1.0013"),
+        (-0.000289, 0.00022, "−0.00029"),
+        (5.0, float("nan"), "5"),
+        (float("nan"), 1.0, "nan"),
+    ],
 )
 def test_no_digits_beyond_the_deviation(value, std, shown):  # fails if 0.30096 ± 0.4 claims five digits
     assert rounded(value, std) == shown

@@ -107,7 +107,8 @@ def test_motion_under_much_noise_is_seen():  # fails if noise of half the motion
 def test_a_free_run_that_breaks_off_has_no_gain():
     # fails if it is nan, which metrics.json cannot hold: the run is lost at the end of its fit
     broken = torch.tensor([[0.1], [math.nan]])
-    assert _gain(broken, torch.ones(2, 1)) is None
+    for lost in (broken, torch.tensor([[0.1], [1e30]])):  # the square of 1e30 is no float32
+        assert _gain(lost, torch.ones(2, 1)) is None
     assert (_gain(broken[:1].expand(2, 1), torch.ones(2, 1)) or 0.0) > 0
 
 
