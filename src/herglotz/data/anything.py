@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from numbers import Number
 from pathlib import Path
 from types import FunctionType
@@ -63,11 +64,9 @@ def as_trajectories(
         sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
         return _marked(load(data, like=like, **sensors, **columns), angles)
     elif hasattr(data, "columns") and h is not None:
-        columns = names["coordinates"] or [str(name) for name in data.columns]
-        found = _array(np.asarray(data), h, time, names | {"coordinates": columns})
+        found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
     elif hasattr(data, "columns") or isinstance(data, Mapping):
-        found = _table(data, Wanted(time, **names, known=() if like is None else like.columns))
-        found = found if like is None else angles_like(found, like)
+        found = _table(data, Wanted(time, **names), like)
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
@@ -103,14 +102,15 @@ def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
     return Trajectories.cat([as_trajectories(one, **options) for one in rows])
 
 
-def _table(data: Any, wanted: Wanted) -> Trajectories:
+def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories:
     """The recordings of a DataFrame or a dict of columns; what each column was taken for is printed."""
+    wanted = replace(wanted, known=() if like is None else like.columns)
     is_frame = hasattr(data, "columns")
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): np.asarray(x) for name, x in data.items()})
     found = in_radians_and_seconds(from_frame(frame, wanted, where))
     print(found.table(), file=sys.stderr)
-    return found
+    return found if like is None else angles_like(found, like)
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:

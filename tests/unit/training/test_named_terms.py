@@ -19,6 +19,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.fit import _equation
+from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import linear_starts
 from herglotz.training.named_terms import NamedTerms, candidates, central, offered
 from herglotz.training.pruning import joining
@@ -63,12 +64,12 @@ def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
     # fails if what a term is worth, ½ log N, has another sign or size, or shorter segments count as whole trajectories:
     # 900 samples, 8 terms less: misfits may grow by a factor of exp(27.2 / 900) = 1.031
     def found(names, rms, length):
-        fit = SimpleNamespace(problem=SimpleNamespace(grid=SimpleNamespace(length=length)))
+        data = SimpleNamespace(q=torch.zeros(450, 2))
+        fit = SimpleNamespace(problem=SimpleNamespace(grid=SimpleNamespace(length=length), data=data))
         return SimpleNamespace(terms=SimpleNamespace(names=names), rms=rms, fit=fit)
 
-    search = SimpleNamespace(data=SimpleNamespace(q=torch.zeros(450, 2)), floor=0.0)
     rich, simple = found("abcdefghi", 1.0, 300), found("a", rms, length)
-    assert DictionarySearch._as_likely(search, simple, rich) is taken  # pyright: ignore
+    assert Found.as_likely(simple, rich, 0.0) is taken  # pyright: ignore
 
 
 def test_the_equation_is_printed_with_deviations(duffing):
