@@ -1,4 +1,4 @@
-"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER]`.
+"""Systems that nobody tuned for: `python benchmarks/zoo.py [--draw SEED] [--count N] [--out FOLDER] [--json]`.
 
 Each system is drawn from (SEED, index): potential, friction, inputs, step, noise and number of recordings. `herglotz
 fit` runs with its default flags in a process of its own, and is judged by free runs over the unseen third of its
@@ -9,6 +9,7 @@ again at the same commit.
 
 from __future__ import annotations
 
+import json
 import math
 import shutil
 import sys
@@ -25,7 +26,7 @@ from benchmarks.zoo_systems.drawing import draw
 from benchmarks.zoo_systems.ours import fit_ours, plain
 from benchmarks.zoo_systems.peers import fit_sindy
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
-from benchmarks.zoo_systems.report import Predictions, outcome, relative, report, score, shown
+from benchmarks.zoo_systems.report import Predictions, outcome, relative, report, score, shares, shown
 from benchmarks.zoo_systems.systems import ZooSystem
 
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
@@ -75,12 +76,14 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--only", type=int, nargs="+", metavar="I", help="these systems alone")
     parser.add_argument("--limit", type=float, default=300, metavar="S", help="processor time of a fit (default 300 s)")
     parser.add_argument("--again", action="store_true", help="keep rows of other commits too")
+    parser.add_argument("--json", action="store_true", help="print rows and shares as JSON, and nothing else")
     parser.set_defaults(out=harness.ROOT / "runs" / "zoo")
     arguments = parser.parse_args(argv)
     warnings.filterwarnings("ignore", category=RuntimeWarning)  # a peer that diverges overflows
     path, at = harness.json_file(arguments, f"draw_{arguments.draw}"), harness.commit()
     rows = harness.load(path, {})
     wanted = [str(index) for index in arguments.only or range(arguments.count)]
+    measured: list[dict[str, Any]] = []
     for index in wanted:
         if not (index in rows and (arguments.again or rows[index]["commit"] == at)):
             folder = path.with_suffix("") / index
@@ -89,7 +92,8 @@ def main(argv: list[str] | None = None) -> None:
             print(line(rows[index]), file=sys.stderr, flush=True)
         measured = [rows[k] for k in wanted if k in rows]
         harness.store(path, rows, report(measured, arguments.draw, arguments.limit))
-    print(path.with_suffix(".md").read_text())
+    table = path.with_suffix(".md").read_text(encoding="utf-8")
+    print(json.dumps({"shares": shares(measured), "rows": measured}, indent=1) if arguments.json else table)
 
 
 if __name__ == "__main__":

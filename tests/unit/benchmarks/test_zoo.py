@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks import zoo
 from benchmarks.zoo import beyond, line, numbers
 from benchmarks.zoo_systems.drawing import KINDS, draw, draw_mechanism
 from benchmarks.zoo_systems.mechanisms import Mechanism, exact_motion
@@ -170,6 +171,18 @@ def test_the_report_counts(pendulum):
     rows = [row, row | {"outcome": SILENT, "ahead_of_sindy": False}]
     assert shares(rows) == {AT: 0.5, USE: 0.0, SAID: 0.0, SILENT: 0.5, "ahead of SINDy": 0.5}
     assert "**failed silently**" in report(rows, 1, 60.0)
+
+
+def test_the_command_prints_json(pendulum, tmp_path, monkeypatch, capsys):
+    # fails if --json is gone, which judges of other draws read, or a row that is asked for alone brings others
+    row = pendulum.facts() | {"ahead_of_sindy": True, "outcome": AT}
+    numbers = {"score": 1.0, "relative": 0.01, "cpu_s": 3.0}
+    row |= {"ours": {**numbers, "said": ""}, "sindy": numbers, "known": numbers}
+    monkeypatch.setattr(zoo, "measure", lambda of, *_: row | {"index": of.index})
+    zoo.main(["--draw", "1", "--only", "1", "--json", "--out", str(tmp_path)])
+    found = json.loads(capsys.readouterr().out)
+    assert found["shares"][AT] == 1.0
+    assert [each["index"] for each in found["rows"]] == [1]
 
 
 def test_what_was_not_reached_is_null_in_json(pendulum):
