@@ -119,15 +119,11 @@ def assign(
     q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
     q = q if wanted.coordinates is None else tuple(place[x] for x in _several(wanted.coordinates))
     both = " and a column ".join(names[i] for i in roles["trajectory"])
-    refuse(
-        {
-            f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (
-                u or wanted.motion
-            ),
-            f"{where}: no coordinate column, only {every}; add a column such as q[rad]": not q,
-            f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
-        }
-    )
+    refuse({
+        f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
+        f"{where}: no coordinate column, only {every}; add a column such as q[rad]": not q,
+        f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
+    })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
     return Columns(names, units, clock, q, trajectory, action, p, u)

@@ -15,6 +15,8 @@ from herglotz.training.task import NOISY
 
 RESTARTS = 4  # random initialisations of a single layer: some stall at a hundred times the error of others
 AS_SET = "as set, or by default"
+HALVED = "the fit needed shorter steps: halved ones change the motion"
+KEPT_STEPS = "halved steps change the motion too little to be worth their time, or other terms stand in for them"
 AS_FOUND = ("order", "features", "drag")  # what the search for terms sets, where the user does not
 
 
@@ -124,7 +126,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
-        "substeps": "the fit needed shorter steps: halved ones change the motion" if named else AS_SET,
+        "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,
         "zeros": seen.apart or "no recording was found to differ from the others",
         "forces": _forces_reason(seen),

@@ -5,7 +5,8 @@ trajectories are fitted by multiple shooting. The candidate that lowers the cost
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
 leave, and of one coordinate all subsets are compared (`subsets`). That criterion takes residuals for white noise. Where
 they are none, because a force or the rule's accuracy is missing, any term may take over some of it: there terms stay
-only if held-out blocks of time ask for them. Model steps are halved while that changes the motion as data miss it.
+only if held-out blocks of time ask for them. Model steps are halved while that changes the motion by a good part of
+what it misses the data by.
 """
 
 from __future__ import annotations
@@ -51,7 +52,7 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-LIKELIER = 1.0  # log-likelihood that halved steps may cost: longer ones bias what other motions are made of
+LIKELIER = 1.0  # log-likelihood that halved steps may cost: parameters that fit longer ones are wrong elsewhere
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
@@ -273,11 +274,11 @@ class DictionarySearch:
         stages, problem = self._problem(found, self.all, found.config.substeps)
         for better in likelier(found, problem, self.all, stages.task.config, self.floor):
             other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
-            if other is not None and self._likelier(other, found):
+            if other is not None and self._preferred(other, found):
                 return self._likeliest(self._held(self._longer(other)))
         return found
 
-    def _likelier(self, other: Found, found: Found) -> bool:
+    def _preferred(self, other: Found, found: Found) -> bool:
         """Whether the criterion of `subsets` prefers the other terms."""
         count = self.data.q.numel()
         price, its = (price_of(len(f.terms.names), len(self.all.names), math.log(count)) for f in (found, other))
@@ -330,7 +331,7 @@ class DictionarySearch:
             count = self.data.q.numel()  # likelihoods of as many parameters compare as they are
             if other is None or not count * math.log(found.rms / max(other.rms, FINE * self.floor)) > -LIKELIER:
                 self.in_vain = found.config.substeps, found.rms
-                break  # terms that stand for the longer steps
+                break  # the terms make up for the longer steps
             found = self._longer(other)
         return found
 

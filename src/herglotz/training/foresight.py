@@ -147,7 +147,7 @@ class _Ahead:
         for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
             last = int((self.rows[first : first + length] >= 0).nonzero()[-1])
             if last < length - 1:
-                parts.append(torch.arange(first + min(last, length - 3), first + length))  # a trajectory has three
+                parts.append(torch.arange(first + min(last, length - 3), first + length))  # three samples at least
         if not parts:
             return known
         at = torch.cat(parts)

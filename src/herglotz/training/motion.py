@@ -20,7 +20,7 @@ from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
-from herglotz.training.recorded_range import Beyond, beyond, farthest, other_steps, warning
+from herglotz.training.recorded_range import Beyond, beyond, other_steps, warning
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -60,7 +60,7 @@ class Motion:
     names: tuple[str, ...]
     units: tuple[str, ...]
     time_unit: str
-    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit, farthest first: the model extrapolates there
+    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit: the model extrapolates there
 
     @property
     def ok(self) -> bool:
@@ -102,8 +102,7 @@ def free_motion(
     with torch.no_grad():
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
     arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
-    motions = zip(found.q.reshape(-1, *found.q.shape[-2:]), found.p.reshape(-1, *found.p.shape[-2:]), strict=True)
-    left = farthest(beyond(run.box, run.data, times, q, p) for q, p in motions)
+    left = tuple(beyond(run.box, run.data, times, found.q, found.p))
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
 
 

@@ -43,27 +43,28 @@ def beyond(
     box: Mapping[str, Sequence[float]],  # lowest and highest q and p of the fit; nothing is beyond an empty one
     like: Trajectories,  # names, units and angles of the coordinates
     t: Tensor,  # (N,)
-    q: Tensor,  # (N, n) a motion; NaN after a failed step
-    p: Tensor,  # (N, n)
+    q: Tensor,  # (..., N, n) motions at the same times; NaN after a failed step
+    p: Tensor,  # (..., N, n)
 ) -> list[Beyond]:
-    """Every position and momentum of one motion that leaves its range; angles count modulo 2π."""
+    """Every position and momentum that leaves its range, of the motion that leaves it farthest; angles modulo 2π."""
     found = []
     for key, x in (("q", q), ("p", p)) if box else ():
         for i, name in enumerate(like.names):
             low, high = box[f"{key}_low"][i], box[f"{key}_high"][i]
-            y = x[:, i].double()
+            y = x[..., i].double().reshape(-1, len(t))
             if key == "q" and like.angles[i]:
                 y = y - 2 * math.pi * torch.round((y - (low + high) / 2) / (2 * math.pi))
-            out = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
-            if bool((out > 0).any()):
-                by = float(out.max()) / (high - low) if high > low else math.inf
-                since, unit = float(t[(out > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
-                found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit))
+            every = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
+            if bool((every > 0).any()):
+                b = int(every.amax(1).argmax())
+                by = float(every[b].max()) / (high - low) if high > low else math.inf
+                since, unit = float(t[(every[b] > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
+                found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit, b))
     return found
 
 
 def farthest(motions: Iterable[Sequence[Beyond]]) -> tuple[Beyond, ...]:
-    """Of the motions of several trajectories, for each quantity the one that leaves its range farthest."""
+    """Of trajectories with times of their own, for each quantity the one that leaves its range farthest."""
     every = [replace(each, trajectory=b) for b, found in enumerate(motions) for each in found]
     first: dict[tuple[str, str], Beyond] = {}
     for each in sorted(every, key=lambda each: -each.by):

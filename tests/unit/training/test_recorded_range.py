@@ -48,6 +48,9 @@ def test_of_several_motions_the_farthest_is_told():
     x, phi = farthest([[], near, far, near])
     assert (x.coordinate, x.quantity, x.by, x.trajectory) == ("x", "position", 1.5, 2)
     assert (phi.coordinate, phi.quantity, phi.by, phi.trajectory) == ("phi", "momentum", 0.5, 2)
+    # a batch of the same times in one go
+    several = torch.stack([INSIDE, q, q * torch.tensor([2.0, 1.0]), q]), torch.stack([p, p, p + 2, p])
+    assert {x, phi} == set(beyond(BOX, LIKE, LIKE.t, *several))
 
 
 def test_the_recorded_range_in_words():  # fails if low and high, or the unit, are lost
