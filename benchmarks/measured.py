@@ -1,10 +1,11 @@
 """Noise, outliers, motors, bands and measured data, seed by seed: `python benchmarks/measured.py [--seeds 5]`.
 
 Writes results/measured.json and .md, and coverage.png. Settings are the defaults unless a set says otherwise
-(measured_sets.py says what each is). Sets that are absent are skipped
+(measured_sets.py and machine_sets.py say what each is). Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
 run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20,
-air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90; `cpu_seconds` in the table says what
+air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90,
+motor_axis 35, duffing_circuit 50, two_joints 150, two_motors 200; `cpu_seconds` in the table says what
 it took.
 """
 
@@ -20,7 +21,7 @@ from typing import Any
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks import harness
+from benchmarks import harness, machine_sets
 from benchmarks import measured_sets as sets
 from herglotz.plots import style
 
@@ -32,6 +33,12 @@ TARGETS: dict[tuple[str, str], tuple[float, float]] = {  # lowest and highest va
     ("air_track", "extrapolation_rms"): (0.0, 0.50),
     ("driven_pendulum", "over_authors_1.0s"): (0.0, 1.0),
     ("driven_pendulum", "over_authors_2.0s"): (0.0, 1.0),
+    ("motor_axis", "rms"): (0.0, 0.005),
+    ("motor_axis", "same_part_rms"): (0.0, 0.005),
+    ("duffing_circuit", "rms"): (0.0, 0.4e-3),
+    ("two_joints", "rms"): (0.0, 0.0072),
+    ("two_motors", "rms_0.5s"): (0.0, 0.8 * 0.024),  # 0.024 and 0.029 rad: the authors' identified model
+    ("two_motors", "rms_1s"): (0.0, 0.8 * 0.029),
     ("coverage_simulated", "laplace_measured"): COVERED,
     ("coverage_simulated", "ensemble_measured"): COVERED,
     ("coverage_real", "laplace_measured"): COVERED,
@@ -46,6 +53,10 @@ ROWS: dict[str, tuple[tuple[str, ...], Callable[..., dict[str, Any]]]] = {
     "real_pendulum": ((sets.PENDULUM,), sets.extrapolation(sets.PENDULUM)),
     "air_track": ((sets.AIR_TRACK,), sets.extrapolation(sets.AIR_TRACK)),
     "driven_pendulum": (sets.DFKI, sets.driven_pendulum),
+    "motor_axis": ((machine_sets.MOTOR_AXIS,), machine_sets.motor_axis),
+    "duffing_circuit": ((machine_sets.DUFFING_CIRCUIT,), machine_sets.duffing_circuit),
+    "two_joints": ((machine_sets.TWO_JOINTS,), machine_sets.two_joints),
+    "two_motors": (machine_sets.TWO_MOTORS, machine_sets.two_motors),
     "coverage_simulated": ((), sets.coverage_simulated),
     "coverage_real": ((sets.PENDULUM,), sets.coverage_real),
 }

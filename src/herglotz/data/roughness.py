@@ -9,6 +9,7 @@ from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
 DEGREES = (3, 5, 7)  # of `precision`: noise leaves the same at each, coarsely sampled motion leaves less at the higher
+AT_THE_NOISE = 1.5  # times the precision: fitted states, and the noise's own estimate, leave 10 to 30 %
 MOST = 4000  # windows at most, evenly spread: more do not change an RMS
 
 

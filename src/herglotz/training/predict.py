@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any, Protocol
@@ -270,28 +271,31 @@ def _warmed_up(run: Trained, data: Trajectories, warmup: int) -> tuple[Tensor, f
     """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma, cost = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6, 0.0
-    for b in range(len(data)):
-        rows = torch.arange(data.offsets[b], data.offsets[b] + warmup)
-        start, own = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, run.h_range[1])
-        cost += own
-        if start is not None:
-            states[rows] = start
+    every = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
+    together = _smoothed(run.model, _rows(data, every.flatten(), (warmup,) * len(data)), sigma, run.h_range[1])
+    if together is not None:
+        states[every.flatten()], cost = together
+        return states, cost
+    for rows in every:  # one of them at least has no step near it
+        alone = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, run.h_range[1])
+        if alone is None:
+            cost = math.inf
+        else:
+            states[rows], cost = alone[0], cost + alone[1]
     return states, cost
 
 
 def _smoothed(
     model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float
-) -> tuple[Tensor | None, float]:
-    """States at every sample of a warm-up, (K, 2n+1), the model held, and ½|r|²; None where it has no step near it."""
+) -> tuple[Tensor, float] | None:
+    """States at every sample of warm-ups, (N, 2n+1), the model held, and ½|r|²; None where it has no step near them."""
     problem = SmoothingProblem(
         model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=BELIEVED
     )  # fmt: skip
     x = problem.start()
     states = StatesOnly(problem, x[: problem.P])
     result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
-    if result.reason == "not_finite":
-        return None, float("inf")
-    return problem.states(states.full(result.x)), result.cost
+    return None if result.reason == "not_finite" else (problem.states(states.full(result.x)), result.cost)
 
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:

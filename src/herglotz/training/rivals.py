@@ -14,7 +14,7 @@ from typing import Any
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.settings import from_plain
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
@@ -26,10 +26,9 @@ from herglotz.training.plan import Plan
 from herglotz.training.sensor_zeros import Apart, refined, sensor_zeros
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
-from herglotz.training.verdict import AT_THE_NOISE, unseen_window_errors
+from herglotz.training.verdict import unseen_window_errors
 
 REFINED = 2  # searches for terms with better zeros
-BETTER = 0.8  # times the error over held-out time without zeros of the sensors: what zeros have to reach
 INNER = 0.75  # of the training part that rivals are fitted to
 
 
@@ -89,7 +88,7 @@ def _aligned(
     second = stages.keep("held out, other zeros", lambda: _held_out(other, config, plan))
     numbers = (f"{x['windows']:.2g} and {x['rms']:.2g}" for x in (second, first))
     words = "{}; over held-out time windows and one free run miss {} with them, {} without".format(apart, *numbers)
-    if _both(second, seen) > BETTER * _both(first, seen):
+    if _both(second, seen) > MARGIN * _both(first, seen):
         return told, first
     return replace(other, apart=words), second
 

@@ -25,7 +25,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.sensors import measured
 from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.units import common_unit, size
@@ -50,7 +50,6 @@ from herglotz.training.stages import Stages
 from herglotz.training.task import Task, build_model
 from herglotz.training.trajectory_fit import FIRST_SEGMENT, FLOOR, STAGE, SegmentStages, TrajectoryFit
 
-AT_THE_NOISE = 1.5  # times the precision: no better model is needed, as in the verdict
 ALONE = 0.8  # times the misfit together: a recording that misses no more where it is fitted alone differs from others
 ROUND = 12  # zeros of an angle that are tried, all around
 SPREADS = (-2.0, -1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5, 2.0)  # zeros of a length that are tried, in its spreads

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision, roughness
+from herglotz.data.roughness import AT_THE_NOISE, precision, roughness
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
@@ -46,7 +46,6 @@ THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the 
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
-AT_THE_NOISE = 1.5  # times the precision, and without noise
 EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.spikes import without
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper
@@ -37,7 +37,6 @@ from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import SegmentStages
 
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
-AT_THE_NOISE = 1.5  # times the precision: fitted states, and the noise's own estimate, leave 10 to 30 %
 EXACT_ENOUGH = 1e-4  # of the spread: exact data have no noise to be compared with
 LOST = 0.1  # of the spread: what `herglotz verify` bounds windows of 20 steps by; a model with nothing in it has 1
 HALF = 0.5  # of the spread: windows of noise alone, whose starts are fitted, leave 0.9 to 0.95 of it

@@ -59,10 +59,14 @@ def residual_problem(level, n=1):
     return problem, torch.cat([x[: len(x) - problem.latents], torch.full((problem.latents,), 0.3).to(x)])
 
 
-def shooting_problem(level, n=1):
+def whole_problem(level, n=1):
+    return shooting_problem(level, n, 10**3)
+
+
+def shooting_problem(level, n=1, length=10):
     model, data = model_of(level, n), data_of(n)
     prior = prior_of(model, data)
-    problem = ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=0.1, prior=prior)
+    problem = ShootingProblem(model, data, segment_grid(data, length, 0.3), sigma=0.1, prior=prior)
     starts = problem.grid.start_sample
     velocity = (data.q[starts + 1] - data.q[starts]) / (data.t[starts + 1] - data.t[starts])[:, None]
     return problem, problem.pack(problem.parameters.get(), problem.states(data.q[starts], velocity))
@@ -78,7 +82,7 @@ def test_held_parameters_leave_the_equations_of_the_states(level):
         torch.testing.assert_close(one, other, rtol=1e-12, atol=0)
 
 
-@pytest.mark.parametrize("make", [residual_problem, shooting_problem])
+@pytest.mark.parametrize("make", [residual_problem, shooting_problem, whole_problem])
 @pytest.mark.parametrize(("level", "n"), [("linear", 1), ("affine", 1), ("linear", 2)])
 def test_gradients_match_finite_differences(make, level, n):
     # fails if a term of the implicit-function theorem, of the recurrence for s, or of the prior is missing
@@ -92,6 +96,31 @@ def test_gradients_match_finite_differences(make, level, n):
         slope = (float(problem.cost(x + e * d)) - float(problem.cost(x - e * d))) / (2 * e)
         assert float(b @ d) == pytest.approx(slope, rel=2e-5, abs=1e-6 * float(cost))
     assert float(torch.linalg.eigvalsh(A).min()) > -1e-9 * float(A.diagonal().max())
+
+
+@pytest.mark.parametrize(("sigma", "length", "better"), [(0.1, 10**3, 10), (0.1, 10, 1), (0.011, 10**3, 1)])
+def test_free_runs_over_whole_trajectories_start_where_the_data_do(sigma, length, better):
+    # fails if states make up for forces that are missing, or if the noise of the starts is taken for motion
+    model, data = model_of("linear"), simulate(scene("damped_pendulum"), trajectories=3, steps=200, h=0.1, noise=0.01, seed=0)
+    problem = ShootingProblem(model, data, segment_grid(data, length, 0.1), sigma=sigma)
+    first = (problem.grid.sample % 201 < 3)[:, None]
+    assert bool((problem.weight[~first.expand_as(problem.weight)] == 1).all())
+    # a standard deviation from 400 windows of nine samples, each three to five times free, is known to 3 %
+    assert problem.weight[first.expand_as(problem.weight)].tolist() == pytest.approx([better] * 9, rel=0.1)
+
+
+def test_a_start_is_that_of_the_recording_though_a_force_is_missing():
+    # fails if the start is moved by as much as the model misses the motion
+    t = torch.linspace(0, 8, 161, dtype=torch.float64)
+    q = 0.5 * t.cos() + 0.1 * (3 * t).sin()  # a second mode, which one coordinate has no force for
+    noise = 1e-5 * torch.randn(161, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    data = Trajectories.of(t, q + noise, (161,), units=("m",))
+    problem = ShootingProblem(model_of("linear"), data, segment_grid(data, 160, 0.1), sigma=0.1)
+    start = problem.states(data.q[:1], (data.q[1:2] - data.q[:1]) / 0.05)
+    result = levenberg_marquardt(problem, problem.pack(problem.parameters.get(), start), max_iterations=40)
+    path = problem.solve(result.x)
+    assert float(problem.misfit(path).square().mean().sqrt()) > 0.02
+    assert abs(float(path.x[0, 0, 0] - data.q[0, 0])) < 1e-3
 
 
 def test_gradient_for_adam_is_the_same_gradient():

@@ -7,12 +7,12 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
-from herglotz.training.verdict import AT_THE_NOISE, Errors, in_words
+from herglotz.training.verdict import Errors, in_words
 
 GOOD = {"follows_data": True, "objective": "trajectory"}
 

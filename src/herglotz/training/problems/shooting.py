@@ -18,12 +18,16 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.roughness import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper
 from herglotz.training.distributed import everywhere
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.solvers.lifted_newton import Path, linear_recurrence, parameter_derivatives, solve_path
+
+START = 3  # samples that a free run starts from: they tell q and q̇, and too little of a force to tell it
+KNOWN = 1e3  # times σ: a start that is known so much better is known
 
 
 class ShootingProblem(StatesProblem):
@@ -55,7 +59,7 @@ class ShootingProblem(StatesProblem):
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.weight = self.used[grid.sample].to(data.q)[:, None]  # (N', 1)
+        self.weight = (self.used.to(data.q)[:, None] * self._known_better())[grid.sample]  # (N', n)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
@@ -67,6 +71,18 @@ class ShootingProblem(StatesProblem):
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
         self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
+
+    def _known_better(self) -> Tensor:
+        """How much better than by σ the samples are known that free runs over whole trajectories start from, (N, n).
+
+        Where the model misses more than the noise, states fitted to what it misses would make up for forces: parameters
+        with the least misfit would then not be those of the least error of a free run from the recorded start.
+        """
+        better = (self.sigma / precisions(self.data).to(self.data.q)).clamp(max=KNOWN)
+        first = torch.zeros_like(self.data.t, dtype=torch.bool)
+        if self.grid.segments == len(self.data):
+            first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START)).to(first.device)] = True
+        return torch.where(first[:, None] & (better > AT_THE_NOISE), better, 1.0)
 
     def memory(self) -> dict[str, Any]:
         """The last path and where it was solved: the next solve starts there, and its last bits depend on it."""
@@ -149,8 +165,8 @@ class ShootingProblem(StatesProblem):
         Z = self._slopes_of(theta, path, held=held)
         fit, joints = self._residuals(path.x)
         cost = self.loss(fit, joints)
-        by_fit, by_joint = self.weight * self.root_weights(fit), self.root_weights(joints)
-        fit, joints = by_fit * fit, by_joint * joints
+        root, by_joint = self.root_weights(fit), self.root_weights(joints)
+        by_fit, fit, joints = self.weight * root, root * fit, by_joint * joints
         S = grid.segments
         A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
         segment = grid.node // (grid.h.shape[1] + 1)
@@ -261,7 +277,7 @@ class ShootingProblem(StatesProblem):
         Both carry the square roots of the weights: those of a robust loss, and 0 for samples that are not used.
         """
         r = self.misfit(path) / self.sigma
-        by = self.weight * self.root_weights(r)
+        by = self.weight * self.root_weights(self.weight * r)
         Z = self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
         Z = Z * (by / self.deviations)[..., None]
         order = self.grid.sample.argsort()
