@@ -16,7 +16,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
-from herglotz.training.run import box_of
+from herglotz.training.recorded_range import box_of
 
 INSTALLED = importlib.util.find_spec("sklearn") is not None
 H = 0.2

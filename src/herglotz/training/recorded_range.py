@@ -39,6 +39,16 @@ class Beyond:
         return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
+def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
+    """Lowest and highest q, p and s over a set of states."""
+    columns = {"q": q, "p": p, "s": s[:, None]}
+    return {
+        f"{name}_{end}": (x.amin(0) if end == "low" else x.amax(0)).tolist()
+        for name, x in columns.items()
+        for end in ("low", "high")
+    }
+
+
 def beyond(
     box: Mapping[str, Sequence[float]],  # lowest and highest q and p of the fit; nothing is beyond an empty one
     like: Trajectories,  # names, units and angles of the coordinates

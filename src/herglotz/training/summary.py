@@ -19,7 +19,7 @@ class Judged(Protocol):
     """The attributes of a run that are told."""
 
     @property
-    def config(self) -> FitConfig: ...  # noqa: D102
+    def decided(self) -> FitConfig: ...  # noqa: D102
     @property
     def metrics(self) -> dict[str, Any]: ...  # noqa: D102
     @property
@@ -37,9 +37,9 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
         ("data", data.summary()),
-        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
+        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
         ("recorded range", recorded(run.box, data)),
-        ("named terms", run.config.features and _terms(run.config.features, data.names)),
+        ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
         (
             "extrapolation RMS",
             _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
@@ -69,7 +69,7 @@ def summary(run: Judged) -> str:
 def one_line(run: Judged) -> str:
     """The run in one line of 80 characters or little more."""
     names, verdict = ", ".join(run.data.names), run.metrics.get("verdict", "not judged").split(":")[0]
-    return f"Run({run.config.level} level, {names} of {run.data.source or 'data'}; {verdict})"
+    return f"Run({run.decided.level} level, {names} of {run.data.source or 'data'}; {verdict})"
 
 
 def as_html(run: Judged) -> str:
@@ -85,7 +85,7 @@ def as_html(run: Judged) -> str:
 def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
     """What the model is made of beside its terms, told or found; "" without."""
     rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
+    return ", ".join(names[:most]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
 
 
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
