@@ -7,9 +7,9 @@ from textwrap import fill
 from typing import Any, Protocol
 
 from herglotz.data import Trajectories
-from herglotz.data.units import common_unit, size
+from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.config import FitConfig
-from herglotz.training.recorded_range import recorded
+from herglotz.training.recorded_range import range_in_words
 
 MOST_FEATURES, COLUMNS = 5, 80
 MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
@@ -36,9 +36,9 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
-        ("data", data.summary()),
+        ("data", as_recorded(data)[0].summary()),
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
-        ("recorded range", recorded(run.box, data)),
+        ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
         (
             "extrapolation RMS",
@@ -96,10 +96,10 @@ def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
 
 def model_card(run: Judged, h_range: tuple[float, float]) -> str:
     """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
-    low, high = h_range
+    steps, positions = span(h_range, run.data.time_unit), range_in_words(run.box, run.data)
     return "\n".join([
         f"Model of {run.data.source or 'a recording'} (sha256 {run.data.digest()[:16]})", summary(run),
-        f"For steps of {low:.4g} to {high:.4g} {run.data.time_unit}, and positions {recorded(run.box, run.data)}.",
+        f"For steps of {steps}, and positions {positions}.",
         "Outside of these the model extrapolates. The first coordinate's mass is 1.",
     ])  # fmt: skip
 
