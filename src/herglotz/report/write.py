@@ -162,8 +162,8 @@ def _plan(run: Run) -> tuple[Block, ...]:
     if "plan" not in run.metrics:
         return ("The run holds no plan.",)
     plan = Plan.from_dict(run.metrics["plan"])
-    rows = tuple(plan.decisions(common_unit(run.data.units)))
-    blocks: list[Block] = [Table(("decision", "taken", "because"), rows)]
+    rows = tuple(("; ".join(taken), why) for taken, why in plan.by_reason(common_unit(run.data.units)))
+    blocks: list[Block] = [Table(("decided", "because"), rows)]
     if run.history:
         blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))
     return tuple(blocks)
