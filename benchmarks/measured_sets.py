@@ -206,7 +206,7 @@ def curves_row(curves: dict[str, list[float]]) -> dict[str, Any]:
 
 def members(run: Run) -> list[Run]:
     """The run and fits of other seeds to its data."""
-    others = (replace(run.config, seed=run.config.seed + 100 * k) for k in range(1, MEMBERS))
+    others = (replace(run.decided, seed=run.config.seed + 100 * k) for k in range(1, MEMBERS))
     return [run, *(fit(run.data, config, progress=False) for config in others)]
 
 

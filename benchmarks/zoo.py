@@ -34,7 +34,7 @@ KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", 
 
 def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     """One row of the results."""
-    row = of.facts() | {"beyond": beyond(of)}
+    row = of.facts() | {"beyond": unseen_excess(of)}
     for name, fit in (("known", lambda of: MechanismModel(of.fitted)), ("sindy", fit_sindy)):
         began = time.process_time()
         found = own_predictions(of, fit(of))
@@ -48,7 +48,7 @@ def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
     return row
 
 
-def beyond(of: ZooSystem) -> float:
+def unseen_excess(of: ZooSystem) -> float:
     """How far the unseen recordings leave the range of the training positions, over the size of the motion."""
     seen = of.train.truth[:, : trained(of.train)].reshape(-1, of.mechanism.n)
     out = np.maximum(of.test.truth - seen.max(0), seen.min(0) - of.test.truth) / of.size

@@ -17,7 +17,8 @@ for _ in t[1:]:
         x += h / 100 * omega
     theta.append(x)
 measured = np.array(theta) + 0.003 * rng.normal(size=len(t))
-np.savetxt("pendulum.csv", np.c_[t, measured], delimiter=",", header="t[s],theta[rad]", comments="", fmt="%.6f")
+table, header = np.c_[t, measured], "t[s],theta[rad]"
+np.savetxt("pendulum.csv", table, "%.6f", ",", header=header, comments="")
 
 # %% [markdown]
 # The unit rad marks an angle. `hz.fit` prints what it takes each column for, holds out the last third of the time,

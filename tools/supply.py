@@ -5,7 +5,7 @@
 * `lock` lets pip resolve the package with its extra `dev`, and writes lock.txt: versions, and the sha256 of the files
   for this Python and platform.
 * `check-lock` lets pip fetch what lock.txt names and compare the hashes. Nothing is installed; on another Python or
-  platform, or where pip reaches no package index that has the files, nothing is checked, and that is said.
+  platform, or where pip reaches no package index, or another one than the lock's, nothing is checked, and that is said.
 """
 
 from __future__ import annotations
@@ -37,7 +37,9 @@ HERE = f"{platform.python_implementation()} {platform.python_version().rpartitio
 ALLOWED = {"0BSD", "Apache-2.0", "BSD", "BSD License", "BSD-2-Clause", "BSD-3-Clause", "BSL-1.0", "CC0-1.0", "MIT",
            "LLVM-exception", "MIT-CMU", "MPL-2.0", "PSF-2.0", "Python Software Foundation License", "Zlib"}  # fmt: skip
 CUDA = ("nvidia-", "cuda-")  # proprietary parts of torch's CUDA builds, which herglotz does not need
-NO_FILE = re.compile("No matching distribution found for .*")  # pip reaches no index, or one without such a file
+NO_FILE = re.compile(r"No matching distribution found for (\S+)")  # pip reaches no index, or one without such a file
+LISTED = re.compile(r"\(from versions: (.*)\)")  # what it has instead
+SLIPS = 3  # lines mistyped at once, by assumption: an index that lacks more than these is not the lock's
 ONE_LINE = 60  # letters; a longer field holds the licence's text, not its name
 
 
@@ -125,18 +127,40 @@ def _resolve(*words: str) -> str:
 
 
 def check_lock() -> None:
-    """Let pip compare the hashes of the lock with those of the files that it gets."""
+    """Let pip compare the hashes of the lock with those of the files that it gets.
+
+    A version that is nowhere is a mistake of the lock where pip finds the other ones; of a build (`+cpu`), where its
+    index lacks the plain version too.
+    """
     text = LOCK.read_text(encoding="utf-8")
     made_for = text.removeprefix("# ").partition(". ")[0]
     if made_for != HERE:
         print(f"lock.txt is for {made_for}, this is {HERE}: nothing checked")
         return
-    if said := _resolve("--require-hashes", "--requirement", str(LOCK)):
-        if not (missing := NO_FILE.search(said)):
-            sys.exit(said)
-        print(f"lock.txt: not checked: no package index, or not the lock's. {missing[0]}")
-        return
-    print(f"lock.txt: pip gets {text.count('--hash')} packages with these hashes")
+    lines, missing, builds = [line for line in text.splitlines() if "==" in line], [], []
+    said = _checked(lines)
+    while len(missing) <= SLIPS and (found := NO_FILE.search(said)):
+        plain, _, build = found[1].partition("+")
+        others = LISTED.search(said)
+        is_build = bool(build and others and plain.rpartition("==")[2] in others[1].split(", "))
+        (builds if is_build else missing).append(found[1])
+        lines = [line for line in lines if line.split()[0] != found[1]]
+        said = _checked(lines, "--no-deps")  # what needs the one left out is no mistake
+    if len(missing) > SLIPS:
+        print(f"lock.txt: not checked: no package index, or not the lock's: it lacks {', '.join(missing)} and more")
+    elif said or missing:
+        sys.exit(said or f"lock.txt: pip finds the other files, and no {', '.join(missing)}: mistyped, or withdrawn?")
+    else:
+        also = f"; not checked: {', '.join(builds)}, whose index pip was not given" if builds else ""
+        print(f"lock.txt: pip gets {len(lines)} packages with these hashes{also}")
+
+
+def _checked(lines: list[str], *words: str) -> str:
+    """What pip says against these lines of a lock; "" where it gets every file with its hash."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "lock.txt"
+        path.write_text("\n".join(lines), encoding="utf-8")
+        return _resolve("--require-hashes", *words, "--requirement", str(path))
 
 
 def main() -> None:

@@ -51,8 +51,8 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
     ----------
     run_
         The `Run`: `run_.equation()`, `run_.verify()`, `run_.export(...)`.
-    n_features_in_
-        Columns of X.
+    n_features_in_, feature_names_in_
+        Columns of X, and their names where X is a DataFrame: `predict` takes the same, in the same order.
 
     Raises
     ------
@@ -79,6 +79,7 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
 
     def fit(self, X: Any, y: Any) -> HerglotzRegressor:
         """Fit a model to positions y at the times X[:, 0]."""
+        names, flat = _names(X), y is not None and np.asarray(y).ndim == 1
         X, q = _matrix("X", X), _matrix("y", y)
         if len(X) != len(q):
             raise InputError(f"X has {len(X)} rows and y {len(q)}; give one position a time")
@@ -92,16 +93,29 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
         if any((self.settings or {}).get(name) for name in at_once):
             raise InputError("input_delay, actuator_lag: inputs act in the row of X that has them; use herglotz.fit")
         self.run_ = fit(data, config.changed({**(self.settings or {}), **at_once}), progress=False)
-        self.n_features_in_, self._flat = X.shape[1], np.ndim(y) == 1
+        self.n_features_in_, self._flat = X.shape[1], flat
+        self.__dict__.pop("feature_names_in_", None)  # of a fit before
+        if names is not None:
+            self.feature_names_in_ = names
         return self
+
+    def __sklearn_tags__(self) -> Any:
+        """Several coordinates are several outputs."""
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
 
     @one_thread()
     def predict(self, X: Any) -> np.ndarray:
         """Positions at the times X[:, 0], in any order without inputs; the shape is that of y."""
         check_is_fitted(self, "run_")
+        names, fitted = _names(X), getattr(self, "feature_names_in_", None)
+        if names is not None and fitted is not None and [*names] != [*fitted]:
+            raise InputError(f"X has the columns {', '.join(names)}, the fit had {', '.join(fitted)}; give the same")
         X = _matrix("X", X)
         if X.shape[1] != self.n_features_in_:
-            raise InputError(f"X has {X.shape[1]} columns, the fit had {self.n_features_in_}; give the same")
+            wanted = f"{type(self).__name__} is expecting {self.n_features_in_} features as input: times, then inputs"
+            raise InputError(f"X has {X.shape[1]} features, but {wanted}. Reshape your data: one row a time")
         with torch.no_grad():
             q = self._free(X[:, 0]) if self.run_.data.u is None else self._driven(X)
         if not np.isfinite(q).all():
@@ -162,6 +176,12 @@ class HerglotzRegressor(RegressorMixin, BaseEstimator):
             raise InputError(f"row {i} of X: {text}")
         acts = torch.cat([u[last : last + 1], u.new_tensor(X[:-1, 1:])])[torch.from_numpy(moves)]
         return self._positions(run.stepper, start, step[moves], acts)[moves.cumsum()]
+
+
+def _names(X: Any) -> np.ndarray | None:
+    """The columns of a DataFrame, where all of their names are texts."""
+    names = [*getattr(X, "columns", ())]
+    return np.array(names, dtype=object) if names and all(isinstance(name, str) for name in names) else None
 
 
 def _matrix(name: str, x: Any) -> np.ndarray:

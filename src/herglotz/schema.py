@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from herglotz.errors import InputError
@@ -17,8 +17,9 @@ def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
     Parameters
     ----------
     kind
-        Keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, and list[T],
-        tuple[T, ...], dict[K, V] of these. A list and a tuple are one, as in JSON. No key of a dataclass is needed.
+        Keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, another
+        `TypedDict`, and list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. A list and a tuple are one, as in
+        JSON. No key of a dataclass is needed.
     values
         What was read.
     where, remedy
@@ -36,7 +37,11 @@ def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
     if missing:
         raise InputError(f"{where}: lacks {', '.join(sorted(missing))}; {remedy}")
     for key, hint in get_type_hints(kind).items():
-        if key in values and not matches(values[key], hint):
+        if key not in values or (values[key] is None and types.NoneType in get_args(hint)):
+            continue
+        if inner := [one for one in (hint, *get_args(hint)) if is_typeddict(one)]:
+            check_entries(inner[0], values[key], f"{where}: {key}", remedy)
+        elif not matches(values[key], hint):
             raise InputError(f"{where}: {key} must be {_named(hint)}, got {_shown(values[key])}; {remedy}")
 
 
@@ -50,10 +55,17 @@ def matches(value: Any, hint: Any) -> bool:
     if origin is Literal:
         return value in inner
     if origin in (list, tuple):
-        return isinstance(value, (list, tuple)) and all(matches(x, inner[0]) for x in value)
+        return isinstance(value, (list, tuple)) and _match_each(value, inner)
     if origin is dict:
         return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
     return _is_number(value, hint) if hint in (int, float) else isinstance(value, hint)
+
+
+def _match_each(values: Sequence[Any], hints: tuple[Any, ...]) -> bool:
+    """Whether entries are of list[T] or tuple[T, ...], or, one by one, of tuple[S, T]."""
+    if len(hints) == 1 or hints[1] is Ellipsis:
+        return all(matches(x, hints[0]) for x in values)
+    return len(values) == len(hints) and all(map(matches, values, hints))
 
 
 def _is_number(value: Any, hint: type) -> bool:

@@ -25,6 +25,11 @@ def test_every_page_is_in_the_menu():  # fails if a page is added that no reader
     assert {name for name in pages if f"({name})" not in index} == {"index.md"}
 
 
+def test_the_style_of_the_site_is_there():  # fails if code in a table breaks inside words because mkdocs finds no style
+    (name,) = re.findall(r"^extra_css: \[(.*)\]$", (ROOT / "mkdocs.yml").read_text(encoding="utf-8"), re.M)
+    assert "word-break: normal" in (ROOT / "docs" / name).read_text(encoding="utf-8")
+
+
 def test_every_name_of_the_reference_exists():  # fails if a function moves and the site's build would end
     text = (ROOT / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
     names = re.findall(r"^::: ([\w.]+)$", text, re.M)

@@ -95,13 +95,56 @@ def test_the_lock_is_not_checked_on_another_platform(monkeypatch, capsys):  # fa
     assert "this is CPython 3.11 Plan9 mips: nothing checked" in capsys.readouterr().out
 
 
-def test_the_lock_is_not_checked_without_a_package_index(monkeypatch, capsys):
-    # fails if a machine without a network fails, or a file with another hash passes as one
+def pip_that_lacks(monkeypatch, lacks, listed="1.0"):
+    """Let pip find all files but these, of which it has other versions."""
+
+    def resolve(*words):
+        lines = Path(words[-1]).read_text("utf-8").splitlines()
+        for name in (line.split()[0] for line in lines):
+            if lacks(name):
+                what = f"{name} (from versions: {listed})"
+                return f"ERROR: Could not find a version {what}\nERROR: No matching distribution found for {name}\n"
+        return ""
+
     monkeypatch.setattr(supply, "HERE", supply.LOCK.read_text("utf-8").removeprefix("# ").partition(". ")[0])
-    monkeypatch.setattr(supply, "_resolve", lambda *_: "ERROR: No matching distribution found for tqdm==4.69.0\n")
+    monkeypatch.setattr(supply, "_resolve", resolve)
+
+
+def test_the_lock_is_not_checked_without_its_package_index(monkeypatch, capsys):
+    # fails if a machine without a network, or with an index of other versions, fails
+    for lacks in (lambda _: True, lambda name: name[0] < "p"):
+        pip_that_lacks(monkeypatch, lacks)
+        supply.check_lock()
+        assert "not checked: no package index, or not the lock's: it lacks contourpy==" in capsys.readouterr().out
+
+
+def test_a_version_that_is_nowhere_fails(monkeypatch, tmp_path):
+    # fails if a mistyped version in lock.txt passes for a missing index
+    mistyped = re.sub("^(tqdm==).*? ", r"\g<1>99.9 ", supply.LOCK.read_text("utf-8"), flags=re.M)
+    (tmp_path / "lock.txt").write_text(mistyped, "utf-8")
+    pip_that_lacks(monkeypatch, lambda name: name == "tqdm==99.9")
     supply.check_lock()
-    assert "not checked: no package index" in (told := capsys.readouterr().out)
-    assert "for tqdm==4.69.0" in told
+    monkeypatch.setattr(supply, "LOCK", tmp_path / "lock.txt")
+    with pytest.raises(SystemExit, match=r"pip finds the other files, and no tqdm==99.9: mistyped, or withdrawn"):
+        supply.check_lock()
+
+
+def test_a_build_that_another_index_has_is_told_apart(monkeypatch, capsys):
+    # fails if an index without torch's builds for processors alone fails, or hides that it was not checked
+    (torch,) = (f"torch=={version}" for name, version in LOCKED if name == "torch")
+    plain = torch.rpartition("==")[2].partition("+")[0]
+    pip_that_lacks(monkeypatch, lambda name: name == torch, f"2.0.0, {plain}")
+    supply.check_lock()
+    told = capsys.readouterr().out
+    assert f"pip gets {len(LOCKED) - 1} packages" in told
+    assert f"not checked: {torch}, whose index pip was not given" in told
+    pip_that_lacks(monkeypatch, lambda name: name == torch)
+    with pytest.raises(SystemExit, match="mistyped, or withdrawn"):
+        supply.check_lock()
+
+
+def test_another_hash_fails(monkeypatch):  # fails if a file with another hash passes for a missing one
+    pip_that_lacks(monkeypatch, lambda _: False)
     for said in ("ERROR: THESE PACKAGES DO NOT MATCH THE HASHES", "ERROR: In --require-hashes mode, all requirements"):
         monkeypatch.setattr(supply, "_resolve", lambda *_, said=said: said)
         with pytest.raises(SystemExit, match=re.escape(said)):

@@ -106,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from herglotz.data import save
     from herglotz.data.units import in_degrees
-    from herglotz.training.recorded_range import beyond
+    from herglotz.training.recorded_range import quantities_outside
 
     source = read_source(arguments.source, arguments.trajectory, arguments.trust_code)
     start, t0 = _start(arguments, source)
@@ -121,7 +121,7 @@ def run(arguments: argparse.Namespace) -> int:
     save(out, in_degrees(motion, source.degrees) if out.suffix.lower() == ".csv" else motion)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
     left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
-    far = beyond(source.limits, motion, motion.t, motion.q, found.p.double()) if source.limits else []
+    far = quantities_outside(source.limits, motion, motion.t, motion.q, found.p.double()) if source.limits else []
     if arguments.json:
         left_by = {"beyond": [asdict(each) for each in far]}
         print_json(_numbers(found, times, seconds, left) | left_by | {"file": str(out)})
@@ -144,6 +144,7 @@ def _motion(source: Source, found: Rollout, times: torch.Tensor, name: str) -> T
     return Trajectories.of(
         times, found.q.double(), names=source.names, units=source.units, angles=source.angles, s=found.s.double(),
         p=found.p.double(), time_unit=source.time_unit, source=name,
+        columns=tuple((name, "coordinate", "deg") for name in source.degrees),
     )  # fmt: skip
 
 
@@ -263,7 +264,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     """Return the inputs (K, m), where there are any, and the times (K + 1,)."""
     import torch
 
-    from herglotz.data.driving import driven, even_times, recorded
+    from herglotz.data.driving import driven, even_times, input_recording
     from herglotz.data.holds import Arrival
     from herglotz.data.waves import waves
 
@@ -278,7 +279,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
         return torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1), times
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    found = recorded(path, arguments.trajectory, source.time_unit, source.arrival or Arrival(), source.columns)
+    found = input_recording(path, arguments.trajectory, source.time_unit, source.arrival or Arrival(), source.columns)
     if arguments.q0 is not None and arguments.t0 is None:
         t0 = float(found.t[0])
     return driven(found, t0, steps, arguments.h)

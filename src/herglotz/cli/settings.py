@@ -58,7 +58,8 @@ def add_data_settings(parser: argparse._ActionsContainer) -> None:
     """Add --config and --train-fraction."""
     parser.add_argument(
         "--config", type=existing, metavar="FILE",
-        help="settings of another run: its folder or its config.json; flags that are given stand over them",
+        help="settings that another run was told: its folder or its config.json; flags that are given stand over them. "
+        "On the same data, read the same way, it is the same fit",
     )  # fmt: skip
     _setting(
         parser, "--train-fraction", type=finite, metavar="F",

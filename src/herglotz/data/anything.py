@@ -62,11 +62,12 @@ def as_trajectories(
     elif isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}
         sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
-        return _marked(load(data, like=like, **sensors, **columns), angles)
+        return _shown(_marked(load(data, like=like, show=False, **sensors, **columns), angles))
     elif hasattr(data, "columns") and h is not None:
         found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
     elif hasattr(data, "columns") or isinstance(data, Mapping):
         found = _table(data, Wanted(time, **names), like)
+        return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
@@ -103,13 +104,12 @@ def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
 
 
 def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories:
-    """The recordings of a DataFrame or a dict of columns; what each column was taken for is printed."""
+    """The recordings of a DataFrame or a dict of columns."""
     wanted = replace(wanted, known=() if like is None else like.columns)
     is_frame = hasattr(data, "columns")
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): np.asarray(x) for name, x in data.items()})
     found = in_radians_and_seconds(from_frame(frame, wanted, where))
-    print(found.table(), file=sys.stderr)
     return found if like is None else angles_like(found, like)
 
 
@@ -157,3 +157,10 @@ def _marked(data: Trajectories, angles: Any) -> Trajectories:
     if angles is not None:
         data = data.with_angles((data.names if angles else ()) if isinstance(angles, bool) else angles)
     return data.unwrapped()
+
+
+def _shown(data: Trajectories) -> Trajectories:
+    """The same; what each column of its table was taken for is printed, after all that was said of the columns."""
+    if data.columns:
+        print(data.table(), file=sys.stderr)
+    return data

@@ -16,8 +16,16 @@ def column_table(
     source: str,
 ) -> str:
     """Return a line a column: its role, and its unit with the conversion that was made."""
+    rows = [("column", "is taken for", "unit"), *column_rows(columns, labels)]
+    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
+    return "\n".join([f"{source or 'table'}:", *lines])
+
+
+def column_rows(columns: Sequence[tuple[str, str, str]], labels: Labels) -> list[tuple[str, str, str]]:
+    """Name, role and unit of each column, in words, after all that was said of it and made of it."""
     now = dict(zip(labels.names, zip(labels.units, labels.angles, strict=True), strict=True))
-    rows = [("column", "is taken for", "unit")]
+    rows = []
     for name, role, unit in columns:
         if role == "coordinate" and name in now:
             role = "angle" if now[name][1] else role
@@ -27,10 +35,10 @@ def column_table(
         elif role == "time":
             unit = _converted(unit, labels.time_unit)
         rows.append((name, role, unit or "-"))
-    widths = [max(len(row[k]) for row in rows) for k in range(2)]
-    lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
-    return "\n".join([f"{source or 'table'}:", *lines])
+    return rows
 
 
 def _converted(unit: str, now: str) -> str:
-    return unit if unit in ("", now) else f"{unit}, converted to {now}"
+    """The unit of a column, and what it became; of a column without a unit the one that it was given since."""
+    given = "" if now == "1" else now
+    return unit if unit == now else f"{unit}, converted to {now}" if unit else given

@@ -30,7 +30,7 @@ def even_times(t0: float, h: float, steps: int) -> Tensor:
     return clean(t0 + float(f"{h:.12g}") * torch.arange(steps + 1, dtype=torch.float64))
 
 
-def recorded(
+def input_recording(
     path: str | Path | Trajectories,
     trajectory: int,
     time_unit: str,

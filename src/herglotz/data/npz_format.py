@@ -8,6 +8,7 @@ import tokenize
 import zipfile
 import zlib
 from pathlib import Path
+from typing import TypedDict
 
 import numpy as np
 import torch
@@ -17,8 +18,8 @@ from herglotz.data.checks import ARRAYS, EXACT
 from herglotz.data.files import PathLike, read_bytes, write_atomically
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
+from herglotz.schema import check_entries
 
-LABELS = ("names", "units", "angles", "time_unit", "source", "hold", "delay", "lag", "columns")
 USED = (*ARRAYS, "lengths", "metadata")
 LARGEST = 2**31  # bytes that the arrays of an archive may take: 67 million samples of t and three coordinates
 # Exceptions that numpy and zipfile raise on a damaged archive.
@@ -26,6 +27,23 @@ DAMAGE = (
     *(ValueError, OSError, EOFError, KeyError, NotImplementedError, RuntimeError, SyntaxError, MemoryError),
     *(OverflowError, TypeError, tokenize.TokenError, zipfile.BadZipFile, zlib.error),
 )
+
+
+class Metadata(TypedDict, total=False):
+    """What an archive says of its arrays: fields of `Trajectories`."""
+
+    names: list[str]
+    units: list[str]
+    angles: list[bool]
+    time_unit: str
+    source: str
+    hold: str
+    delay: float | None
+    lag: float | None
+    columns: list[tuple[str, str, str]]  # name, role, unit
+
+
+LABELS = tuple(Metadata.__annotations__)
 
 
 def read_npz(path: PathLike) -> Trajectories:
@@ -135,17 +153,6 @@ def _labels(path: Path, metadata: np.ndarray | None) -> dict:
         labels = json.loads(str(metadata))
     except (ValueError, RecursionError):
         labels = None
-    known = {k: x for k, x in labels.items() if k in LABELS} if isinstance(labels, dict) else None
-    if known is None or not all(_has_its_type(k, x) for k, x in known.items()):
-        raise InputError(f"{path}: 'metadata' must be a JSON object of {', '.join(LABELS)}; write it again or drop it")
+    check_entries(Metadata, labels, f"{path}: 'metadata' (a JSON object)", "write it again or drop it")
+    known = {name: labels[name] for name in LABELS if name in labels}
     return {**known, "columns": tuple(map(tuple, known.get("columns", [])))}
-
-
-def _has_its_type(label: str, x: object) -> bool:
-    """Whether `x` is the list of texts, of truth values or of rows (name, role, unit), or the text, of this label."""
-    if label == "columns":
-        return isinstance(x, list) and all(_has_its_type("names", row) and len(row) == 3 for row in x)
-    if label in ("delay", "lag"):
-        return x is None or (isinstance(x, (int, float)) and not isinstance(x, bool))
-    kind = {"names": str, "units": str, "angles": bool}.get(label)
-    return isinstance(x, str) if kind is None else isinstance(x, list) and all(isinstance(y, kind) for y in x)

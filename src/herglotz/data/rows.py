@@ -73,6 +73,7 @@ def group_rows(
             if not t[two] > t[one]:
                 raise InputError(
                     f"{path}, row {rows[two]}, column '{columns[1]}': {t[two]!r} does not increase on {t[one]!r} in "
-                    f"row {rows[one]}; sort the rows, delete one, or number the trajectories"
+                    f"row {rows[one]}; sort the rows, delete one, or number the trajectories in a column 'trajectory' "
+                    "(another name: --group NAME, group= in Python)"
                 )
     return list(groups.values())

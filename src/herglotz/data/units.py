@@ -63,3 +63,10 @@ def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str
     """A length or an angle in words: `0.0021 rad = 0.12 deg` where it was recorded in degrees."""
     also = f" = {math.degrees(value):.3g} deg" if degrees and unit == "rad" else ""
     return f"{value:.{digits}g} {unit}".removesuffix(" 1").rstrip() + also
+
+
+def span(ends: Sequence[float], unit: str = "", degrees: bool = False) -> str:
+    """A range in words: `-0.5 to 0.5 rad = -28.6 to 28.6 deg` where it was recorded in degrees."""
+    low, high = ends
+    also = f" = {math.degrees(low):.3g} to {math.degrees(high):.3g} deg" if degrees and unit == "rad" else ""
+    return f"{low:.3g} to {size(high, unit)}{also}"

@@ -77,7 +77,7 @@ class ExportedStepper(OneStepMethod):
         if "init" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
         s0 = torch.zeros_like(q0[..., 0]) if s0 is None else s0
-        self._check(q0, q1, s0, ("q0", "q1", "s0"))
+        self._check(q0, q1, s0, ("q0", "q1", "s0"), finite=True)
         p, s = self.programs["init"](*map(plain, self._flat(State(q0, q1, s0), h, u)))
         return check_started(State(q1, p.reshape(q1.shape), s.reshape(s0.shape)))
 
@@ -92,7 +92,7 @@ class ExportedStepper(OneStepMethod):
         Raises
         ------
         InputError
-            If a shape, the dtype or a value is not what the file takes.
+            If a shape, the dtype, h or u is not what the file takes. What is not finite has a status.
         """
         del guess
         self._check(*state)
@@ -196,8 +196,10 @@ class ExportedStepper(OneStepMethod):
         check_rows(inputs)
         return inputs
 
-    def _check(self, q: Tensor, p: Tensor, s: Tensor, names: tuple[str, str, str] = ("q", "p", "s")) -> None:
-        check_state(State(q, p, s), self, names, finite=True)
+    def _check(
+        self, q: Tensor, p: Tensor, s: Tensor, names: tuple[str, str, str] = ("q", "p", "s"), finite: bool = False
+    ) -> None:
+        check_state(State(q, p, s), self, names, finite=finite)
         if s.numel() == 0:
             raise InputError(f"{', '.join(names)} hold no samples; give at least one")
         for name, x in zip(names, (q, p, s), strict=True):

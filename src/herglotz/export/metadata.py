@@ -11,6 +11,7 @@ import torch
 
 import herglotz
 from herglotz.data.files import PathLike
+from herglotz.data.holds import Arrival, check_arrival
 from herglotz.errors import InputError, refuse
 from herglotz.export.equation import input_count
 from herglotz.models import ContactLagrangian
@@ -43,6 +44,28 @@ class _Needed(TypedDict):
     newton_tolerance: float
 
 
+class _State(TypedDict):
+    """A state to start from."""
+
+    q: list[float]
+    p: list[float]
+    s: float
+
+
+class _Start(_State, total=False):
+    """The same, and its time."""
+
+    t: float
+
+
+class _Arrival(TypedDict, total=False):
+    """What happens to recorded inputs before they act (`data.holds.Arrival`)."""
+
+    hold: str
+    delay: float | None
+    lag: float | None
+
+
 class Metadata(_Needed, total=False):
     """What the command line adds, and C."""
 
@@ -50,10 +73,12 @@ class Metadata(_Needed, total=False):
     h_range: list[float] | None
     names: list[str]
     time_unit: str
-    start: dict[str, float | list[float]] | None
+    degrees: list[str]
+    start: _Start | None
     metrics: dict[str, Any]
-    arrival: dict[str, Any]
-    columns: list[list[str]]
+    card: str
+    arrival: _Arrival
+    columns: list[tuple[str, str, str]]  # name, role, unit
     name: str
 
 
@@ -168,7 +193,7 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
         )
     check_entries(Metadata, entries, f"{path}: metadata", REMEDY)
     n, where = entries["dof"], f"{path}: metadata"
-    span, start = entries.get("h_range"), entries.get("start")
+    span, start, arrival = entries.get("h_range"), entries.get("start"), entries.get("arrival", {})
     good = {
         "dof": n >= 1,
         "h": 0 < entries["h"] < float("inf"),
@@ -178,11 +203,13 @@ def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
         "names": len(entries.get("names") or ()) in (0, n),
         "input_zero": len(entries.get("input_zero") or ()) in (0, entries["inputs"]),
         "h_range": span is None or (len(span) == 2 and 0 <= span[0] <= span[1]),
-        "start": start is None or (set(start) >= {"q", "p", "s"} and len(start["q"]) == len(start["p"]) == n),
+        "start": start is None or len(start["q"]) == len(start["p"]) == n,
+        "arrival": set(arrival) <= set(Arrival._fields),
     }
     wrong = [name for name, fine in good.items() if not fine]
     if wrong:
         raise InputError(f"{where}: {wrong[0]} cannot be {entries.get(wrong[0])} with dof {n}; {REMEDY}")
+    check_arrival(f"{where}: arrival", Arrival(**arrival))
     if entries["box"] is not None:
         _box(entries["box"], n)
 

@@ -13,7 +13,7 @@ from torch._higher_order_ops.while_loop import while_loop_op
 from herglotz.export.equation import Equations, dense
 from herglotz.export.newton import CARRIED, CONVERGED, Values, unfinished
 from herglotz.export.step import STATE, StepGraphs
-from herglotz.mechanics.legendre import beyond
+from herglotz.mechanics.legendre import soft_threshold
 from herglotz.stepping.linearise import eliminate
 
 
@@ -35,7 +35,7 @@ def solved(
     carried: Any = first
     found = while_loop_op(lambda *x: unfinished(x[0], x[1], iterations), turn, carried, fixed)
     # What is carried as Δ is z where friction can hold a coordinate.
-    return (*found[:2], beyond(found[2], held[1]), *found[3:]) if held else found
+    return (*found[:2], soft_threshold(found[2], held[1]), *found[3:]) if held else found
 
 
 class RolloutModule(nn.Module):

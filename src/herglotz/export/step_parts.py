@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from herglotz.export.equation import Equations, FieldAt, example, field_like
 from herglotz.export.trace import Graph, traced
-from herglotz.mechanics.legendre import beyond
+from herglotz.mechanics.legendre import soft_threshold
 from herglotz.models import ContactLagrangian
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
@@ -159,7 +159,7 @@ class StepParts(nn.Module):
             guess, stiffness, bound = at_rest(equation)
             form = StickSlip(equation, stiffness, bound)
             point = form(delta, True)
-        end, moved = form.end(delta, point), beyond(x, bound) - beyond(delta, bound)
+        end, moved = form.end(delta, point), soft_threshold(x, bound) - soft_threshold(delta, bound)
         left = point.F - torch.where(form.slides(delta), 0.0, stiffness * (x - delta))  # −J (Δ(x) − Δ)
         assert point.J is not None
         L = end.L + (end.p1 * moved).sum(-1)

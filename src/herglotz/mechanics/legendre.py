@@ -86,11 +86,11 @@ def momentum_residual(P: Partials, p0: Tensor) -> Tensor:
     """
     F = unheld_residual(P, p0)
     held = None if P.force is None else P.force.held
-    return F if held is None else torch.where(held > 0, beyond(F, held), F)
+    return F if held is None else torch.where(held > 0, soft_threshold(F, held), F)
 
 
-def beyond(x: Tensor, bound: Tensor) -> Tensor:
-    """What x has beyond ±bound, x − clamp(x, −bound, bound): exactly 0 between them, with derivative 0."""
+def soft_threshold(x: Tensor, bound: Tensor) -> Tensor:
+    """Soft thresholding x − clamp(x, −bound, bound), what x has beyond ±bound: 0 between, with derivative 0."""
     below = torch.where(x > bound, bound, x)
     return x - torch.where(-bound > below, -bound, below)
 

@@ -10,8 +10,10 @@ from typing import Any
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.checks import Labels
+from herglotz.data.column_table import column_rows
 from herglotz.data.files import write_atomically
-from herglotz.data.units import common_unit
+from herglotz.data.units import as_recorded, common_unit, size
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
@@ -21,7 +23,7 @@ from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.quantities import held_out_rms, quantities
-from herglotz.training.recorded_range import recorded, warning
+from herglotz.training.recorded_range import range_in_words, warning
 from herglotz.training.summary import rows as summary_rows
 from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
@@ -120,13 +122,14 @@ def _equation(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
 
 
 def _sliders(run: Run) -> list[Block]:
-    data, trained = run.data.unwrapped(), max(run.train_lengths[0] - 1, 0)
+    (data, factor), trained = as_recorded(run.data.unwrapped()), max(run.train_lengths[0] - 1, 0)
     rows = slice(0, data.lengths[0])
     found: list[Block] = [
         "Grey: recorded. Blue: the model on the training part. Orange: its free run, never corrected."
     ]
+    predicted = run.prediction.detach() * factor
     for i, (name, unit) in enumerate(zip(data.names, data.units, strict=True)):
-        model = [x if math.isfinite(x) else None for x in run.prediction.detach()[rows, i].tolist()]
+        model = [x if math.isfinite(x) else None for x in predicted[rows, i].tolist()]
         values = {
             "t": data.t[rows].tolist(), "data": data.q[rows, i].tolist(), "model": model, "trained": trained,
             "name": name, "unit": "" if unit == "1" else unit, "time_unit": data.time_unit,
@@ -137,31 +140,30 @@ def _sliders(run: Run) -> list[Block]:
 
 def _data(run: Run) -> tuple[Block, ...]:
     data, m = run.data, run.metrics
+    unit, degrees = common_unit(data.units), bool(data.degrees)
     h = data.steps().h
     precision = m.get("precision")
     rows = [
-        ("recording", data.summary()),
+        ("recording", as_recorded(data)[0].summary()),
         ("steps", f"{float(h.min()):.4g} to {float(h.max()):.4g} {data.time_unit}, median {data.typical_step:.4g}"),
-        (
-            "precision, found in the data",
-            "not found" if precision is None else f"{precision:.3g} {common_unit(data.units)}".rstrip(),
-        ),
-        ("range that was trained on", recorded(run.box, data) or "not known"),
+        ("precision, found in the data", "not found" if precision is None else size(precision, unit, degrees)),
+        ("range that was trained on", range_in_words(run.box, data) or "not known"),
         ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),
         ("sha256", data.digest()),
     ]
     table = Table(("", ""), tuple(rows))
     if not data.columns:
         return (table,)
-    return (table, Table(("column", "is taken for", "unit"), tuple((a, b, c or "-") for a, b, c in data.columns)))
+    rows = column_rows(data.columns, Labels(data.names, data.units, data.angles, data.time_unit))
+    return (table, Table(("column", "is taken for", "unit"), tuple(rows)))
 
 
 def _plan(run: Run) -> tuple[Block, ...]:
     if "plan" not in run.metrics:
         return ("The run holds no plan.",)
     plan = Plan.from_dict(run.metrics["plan"])
-    rows = tuple(plan.decisions(common_unit(run.data.units)))
-    blocks: list[Block] = [Table(("decision", "taken", "because"), rows)]
+    rows = tuple(("; ".join(taken), why) for taken, why in plan.by_reason(common_unit(run.data.units)))
+    blocks: list[Block] = [Table(("decided", "because"), rows)]
     if run.history:
         blocks.append(Picture(plot_training(run), "The cost of every stage; each stage minimises its own."))
     return tuple(blocks)
@@ -169,10 +171,8 @@ def _plan(run: Run) -> tuple[Block, ...]:
 
 def _errors(run: Run) -> tuple[Block, ...]:
     data = run.data
-    rows = [
-        (f"{b}", *(f"{x:.3g} {unit}".removesuffix(" 1") for x, unit in zip(each, data.units, strict=True)))
-        for b, each in enumerate(held_out_rms(run))
-    ]
+    each = [_of_each(run, dict(zip(data.names, row, strict=True))) for row in held_out_rms(run)]
+    rows = [(f"{b}", *(value for _, value in row)) for b, row in enumerate(each)]
     table = Table(("trajectory", *(f"RMS {name}" for name in data.names)), tuple(rows[:20]))
     about = [row for row in summary_rows(run) if "RMS" in row[0]]
     return (
@@ -181,15 +181,26 @@ def _errors(run: Run) -> tuple[Block, ...]:
     )  # fmt: skip
 
 
+def _of_each(run: Run, errors: dict[str, float | None]) -> list[tuple[str, str]]:
+    """RMS of each coordinate in words, in its unit and in degrees where the table had degrees."""
+    units, degrees = dict(zip(run.data.names, run.data.units, strict=True)), run.data.degrees
+    return [
+        (f"RMS {name}", "not reached" if error is None else size(error, units[name], name in degrees))
+        for name, error in errors.items()
+    ]
+
+
 def _against(run: Run, data: Trajectories) -> tuple[Block, ...]:
     found = run.predict(data)
-    rows = [(name, "not reached" if v is None else f"{v:.4g}") for name, v in (
-        *((f"RMS {k}", v) for k, v in (found.metrics()["rms_per_coordinate"] or {}).items()),
-    )]  # fmt: skip
+    rows = _of_each(run, found.metrics()["rms_per_coordinate"] or {})
     rows.append(("steps that failed", f"{100 * found.failed_steps:.3g} %"))
     left = warning(found.beyond, data.time_unit)
     rows += [("beyond the recorded range", left)] if left else []
-    return (data.summary(), Table(("", ""), tuple(rows)), Picture(plot_prediction(found), "Free run on the recording."))
+    return (
+        as_recorded(data)[0].summary(),
+        Table(("", ""), tuple(rows)),
+        Picture(plot_prediction(found), "Free run on the recording."),
+    )
 
 
 def _open(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:

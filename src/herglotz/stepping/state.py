@@ -20,9 +20,9 @@ class Status(IntEnum):
     CONVERGED = 0
     MAX_ITERATIONS = 1  # no convergence within the allowed iterations
     SINGULAR = 2  # det J = 0 (or c = 0): the step is not defined there, erratum E4
-    DIVERGED = 3  # a value stopped being finite
+    DIVERGED = 3  # an input, or a number of the state before the step or after it, is not finite
     STOPPED = 4  # no failure: a terminal event ended the trajectory in or before this step
-    BAD_INPUT = 5  # h is no step, or a number is not finite: of exported files only, a stepper raises
+    BAD_INPUT = 5  # h is no step: of exported files by themselves, for a stepper raises
     UNRESOLVED = 6  # solved, but h does not see the motion: set by `tune.flag_unresolved`, never by a stepper
 
 

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.legendre import beyond, unheld_jacobian, unheld_residual
+from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Point
 from herglotz.models import capabilities
 from herglotz.stepping.partials_equation import End, PartialsEquation
@@ -53,7 +53,7 @@ def at_rest(equation: PartialsEquation) -> Rest:
     n = z.shape[-1]
     for _ in range(SWEEPS if n > 1 else 0):
         for i in range(n):
-            delta = beyond(z, bound)
+            delta = soft_threshold(z, bound)
             others = (couples[..., i, :] * delta).sum(-1) - couples[..., i, i] * delta[..., i]
             z = torch.cat([z[..., :i], (alone[..., i] + others)[..., None], z[..., i + 1 :]], -1)
     return Rest(z, stiffness, bound)
@@ -70,7 +70,7 @@ class StickSlip:
 
     def unknown(self, z: Tensor) -> Tensor:
         """What the equation itself has for its unknown: Δ, or q1."""
-        delta = beyond(z, self.bound)
+        delta = soft_threshold(z, self.bound)
         return delta if self.equation.increments else self.equation.q0 + delta
 
     def slides(self, z: Tensor) -> Tensor:

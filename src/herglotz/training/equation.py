@@ -42,6 +42,7 @@ class Run(Protocol):
 
 
 WIDTH = 78  # two blanks stand before each line on screen
+TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
 
 
 @dataclass(frozen=True)
@@ -81,9 +82,11 @@ class Equation:
         for left in self.lefts:
             every = [term for term in self.terms if term.left == left]
             own = [term for term in every if term.shown] or every
-            right = " ".join(map(str, own)) or "0"
-            right = "−" + right.removeprefix("− ") if right.startswith("− ") else right.removeprefix("+ ")
-            lines += textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
+            right = " ".join(str(term).replace(" ", TOGETHER) for term in own) or "0"
+            minus = f"−{TOGETHER}"
+            right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
+            wrapped = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
+            lines += [line.replace(TOGETHER, " ") for line in wrapped]
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
         return "\n".join([*lines, *textwrap.wrap(f"with {self.units}", WIDTH)])

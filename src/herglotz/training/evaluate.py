@@ -16,6 +16,7 @@ from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.stepping import State, Stepper
+from herglotz.training.config import FitConfig
 from herglotz.training.free_run import states_everywhere
 from herglotz.training.inputs import step_inputs
 from herglotz.training.look import Look
@@ -23,13 +24,17 @@ from herglotz.training.objectives import Fitted
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.supervised import SupervisedProblem
-from herglotz.training.run import Run, box_of
+from herglotz.training.recorded_range import box_of
+from herglotz.training.run import Run
 from herglotz.training.task import Task
 from herglotz.training.verdict import judged
 
 
-def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
-    """Return the finished run: its states, its free run beyond the training part, and the errors of both."""
+def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig) -> Run:
+    """Return the finished run: its states, its free run beyond the training part, and the errors of both.
+
+    `told` are the settings of the fit before anything was decided.
+    """
     train, data, config = seen.train, seen.data, task.config
     fitted = replace(fitted, states=_with_dropped(fitted, train, seen.spikes))
     dropped = seen.spikes.clone()
@@ -56,7 +61,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted) -> Run:
     x, n = fitted.states, data.dof
     box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
     h = train.typical_step / config.substeps
-    return Run(fitted.model, config, metrics, data, train.lengths, states, h, box, task.stages.history)
+    return Run(fitted.model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
 
 def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:

@@ -129,7 +129,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
             seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
         task = Task(seen.kept, seen.base, seen.settings, stages)
-        run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan))
+        run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
     run.metrics["equation"] = _equation(run, plan, ROUNDING * task.exact).as_dict()
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run

@@ -13,14 +13,14 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.driving import driven, even_times, recorded
+from herglotz.data.driving import driven, even_times, input_recording
 from herglotz.data.holds import Arrival
 from herglotz.data.waves import waves
 from herglotz.errors import InputError
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
-from herglotz.training.recorded_range import Beyond, beyond, other_steps, warning
+from herglotz.training.recorded_range import Beyond, other_steps, quantities_outside, warning
 
 Numbers = float | Sequence | np.ndarray | Tensor
 
@@ -102,7 +102,7 @@ def free_motion(
     with torch.no_grad():
         found = run.stepper.rollout(*state, h=step, steps=steps, inputs=None if u is None else u.to(dtype))
     arrays = [x.detach().cpu().numpy() for x in (times, found.q, found.p, found.s, found.status)]
-    left = tuple(beyond(run.box, run.data, times, found.q, found.p))
+    left = tuple(quantities_outside(run.box, run.data, times, found.q, found.p))
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
 
 
@@ -121,7 +121,7 @@ def _inputs(
     """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
     (time, steps, h), (trajectory, from_first) = span, recording
     if isinstance(inputs, (str, Path, Trajectories)):
-        found = recorded(inputs, trajectory, run.data.time_unit, run.arrival, run.data.columns)
+        found = input_recording(inputs, trajectory, run.data.time_unit, run.arrival, run.data.columns)
         return driven(found, float(found.t[0]) if from_first else time, steps, h)
     times = even_times(time, h or run.h, steps)
     if inputs is None:

@@ -25,7 +25,7 @@ from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
-from herglotz.training.recorded_range import Beyond, beyond, farthest
+from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 WARMUP = 20  # samples from which the state is estimated
@@ -205,7 +205,9 @@ def predict(
 def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyond, ...]:
     """What the free runs leave the range of the fit by."""
     rows = [found.free.nonzero()[:, 0][found.data.trajectory[found.free] == b] for b in range(len(found.data))]
-    return farthest(beyond(box, found.data, found.data.t[r], found.states.q[r], found.states.p[r]) for r in rows)
+    return farthest(
+        quantities_outside(box, found.data, found.data.t[r], found.states.q[r], found.states.p[r]) for r in rows
+    )
 
 
 def arrival_of(run: Trained) -> Arrival:

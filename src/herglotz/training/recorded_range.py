@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.units import size
+from herglotz.data.units import size, span
 
 HAIR = 1e-6  # of a step: recorded times are rounded
 QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
@@ -27,19 +27,34 @@ class Beyond:
     low: float  # the recorded range
     high: float
     unit: str  # of a position; "" of a momentum
+    degrees: bool = False  # whether it was recorded in degrees
     trajectory: int = 0
 
     def words(self, time_unit: str) -> str:
         """One clause for people: what leaves which range, how far, and since when."""
-        high, moved = size(self.high, self.unit, digits=3), self.low < self.high
-        ends = f"{size(self.low, '', digits=3)} to {high}" if moved else f"{high} throughout"
+        moved = self.low < self.high
+        ends = (
+            span((self.low, self.high), self.unit, self.degrees)
+            if moved
+            else f"{size(self.high, self.unit, self.degrees)} throughout"
+        )
         time = size(self.since, time_unit, digits=4)
         where = f" in trajectory {self.trajectory}" if self.trajectory else ""
         by = f" by {100 * self.by:.2g} % of its width" if moved else ""
         return f"the {self.quantity} of {self.coordinate} ({ends}){by}, since t = {time}{where}"
 
 
-def beyond(
+def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
+    """Lowest and highest q, p and s over a set of states."""
+    columns = {"q": q, "p": p, "s": s[:, None]}
+    return {
+        f"{name}_{end}": (x.amin(0) if end == "low" else x.amax(0)).tolist()
+        for name, x in columns.items()
+        for end in ("low", "high")
+    }
+
+
+def quantities_outside(
     box: Mapping[str, Sequence[float]],  # lowest and highest q and p of the fit; nothing is beyond an empty one
     like: Trajectories,  # names, units and angles of the coordinates
     t: Tensor,  # (N,)
@@ -59,7 +74,8 @@ def beyond(
                 b = int(every.amax(1).argmax())
                 by = float(every[b].max()) / (high - low) if high > low else math.inf
                 since, unit = float(t[(every[b] > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
-                found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit, b))
+                turned = key == "q" and name in like.degrees
+                found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit, turned, b))
     return found
 
 
@@ -89,12 +105,12 @@ def other_steps(times: Tensor, h_range: tuple[float, float], time_unit: str) -> 
     return f"{mean} are outside of {low:g} to {high:g}, those that the model was fitted to"
 
 
-def recorded(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:
+def range_in_words(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:
     """The range that a fit was trained on, in words; "" where it is not known."""
     if not box:
         return ""
     parts = []
     for i, (name, unit) in enumerate(zip(like.names, like.units, strict=True)):
-        q, p = ([f"{box[f'{key}_{end}'][i]:.3g}" for end in ("low", "high")] for key in "qp")
-        parts.append(f"{name} {q[0]} to {q[1]}{'' if unit == '1' else f' {unit}'}, its momentum {p[0]} to {p[1]}")
+        q, p = ((box[f"{key}_low"][i], box[f"{key}_high"][i]) for key in "qp")
+        parts.append(f"{name} {span(q, unit, name in like.degrees)}, its momentum {span(p)}")
     return "; ".join(parts)

@@ -24,6 +24,7 @@ from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
+from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, arrival_of, predict
 from herglotz.training.summary import as_html, one_line, summary
 
@@ -39,7 +40,8 @@ class Run:
     Parameters
     ----------
     model, config
-        The discrete Lagrangian L_d, and the settings of the fit with what its plan decided.
+        The discrete Lagrangian L_d, and the settings that `fit` was told: `fit(data, run.config)` gives the same fit.
+        `decided` holds them with what the plan decided.
     metrics, history
         Errors in the data's units, verdict, plan and equation (`docs/trajectory.md`, section 8); cost by iteration.
     data, train_lengths
@@ -71,12 +73,18 @@ class Run:
         return State(*(x[last] for x in self.states))
 
     @property
+    def decided(self) -> FitConfig:
+        """The settings with what the plan decided: level, objective, terms, friction, order, substeps."""
+        plan = self.metrics.get("plan")
+        return Plan.from_dict(plan).applied(self.config) if plan else self.config
+
+    @property
     def h_range(self) -> tuple[float, float]:
         """The shortest and the longest step that the model was fitted to, with a hair for rounded time stamps.
 
         A tuned model is made for one step.
         """
-        steps, m = self.data.steps().h, self.config.substeps
+        steps, m = self.data.steps().h, self.decided.substeps
         fitted = steps[steps <= GAP * m * self.h]
         if m > 1:
             fitted = fitted / (fitted / (JITTER * self.h) - 1e-6).ceil()
@@ -338,13 +346,3 @@ class Run:
 def _front() -> Any:
     """The module that knows the rooms above this one; loaded when a run is asked for something of theirs."""
     return import_module("herglotz.front")
-
-
-def box_of(q: Tensor, p: Tensor, s: Tensor) -> dict[str, list[float]]:
-    """Lowest and highest q, p and s over a set of states."""
-    columns = {"q": q, "p": p, "s": s[:, None]}
-    return {
-        f"{name}_{end}": (x.amin(0) if end == "low" else x.amax(0)).tolist()
-        for name, x in columns.items()
-        for end in ("low", "high")
-    }

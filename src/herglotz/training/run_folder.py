@@ -140,7 +140,8 @@ def load_run(folder: str | Path) -> Run:
     if folder.is_file():
         raise InputError(f"{folder}: is a file, and no run; fit data first: herglotz fit {folder} --out RUN")
     if not (folder / "model.pt").is_file():
-        raise InputError(f"{folder}: no model.pt in this folder; give the folder that `herglotz fit --out` wrote")
+        what = "no model.pt in this folder" if folder.is_dir() else "no such folder"
+        raise InputError(f"{folder}: {what}; give the folder that `herglotz fit --out` wrote")
     contents = _bound(folder)
     path = folder / "model.pt"
     try:

@@ -195,7 +195,7 @@ class _Told:
         took, rms = time.monotonic() - self.began, run.metrics.get("extrapolation_rms")
         left = took / self.done * (self.total - self.done)
         error = "fails" if rms is None else f"{rms:.3g}"
-        text = f"fit {self.done} of {self.total}: {run.config.level}, seed {run.config.seed}: held-out RMS {error}"
+        text = f"fit {self.done} of {self.total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
         print(f"{text}; about {left:.0f} s left", file=sys.stderr, flush=True)
 
 

@@ -7,9 +7,9 @@ from textwrap import fill
 from typing import Any, Protocol
 
 from herglotz.data import Trajectories
-from herglotz.data.units import common_unit, size
+from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.config import FitConfig
-from herglotz.training.recorded_range import recorded
+from herglotz.training.recorded_range import range_in_words
 
 MOST_FEATURES, COLUMNS = 5, 80
 MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
@@ -19,7 +19,7 @@ class Judged(Protocol):
     """The attributes of a run that are told."""
 
     @property
-    def config(self) -> FitConfig: ...  # noqa: D102
+    def decided(self) -> FitConfig: ...  # noqa: D102
     @property
     def metrics(self) -> dict[str, Any]: ...  # noqa: D102
     @property
@@ -36,10 +36,10 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
     kept, per = sum(run.train_lengths), "unit of time" if data.time_unit == "1" else data.time_unit
     found = [
-        ("data", data.summary()),
-        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.config.level} level"),
-        ("recorded range", recorded(run.box, data)),
-        ("named terms", run.config.features and _terms(run.config.features, data.names)),
+        ("data", as_recorded(data)[0].summary()),
+        ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
+        ("recorded range", range_in_words(run.box, data)),
+        ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
         (
             "extrapolation RMS",
             _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
@@ -69,7 +69,7 @@ def summary(run: Judged) -> str:
 def one_line(run: Judged) -> str:
     """The run in one line of 80 characters or little more."""
     names, verdict = ", ".join(run.data.names), run.metrics.get("verdict", "not judged").split(":")[0]
-    return f"Run({run.config.level} level, {names} of {run.data.source or 'data'}; {verdict})"
+    return f"Run({run.decided.level} level, {names} of {run.data.source or 'data'}; {verdict})"
 
 
 def as_html(run: Judged) -> str:
@@ -85,7 +85,7 @@ def as_html(run: Judged) -> str:
 def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
     """What the model is made of beside its terms, told or found; "" without."""
     rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more (config.json)" if rest > 0 else "")
+    return ", ".join(names[:most]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
 
 
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
@@ -96,10 +96,10 @@ def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
 
 def model_card(run: Judged, h_range: tuple[float, float]) -> str:
     """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
-    low, high = h_range
+    steps, positions = span(h_range, run.data.time_unit), range_in_words(run.box, run.data)
     return "\n".join([
         f"Model of {run.data.source or 'a recording'} (sha256 {run.data.digest()[:16]})", summary(run),
-        f"For steps of {low:.4g} to {high:.4g} {run.data.time_unit}, and positions {recorded(run.box, run.data)}.",
+        f"For steps of {steps}, and positions {positions}.",
         "Outside of these the model extrapolates. The first coordinate's mass is 1.",
     ])  # fmt: skip
 

@@ -92,9 +92,9 @@ class Laplace:
             train, out, states = without(train, lone), out[~lone], states[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
-        self.base = estimate_baseline(train, outliers=found, substeps=run.config.substeps)
+        self.base = estimate_baseline(train, outliers=found, substeps=run.decided.substeps)
         self.sigma = float(run.metrics["sigma"])
-        departure = run.metrics.get("departure") or run.config.departures[-1]
+        departure = run.metrics.get("departure") or run.decided.departures[-1]
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, _starts(run), ~out, guess=states)
         self.theta = self.problem.parameters.get()
@@ -140,7 +140,7 @@ class Laplace:
         if not 3 <= seen < min(data.lengths):
             raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
         head = _first(data, (seen,) * len(data))
-        task = Task(head, self.base, replace(self.run.config, iterations=1), Stages(False, None, "", resume=False))
+        task = Task(head, self.base, replace(self.run.decided, iterations=1), Stages(False, None, "", resume=False))
         found = fit_states(task, self.run.model, self.sigma)
         if found is None or found.problem.grid.segments > len(data):
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")

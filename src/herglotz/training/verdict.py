@@ -77,6 +77,7 @@ class Errors:
     noise: float  # precision of the data; inf: not known
     spread: float
     unit: str | None = ""  # None: all are over the spread of each coordinate, which is 1
+    degrees: bool = False  # told in deg, as they were recorded; the unit is rad
 
     @property
     def limit(self) -> float:
@@ -89,8 +90,9 @@ class Errors:
         return max(LOST * self.spread, BURIED * self.limit)
 
     def __str__(self) -> str:
+        unit, factor = ("deg", math.degrees(1)) if self.degrees else (self.unit or "", 1.0)
         windows, unseen, free, limit, spread = (
-            "" if x is None else size(x, self.unit or "", digits=2)
+            "" if x is None else size(factor * x, unit, digits=2)
             for x in (self.windows, self.unseen, self.free, self.limit, self.spread)
         )
         held_out = f", unseen data by {unseen}, all unseen time in one run by {free}" if unseen else ""
@@ -125,8 +127,8 @@ def judged(
         unseen = free  # the free run's states are better than those that were found for the windows
     in_units, later = (None if x is None else _rms(x / unit) for x in (unseen, free))
     spread = _rms(scaled.q - scaled.q.mean(0))
-    named = common_unit(kept.units) if kept.dof == 1 else None
-    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named)
+    named, in_degrees = (common_unit(kept.units), bool(kept.degrees)) if kept.dof == 1 else (None, False)
+    errors = Errors(_rms(windows / unit), in_units, later, precision(scaled), spread, named, in_degrees)
     ahead = foresee(task, fitted, seen, everywhere)
     numbers = {"window_rms": _rms(windows), "unseen_window_rms": None if unseen is None else _rms(unseen)}
     numbers["precision"] = precision(kept)

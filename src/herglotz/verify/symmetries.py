@@ -88,7 +88,7 @@ def _opened(states: State, make: torch.Generator) -> State:
 def _unseen_steps(run: Run) -> int:
     """Model steps of the longest unseen part, at most `MOST`; `STEPS` where nothing is unseen."""
     unseen = max(length - seen for length, seen in zip(run.data.lengths, run.train_lengths, strict=True))
-    return min(unseen * run.config.substeps, MOST) or STEPS
+    return min(unseen * run.decided.substeps, MOST) or STEPS
 
 
 def _precision(run: Run) -> float:

@@ -9,7 +9,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Forces, partials
-from herglotz.mechanics.legendre import beyond, unheld_residual
+from herglotz.mechanics.legendre import soft_threshold, unheld_residual
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
@@ -190,7 +190,7 @@ def _forces(known: Subject, w: SampledRollout) -> Forces | None:
         if force is None or force.held is None:
             return force
         F = unheld_residual(P, p0)
-        return replace(force, minus=force.minus - F + beyond(F, force.held))
+        return replace(force, minus=force.minus - F + soft_threshold(F, force.held))
 
 
 def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:

@@ -12,8 +12,10 @@ import torch
 from herglotz.cli import main
 from herglotz.cli.verify import _agreement, _table
 from herglotz.data import load
+from herglotz.data.seal import ONNX_ENTRY, SIZE, sealed_onnx
 from herglotz.export import compare, load_exported
 from herglotz.export.load import read_header
+from herglotz.export.metadata import KEY
 from herglotz.training import load_run, save_run
 
 pytest.importorskip("onnxruntime")
@@ -147,3 +149,18 @@ def test_a_name_of_another_format_is_refused(form, name, tiny_run, tmp_path, cap
     # fails if the extension, by which files are read, may disagree with the format
     assert main(["export", str(tiny_run), "--format", form, "--out", str(tmp_path / name)]) == 2
     assert "the name must end in" in capsys.readouterr().err
+
+
+def test_a_file_made_by_hand_is_one_message(tiny_onnx, tmp_path, capsys):
+    # fails if an entry that cannot be is a traceback where it is used, and no word of file, key and remedy
+    onnx = pytest.importorskip("onnx")
+    made = onnx.load_model_from_string(tiny_onnx.read_bytes()[: -SIZE - len(ONNX_ENTRY)])
+    (said,) = (entry for entry in made.metadata_props if entry.key == KEY)
+    said.value = json.dumps(json.loads(said.value) | {"columns": [["t", "time"]]})
+    path = tmp_path / "made.onnx"
+    path.write_bytes(sealed_onnx(made.SerializeToString()))
+    capsys.readouterr()
+    assert main(["rollout", str(path), "--steps", "2", "--out", str(tmp_path / "a.csv")]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert said.startswith(f"herglotz: error: {path}: metadata: columns must be list[tuple[str, str, str]], got ")
+    assert said.endswith("export the model again")

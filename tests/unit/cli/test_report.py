@@ -2,12 +2,14 @@
 
 import json
 import re
+from dataclasses import replace
 
 import pytest
 
 from herglotz.cli import main
 from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Code, Document, Section, Slider, Table
+from herglotz.training import load_run
 
 
 @pytest.fixture(scope="module")
@@ -43,13 +45,24 @@ def test_the_verdict_comes_first_and_everything_is_said(written, tiny_run):
 
 
 def test_the_slider_holds_the_run(written, tiny_run):  # fails if data, model or the end of training are another's
-    from herglotz.training import load_run
-
     run = load_run(tiny_run)
     found = json.loads(re.findall(r'<script type="application/json">(.*?)</script>', written[0])[0])
     assert found["data"] == run.data.q[:, 0].tolist()
     assert found["model"] == run.prediction[:, 0].tolist()
     assert found["trained"] == run.train_lengths[0] - 1
+
+
+def test_a_report_of_degrees_is_in_degrees(tiny_run, tmp_path):
+    # fails if the table of columns, the walk through the run or an error is another one's than the file of degrees
+    run = load_run(tiny_run)
+    run = replace(run, data=replace(run.data, columns=(("theta", "coordinate", "deg"),)))
+    page, text = (path.read_text() for path in run.report(tmp_path))
+    assert "| theta | angle | deg, converted to rad |" in text
+    assert "samples of theta [deg]" in text
+    assert len(re.findall(r"^\| \d+ \| [\d.e-]+ rad = [\d.e-]+ deg \|$", text, re.M)) == len(run.data)
+    found = json.loads(re.findall(r'<script type="application/json">(.*?)</script>', page)[0])
+    assert found["unit"] == "deg"
+    assert found["data"] == pytest.approx(run.data.q[:, 0].rad2deg().tolist())
 
 
 def test_nothing_of_the_data_is_read_as_markup():  # fails if a name of a column can put a script into the page

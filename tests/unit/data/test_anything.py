@@ -99,7 +99,18 @@ def test_mistakes(data, options, message):  # fails if a mistake is a traceback,
 def test_what_a_frame_is_taken_for_is_printed(capsys):  # fails if the columns of a DataFrame are guessed silently
     as_trajectories(Frame({"t": T, "load": Q[:, 0], "F": Q[:, 1]}))
     lines = [line.split() for line in capsys.readouterr().err.splitlines()]
-    assert lines[2:] == [["t", "time", "-"], ["load", "coordinate", "-"], ["F", "input", "-"]]
+    assert lines[2:] == [["t", "time", "s"], ["load", "coordinate", "-"], ["F", "input", "-"]]
+
+
+@pytest.mark.parametrize("kind", ["frame", "dict", "path"])
+def test_the_table_tells_of_the_angles_that_are_named(capsys, tmp_path, kind):
+    # fails if the table is printed before angles are marked: it then shows another role and unit than the fit takes
+    columns = {"t": T, "theta": Q[:, 0], "x": Q[:, 1]}
+    path = tmp_path / "motion.csv"
+    path.write_text("t,theta,x\n" + "".join(f"{t},{a},{b}\n" for t, (a, b) in zip(T, Q, strict=True)))
+    as_trajectories({"frame": Frame(columns), "dict": columns, "path": path}[kind], angles="theta")
+    lines = [line.split() for line in capsys.readouterr().err.splitlines()]
+    assert lines[2:] == [["t", "time", "s"], ["theta", "angle", "rad"], ["x", "coordinate", "-"]]
 
 
 @pytest.mark.parametrize("name", ["t", None])

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, save
-from herglotz.data.driving import CLOSE, driven, even_times, recorded
+from herglotz.data.driving import CLOSE, driven, even_times, input_recording
 from herglotz.errors import InputError
 
 T = torch.tensor([0.0, 0.1, 0.2, 0.4, 0.5], dtype=torch.float64)
@@ -53,23 +53,23 @@ def test_times_and_inputs_suffice(tmp_path):
     # fails if a file that drives a model must hold positions, or an input is known by the names of inputs alone
     path = tmp_path / "drive.csv"
     path.write_text("t[ms],volts\n0,1\n100,2\n200,4\n")
-    found = recorded(path, 0, "s", known=[["t", "time", "s"], ["volts", "input", ""]])
+    found = input_recording(path, 0, "s", known=[["t", "time", "s"], ["volts", "input", ""]])
     assert (found.t.tolist(), found.u.tolist()) == ([0, 0.1, 0.2], [[1], [2], [4]])  # type: ignore[union-attr]
     path.write_text("t,torque\n0,1\n1,2\n2,4\n")
-    assert recorded(path, 0, "s").u.tolist() == [[1], [2], [4]]  # type: ignore[union-attr]
+    assert input_recording(path, 0, "s").u.tolist() == [[1], [2], [4]]  # type: ignore[union-attr]
     path.write_text("t,x\n0,1\n1,2\n2,4\n")
     with pytest.raises(InputError, match="holds no inputs, only t, x; name their columns u, u_\\*, force or torque"):
-        recorded(path, 0, "s")
+        input_recording(path, 0, "s")
 
 
 def test_the_recording_of_the_trajectory(tmp_path):  # fails if trajectory 0 drives all, or minutes are read as seconds
     second = Trajectories.of(T, T, u=2 * torch.tensor([1.0, 2.0, 4.0, 8.0, 16.0]).double())
     save(tmp_path / "u.npz", Trajectories.cat([RECORDING, second]))
-    assert float(recorded(tmp_path / "u.npz", 1, "s").u[0]) == 2  # type: ignore[index]
+    assert float(input_recording(tmp_path / "u.npz", 1, "s").u[0]) == 2  # type: ignore[index]
     with pytest.raises(InputError, match="there is no trajectory 2; choose one from 0 to 1"):
-        recorded(tmp_path / "u.npz", 2, "s")
+        input_recording(tmp_path / "u.npz", 2, "s")
     with pytest.raises(InputError, match="time is in s, the model's in h; convert it"):
-        recorded(tmp_path / "u.npz", 0, "h")
+        input_recording(tmp_path / "u.npz", 0, "h")
     save(tmp_path / "none.npz", Trajectories.of(T, T))
     with pytest.raises(InputError, match="holds no inputs"):
-        recorded(tmp_path / "none.npz", 0, "s")
+        input_recording(tmp_path / "none.npz", 0, "s")

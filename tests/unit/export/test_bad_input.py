@@ -54,9 +54,11 @@ STATES = {
     "float32": State(q.float(), p.float(), s.float()),
     "p in float32": State(q, p.float(), s),
     "integers": State(q.long(), p.long(), s.long()),
-    "NaN in q": State(q * NAN, p, s),
-    "one NaN in p": State(q, p.clone().index_fill_(0, torch.tensor(1), NAN), s),
-    "an infinite s": State(q, p, s + INF),
+}
+LOST = {
+    "NaN in q": State(q.clone().index_fill_(0, torch.tensor(1), NAN), p, s),
+    "NaN in p": State(q, p.clone().index_fill_(0, torch.tensor(1), NAN), s),
+    "an infinite s": State(q, p, s.clone().index_fill_(0, torch.tensor(1), INF)),
 }
 STEPS = {"zero": 0.0, "negative": -0.1, "NaN": NAN, "infinite": INF, "of two samples": torch.tensor([0.1, 0.1])}
 
@@ -68,6 +70,13 @@ def test_a_wrong_state_is_refused(stepper, name):
         stepper.step(STATES[name], 0.1)
     with pytest.raises(InputError):
         stepper.rollout(*STATES[name], h=0.1, steps=2)
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_a_state_that_is_not_finite_is_lost_alone(stepper, name):
+    # fails if a format refuses the whole batch, passes NaN with status 0, or has another status than the eager stepper
+    assert stepper.step(LOST[name], 0.1).status.tolist() == [0, 3, 0]
+    assert stepper.rollout(*LOST[name], h=0.1, steps=2).status.tolist() == [[0, 0], [3, 3], [0, 0]]
 
 
 @pytest.mark.parametrize("name", STEPS)

@@ -76,7 +76,7 @@ def test_statuses_survive_fast_math(tmp_path, compiler, flags):
     box = {**BOX, "q_low": [-1.0], "q_high": [1.0]}
     export_c(model(correction_width=4), tmp_path / "stepper.h", h=0.1, h_range=(0.05, 0.2), box=box, name="arm")
     words = run(tmp_path, STATUSES, compiler, *flags)
-    assert " ".join(words) == "0 5 5 5 5 5 5 5 5 1 1 1 32 16 5 0 5 0"
+    assert " ".join(words) == "0 5 5 5 5 3 3 3 3 1 1 1 32 16 3 0 3 0"
 
 
 INIT = """

@@ -5,7 +5,7 @@ import torch
 
 from herglotz.mechanics import partials
 from herglotz.mechanics.contact import contact_form
-from herglotz.mechanics.legendre import beyond
+from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.regularity import left_hessian, regularity
 
@@ -75,7 +75,7 @@ def test_the_contact_form():
 
 def test_beyond_a_bound():
     # fails if a side of the bound is lost
-    found = beyond(tensor(-3.0, -1.0, 0.0, 1.0, 3.0), tensor(2.0))
+    found = soft_threshold(tensor(-3.0, -1.0, 0.0, 1.0, 3.0), tensor(2.0))
     assert found.tolist() == [-1, 0, 0, 0, 1]
 
 

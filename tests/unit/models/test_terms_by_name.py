@@ -99,7 +99,7 @@ def test_a_fit_finds_it(recorded, tmp_path):
     settings = FitConfig(terms=("coupling_spring",), train_fraction=0.8, objective="residual", correction_width=0)
     run = fit(recorded, settings, progress=False)
     found = {name: x.detach() for name, x in run.model.named_parameters()}
-    assert run.config.level == "forced"
+    assert run.decided.level == "forced"
     assert float(found["more.0.stiffness"]) == pytest.approx(2.0, abs=1e-3)
     assert float(found["more.0.damper"]) == pytest.approx(0.3, abs=1e-3)
     save_run(run, tmp_path / "run")

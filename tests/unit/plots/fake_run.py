@@ -7,7 +7,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Plan, Run
-from herglotz.training.run import box_of
+from herglotz.training.recorded_range import box_of
 
 TERMS = "cos(q1) explains the data to 0.01"
 PLAN = Plan(

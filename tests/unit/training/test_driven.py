@@ -99,7 +99,7 @@ def test_gradients_with_inputs_match_finite_differences(objective):
 def test_exact_data_give_back_the_map(exact_run):
     # fails if training, the free run or the judgement steps without the recorded input, or with its neighbour's
     friction: Any = exact_run.model.friction
-    assert (exact_run.metrics["level"], exact_run.config.coulomb) == ("forced", True)
+    assert (exact_run.metrics["level"], exact_run.decided.coulomb) == ("forced", True)
     assert friction.input_map.item() == pytest.approx(GAIN, rel=1e-4)
     assert friction.input_zero.item() == pytest.approx(ZERO, abs=1e-4)
     assert exact_run.metrics["extrapolation_rms"] < 1e-4
@@ -126,9 +126,9 @@ def test_select_compares_what_fit_does():
     found = select(data, seeds=1, config=settings, progress=False)
     plain, auto = found.candidates
     assert (plain.level, auto.level) == ("forced", "auto")
-    assert auto.best.config == fit(data, settings, progress=False).config
-    assert auto.best.config.coulomb
-    assert not plain.best.config.coulomb
+    assert auto.best.decided == fit(data, settings, progress=False).decided
+    assert auto.best.decided.coulomb
+    assert not plain.best.decided.coulomb
 
 
 def test_a_given_map_is_kept():

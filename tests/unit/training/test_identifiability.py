@@ -9,7 +9,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace, traded
 from herglotz.training.identifiability import LARGEST, in_words, sparse_basis
-from herglotz.training.run import box_of
+from herglotz.training.recorded_range import box_of
 
 NOISE, H = 1e-3, 0.2
 

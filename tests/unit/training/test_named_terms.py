@@ -285,3 +285,15 @@ def test_deviations_are_no_smaller_than_rounding(duffing):
     for term, wide in zip(duffing.equation().terms, _equation(duffing, plan, least).terms, strict=True):
         assert wide.deviation == pytest.approx(by * term.deviation)
     assert str(_equation(duffing, plan, 0.0)) == str(duffing.equation())
+
+
+def test_lines_of_an_equation_break_between_terms():  # fails if a number stands at the end of a line, x on the next
+    terms = tuple(
+        Term("x″", what, -0.123456, 1e-5, "1/s²") for what in ("x′", "|x′| x′", "(u_0 + 0.1)", "x", "x³", "x⁵", "x⁷")
+    )
+    lines = str(Equation(terms, ("x″",), "x in m", None)).splitlines()
+    assert [line.strip() for line in lines] == [
+        "x″ = −0.123456(10) x′ − 0.123456(10) |x′| x′ − 0.123456(10) (u_0 + 0.1)",
+        "− 0.123456(10) x − 0.123456(10) x³ − 0.123456(10) x⁵ − 0.123456(10) x⁷",
+        "with x in m",
+    ]

@@ -1,11 +1,12 @@
 """A motion that leaves what was recorded is said to: which quantity, how far, since when."""
 
 import math
+from dataclasses import replace
 
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.training.recorded_range import beyond, farthest, recorded, warning
+from herglotz.training.recorded_range import farthest, quantities_outside, range_in_words, warning
 
 BOX = {"q_low": [-1.0, 2.0], "q_high": [1.0, 4.0], "p_low": [-3.0, -1.0], "p_high": [3.0, 1.0]}
 LIKE = Trajectories.of(
@@ -20,8 +21,8 @@ def test_a_motion_inside_is_not_noted():
     q = INSIDE.clone()
     q[1], q[2, 1] = torch.tensor([1.0, 4.0]), 3.0 + 6 * math.pi
     q[3] = torch.nan
-    assert beyond(BOX, LIKE, LIKE.t, q, 0 * INSIDE) == []
-    assert beyond({}, LIKE, LIKE.t, 100 + q, q) == []
+    assert quantities_outside(BOX, LIKE, LIKE.t, q, 0 * INSIDE) == []
+    assert quantities_outside({}, LIKE, LIKE.t, 100 + q, q) == []
 
 
 def test_what_leaves_how_far_and_since_when():
@@ -29,7 +30,7 @@ def test_what_leaves_how_far_and_since_when():
     q, p = INSIDE.clone(), 0 * INSIDE
     q[2:, 0] = torch.tensor([-1.5, -2.0])
     p[1, 1] = 5.0
-    found = beyond(BOX, LIKE, 10 + LIKE.t, q, p)
+    found = quantities_outside(BOX, LIKE, 10 + LIKE.t, q, p)
     assert [(x.coordinate, x.quantity, x.by, x.since) for x in found] == [
         ("x", "position", 0.5, 12.0), ("phi", "momentum", 2.0, 11.0),
     ]  # fmt: skip
@@ -44,21 +45,36 @@ def test_of_several_motions_the_farthest_is_told():
     q = INSIDE.clone()
     q[3, 0] = 2.0
     p = torch.zeros_like(q)
-    near, far = beyond(BOX, LIKE, LIKE.t, q, p), beyond(BOX, LIKE, LIKE.t, q * torch.tensor([2.0, 1.0]), p + 2)
+    near, far = (
+        quantities_outside(BOX, LIKE, LIKE.t, q, p),
+        quantities_outside(BOX, LIKE, LIKE.t, q * torch.tensor([2.0, 1.0]), p + 2),
+    )
     x, phi = farthest([[], near, far, near])
     assert (x.coordinate, x.quantity, x.by, x.trajectory) == ("x", "position", 1.5, 2)
     assert (phi.coordinate, phi.quantity, phi.by, phi.trajectory) == ("phi", "momentum", 0.5, 2)
     # a batch of the same times in one go
     several = torch.stack([INSIDE, q, q * torch.tensor([2.0, 1.0]), q]), torch.stack([p, p, p + 2, p])
-    assert {x, phi} == set(beyond(BOX, LIKE, LIKE.t, *several))
+    assert {x, phi} == set(quantities_outside(BOX, LIKE, LIKE.t, *several))
 
 
 def test_the_recorded_range_in_words():  # fails if low and high, or the unit, are lost
-    assert recorded(BOX, LIKE) == "x -1 to 1 m, its momentum -3 to 3; phi 2 to 4 rad, its momentum -1 to 1"
+    assert range_in_words(BOX, LIKE) == "x -1 to 1 m, its momentum -3 to 3; phi 2 to 4 rad, its momentum -1 to 1"
+
+
+def test_what_was_recorded_in_degrees_is_told_in_degrees():
+    # fails if a reader whose file has degrees is told of radians alone, or a momentum is turned
+    like = replace(LIKE, columns=(("phi", "coordinate", "deg"),))
+    assert range_in_words(BOX, like).endswith("; phi 2 to 4 rad = 115 to 229 deg, its momentum -1 to 1")
+    q = INSIDE.clone()
+    q[2:, 1] = 1.0
+    found = quantities_outside(BOX, like, LIKE.t, q, q)
+    text = warning(found, "s")
+    assert "the position of phi (2 to 4 rad = 115 to 229 deg) by 50 % of its width" in text
+    assert "the momentum of phi (-1 to 1) by" in text
 
 
 def test_zero_width_is_no_division_by_zero():  # fails if a coordinate that never moved leaves by inf % of no width
     box = {"q_low": [0.0, 0.0], "q_high": [0.0, 0.0], "p_low": [0.0, 0.0], "p_high": [0.0, 0.0]}
-    (found,) = beyond(box, LIKE, LIKE.t, torch.tensor([[0.0, 0.0]] * 3 + [[1.0, 0.0]]), torch.zeros(4, 2))
+    (found,) = quantities_outside(box, LIKE, LIKE.t, torch.tensor([[0.0, 0.0]] * 3 + [[1.0, 0.0]]), torch.zeros(4, 2))
     assert found.by == math.inf
     assert warning([found], "s").endswith(": the position of x (0 m throughout), since t = 3 s")

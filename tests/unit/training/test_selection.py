@@ -106,7 +106,7 @@ def test_joints_are_chosen_as_fit_finds_them():
     data = simulate(scene("double_pendulum"), trajectories=12, steps=49, h=0.02, seed=0)
     found = select(data, ("linear", "auto"), 1, FitConfig(iterations=40), progress=False)
     assert found.chosen.level == "auto"
-    assert found.run.config.features
+    assert found.run.decided.features
     assert found.chosen.error < 0.1 * found.candidates[0].error
 
 

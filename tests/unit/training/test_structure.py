@@ -226,7 +226,7 @@ def test_a_planet_is_learned_with_structure_is_free():
     # fails if the distance is not found: free runs then leave the orbit (the networks' end in NaN)
     data = simulate(scene("kepler"), trajectories=4, steps=40, h=0.02, seed=0)
     run = fit(data, FitConfig(train_fraction=1.0, iterations=20), progress=False)
-    assert "r^-1" in run.config.features
+    assert "r^-1" in run.decided.features
     test = simulate(scene("kepler"), trajectories=4, steps=101, h=0.02, seed=1000).q.reshape(4, 102, 2)
     with torch.no_grad():
         start = run.stepper.init(test[:, 0], test[:, 1], None, 0.02)

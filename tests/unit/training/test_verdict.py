@@ -47,6 +47,14 @@ def test_words(windows, unseen, free, ahead, expected):
     assert ("Try " in text) == (expected.startswith("does not fit"))
 
 
+def test_a_verdict_on_degrees_is_in_degrees():  # fails if a reader whose file has degrees is told of radians alone
+    errors = Errors(0.01, 0.02, 0.03, noise=0.01, spread=1.0, unit="rad", degrees=True)
+    assert "miss the training data by 0.57 deg, unseen data by 1.1 deg, all unseen time in one run by 1.7" in str(
+        errors
+    )
+    assert "miss the training data by 0.01 rad" in str(replace(errors, degrees=False))
+
+
 def test_a_model_without_states_does_not_fit():
     # fails if a fit that says it follows no data is praised for its one-step errors
     text = in_words(Errors(0.01, 0.01, 0.01, noise=0.01, spread=1.0), KNOWN, {**GOOD, "follows_data": False})

@@ -152,7 +152,11 @@ def test_metadata_of_a_wrong_type(model):
     wrong: list[tuple[str, object]] = [
         ("dof", 1.5), ("dof", 0), ("dtype", "float16"), ("angles", [1]), ("h", "0.1"), ("box", {"q_low": [0.0]}),
         ("units", ["rad", "m"]), ("start", []), ("h_range", [2.0, 1.0]), ("inputs", True),
-        ("dof", 2**70), ("inputs", 2**70),
+        ("dof", 2**70), ("inputs", 2**70), ("columns", [["t", "time"]]), ("columns", [["t", "time", 1]]),
+        ("columns", None), ("columns", ["abc"]), ("start", {"q": 1.0, "p": [1.0], "s": 0.0}), ("arrival", None),
+        ("start", {"q": [1.0], "p": [1.0], "s": [0.0]}), ("start", {"q": [1.0], "p": [1.0]}), ("degrees", [1]),
+        ("arrival", {"hold": 1}), ("arrival", {"hold": "second"}), ("arrival", {"delay": -1.0}),
+        ("arrival", {"late": 1.0}), ("time_unit", None), ("box", {"q_low": "a"}),
     ]  # fmt: skip
     for name, value in wrong:
         with pytest.raises(InputError, match=name):

@@ -1,5 +1,6 @@
 """A number that is not finite has a status, eager and exported; every wrong start is refused at one door."""
 
+import itertools
 import shutil
 
 import pytest
@@ -65,6 +66,30 @@ def test_the_factor_of_an_exported_file(model):
     out = program.rollout(zero[:1], zero[:1], h=0.1, steps=400)
     assert not silent(out)
     assert int((out.status == 0).sum()) == 308
+
+
+@pytest.mark.parametrize("level", ["conservative", "linear", "full", "forced"])
+def test_what_is_not_finite_is_the_loss_of_one_sample(level, files):
+    # fails if a file refuses a batch of which the eager stepper loses one sample, or loses another, or with another
+    # status; s = NaN moves nothing at the conservative level
+    driven = {"inputs": 1} if level == "forced" else {}
+    model = ContactLagrangian(ModelConfig(level=level, **driven))
+    named = steppers(model) + ([load_exported(files("onnx"))] if level == "linear" else [])
+    fine = [torch.full((3, 1), 0.3).double(), torch.full((3, 1), 0.2).double(), torch.full((3,), 0.1).double()]
+    for stepper, k, value in itertools.product(named, range(4 if driven else 3), (float("nan"), float("inf"))):
+        start, u = [x.clone() for x in fine], torch.zeros(3, 2, 1).double() if driven else None
+        (start[k] if k < 3 else u)[1] = value  # pyright: ignore[reportOptionalSubscript]
+        with torch.no_grad():
+            out = stepper.rollout(*start, h=0.1, inputs=u, steps=2)
+            step, slopes = (f(State(*start), 0.1, u=None if u is None else u[:, 0])
+                            for f in (stepper.step, stepper.linearise))  # fmt: skip
+            alone = stepper.rollout(*(x[:1] for x in fine), h=0.1, steps=2)
+        assert out.status.tolist() == [[0, 0], [3, 3], [0, 0]]
+        assert step.status.tolist() == slopes.step.status.tolist() == [0, 3, 0]
+        assert bool(out.q[1, 1:].isnan().all() & step.state.s[1].isnan() & slopes.by_state[1].isnan().all())
+        torch.testing.assert_close(out.q[0], alone.q[0], rtol=1e-13, atol=0)
+        with pytest.raises(InputError, match="q1 must be finite"):
+            stepper.init(fine[0], fine[1] * value, fine[2], 0.1)
 
 
 def test_s_that_is_no_number_where_nothing_depends_on_it():

@@ -10,7 +10,7 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
-from herglotz.training.run import box_of
+from herglotz.training.recorded_range import box_of
 from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, tune
 from herglotz.tune.config import allowed_failures
 from herglotz.tune.cost import Cost, Timed, measure_costs

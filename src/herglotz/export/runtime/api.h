@@ -33,7 +33,7 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
   P.s0 = next.s = s0;
   P.h = h;
   next.sigma = hz_R(1.0);
-  if (!hz_usable(&next, h) || !hz_all_finite(q0) || hz_BAD_U(u)) return hz_BAD_INPUT;
+  if (hz_before(&next, h) || !hz_all_finite(q0) || hz_BAD_U(u)) return hz_BAD_INPUT;
 #if hz_INPUTS
   hz_push(u, P.push);
 #endif
@@ -64,8 +64,9 @@ static inline int hz_init(const hz_real q0[hz_N], const hz_real q1[hz_N], hz_rea
    the box and hz_OUTSIDE_H where h is not one of the range the model was fitted for. */
 static inline int hz_step(hz_state *state, hz_real h, hz_TAKES_U hz_real *residual) {
   hz_real left = hz_R(0.0);
-  int status = hz_BAD_INPUT;
-  if (hz_usable(state, h) && !hz_BAD_U(u)) {
+  int status = hz_before(state, h);
+  if (!status && hz_BAD_U(u)) status = hz_DIVERGED;
+  if (!status) {
     status = hz_outside_box(state) | hz_outside_h(h);
     status |= hz_alone(state, h, hz_WITH_U(u) &left) | hz_outside_box(state);
   }
@@ -150,7 +151,7 @@ static inline int hz_rollout_batch(long count, hz_state *states, hz_real h, hz_T
   long b;
   for (b = 0; b < count; b += some) {
     for (w = 0; w < hz_SIDE && b + w < count; w++) {
-      status[w] = possible && hz_usable(states + b + w, h) ? hz_CONVERGED : hz_BAD_INPUT;
+      status[w] = possible ? hz_before(states + b + w, h) : hz_BAD_INPUT;
       flags[w] = status[w] ? 0 : hz_outside_box(states + b + w) | hz_outside_h(h);
     }
     some = possible ? hz_run_some(states + b, b, count, &job, status, flags) : 1;

@@ -20,9 +20,11 @@ static inline int hz_outside_box(const hz_state *state) {
 #endif
 }
 
-static inline int hz_usable(const hz_state *state, hz_real h) {
-  return hz_finite(h) && h > hz_R(0.0) && hz_all_finite(state->q) && hz_all_finite(state->p) && hz_finite(state->s) &&
-         hz_finite(state->sigma);
+/* The status of a state before a step h: hz_BAD_INPUT where h is no step, hz_DIVERGED where the state is not finite. */
+static inline int hz_before(const hz_state *state, hz_real h) {
+  if (!(hz_finite(h) && h > hz_R(0.0))) return hz_BAD_INPUT;
+  return hz_all_finite(state->q) && hz_all_finite(state->p) && hz_finite(state->s) && hz_finite(state->sigma)
+      ? hz_CONVERGED : hz_DIVERGED;
 }
 
 /* A state that there is none of. */

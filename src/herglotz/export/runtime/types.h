@@ -31,8 +31,8 @@ enum {
   hz_CONVERGED = 0,
   hz_MAX_ITERATIONS = 1,
   hz_SINGULAR = 2,     /* det J = 0 or c = 0: the step is not defined there */
-  hz_DIVERGED = 3,     /* a value stopped being finite */
-  hz_BAD_INPUT = 5,    /* h <= 0, or a number that is not finite */
+  hz_DIVERGED = 3,     /* an input, or a number of the state before the step or after it, is not finite */
+  hz_BAD_INPUT = 5,    /* h is no finite number > 0, or hz_init is given a number that is not finite */
   hz_OUTSIDE_BOX = 16, /* a separate bit: a state outside the box of the fitted data; the step is done */
   hz_OUTSIDE_H = 32    /* a separate bit: h outside [hz_h_low, hz_h_high]; the step is done */
 };

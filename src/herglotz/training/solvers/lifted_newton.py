@@ -20,7 +20,7 @@ from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
-from herglotz.mechanics.legendre import beyond
+from herglotz.mechanics.legendre import soft_threshold
 from herglotz.stepping import Status, solve, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
@@ -144,7 +144,7 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
     q0, p0, s0, q1 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n], x[:, 1:, :n]
     if L_d.capabilities.sticking:
         rest = at_rest(PartialsEquation(L_d, q0, p0, s0, h, 2, increments=False))
-        delta = beyond(rest.start, rest.bound)
+        delta = soft_threshold(rest.start, rest.bound)
         q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
     P = partials(L_d, q0, q1, s0, h, order=2)
     dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))[..., None]
