@@ -91,12 +91,16 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
+        found = self._braking(found)
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         for _ in range(ADDED):
             name = self._missing(found)
             if name is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
+            if name == DRY and more is not None and more.pushes:
+                self.all = replace(self.all, dry=False)
+                continue
             white = more is not None and not (found.coloured and more.coloured)  # what the criterion takes for granted
             if more is None or not more.rms < found.rms or not (white or found.beaten_by(more, self.floor)):
                 break
@@ -171,11 +175,14 @@ class DictionarySearch:
         features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
         return self.all.only(tuple(own)), {**values, **features}
 
+    def _braking(self, found: Found) -> Found:
+        """Without dry friction that pushes: it makes up for another force."""
+        less = self._refit(found, replace(found.terms, dry=False)) if found.pushes else None
+        return found if less is None else self._finer(less)
+
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
-        if not found.terms.dry or found.config.sticking or self.config.sticking is False:
-            return found
-        if max(found.values[DRY]) <= 0:  # smooth friction that pushes makes up for another force, and holds nothing
+        if not found.terms.dry or found.pushes or found.config.sticking or self.config.sticking is False:
             return found
         other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
         return found if other is None or not other.rms < found.rms else self._longer(other)
@@ -274,7 +281,7 @@ class DictionarySearch:
         stages, problem = self._problem(found, self.all, found.config.substeps)
         for better in likelier(found, problem, self.all, stages.task.config, self.floor):
             other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
-            if other is not None and self._preferred(other, found):
+            if other is not None and not other.pushes and self._preferred(other, found):
                 return self._likeliest(self._held(self._longer(other)))
         return found
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.named_terms import NamedTerms, places
+from herglotz.training.named_terms import DRY, NamedTerms, places
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
 from herglotz.training.pruning import prune
@@ -38,6 +38,11 @@ class Found:
     def rms(self) -> float:
         """Misfit of the data, in units of q."""
         return self.fit.noise
+
+    @property
+    def pushes(self) -> bool:
+        """Whether its dry friction drives every coordinate, which none does: it would create energy."""
+        return self.terms.dry and max(self.values[DRY]) <= 0
 
     @cached_property
     def held_out(self) -> Tensor:
