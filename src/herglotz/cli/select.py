@@ -24,7 +24,7 @@ examples:
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
-    parser = commands.add_parser("select", help="fit the ladder, keep the simplest level", description=DESCRIPTION)
+    parser = commands.add_parser("select", help="compare kinds of damping, keep the simplest", description=DESCRIPTION)
     add_run_flags(parser)
     parser.add_argument(
         "--levels",
