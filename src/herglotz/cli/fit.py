@@ -107,7 +107,8 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     if exit_code(result):
         say(f"Next: what the verdict says, or herglotz trust {out}, which says what the data leave open")
         return
-    print(f"Next: herglotz verify {out}")
+    print(f"Next: herglotz report {out}")
+    print(f"      herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 
 

@@ -29,7 +29,7 @@ def add(commands: argparse._SubParsersAction) -> None:
     parser.add_argument(
         "--levels",
         help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
-        "but full, and auto for joints; with recorded inputs u: forced and auto, which adds dry friction",
+        "but full, and auto where nothing is said of the terms; with recorded inputs u: forced and auto",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     add_progress_flags(parser)

@@ -131,7 +131,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "extrapolation RMS" in out
     # fails if what the fit found with nothing told stays hidden
     assert "cos(q1)" in next(line for line in out.splitlines() if line.strip().startswith("named terms"))
-    assert f"Next: herglotz verify {folder}" in out
+    assert f"Next: herglotz report {folder}" in out
     assert err.startswith("tiny.csv:\n  column")
     assert "\r" not in err  # no bar where there is no terminal, but a line a stage
     assert re.search(r"^segments of \d+: \d+ iterations?, [\d.]+ s$", err, re.M)
