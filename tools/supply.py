@@ -140,10 +140,7 @@ def check_lock() -> None:
     lines, missing, builds = [line for line in text.splitlines() if "==" in line], [], []
     said = _checked(lines)
     while len(missing) <= SLIPS and (found := NO_FILE.search(said)):
-        plain, _, build = found[1].partition("+")
-        others = LISTED.search(said)
-        is_build = bool(build and others and plain.rpartition("==")[2] in others[1].split(", "))
-        (builds if is_build else missing).append(found[1])
+        (builds if _is_build(found[1], said) else missing).append(found[1])
         lines = [line for line in lines if line.split()[0] != found[1]]
         said = _checked(lines, "--no-deps")  # what needs the one left out is no mistake
     if len(missing) > SLIPS:
@@ -153,6 +150,13 @@ def check_lock() -> None:
     else:
         also = f"; not checked: {', '.join(builds)}, whose index pip was not given" if builds else ""
         print(f"lock.txt: pip gets {len(lines)} packages with these hashes{also}")
+
+
+def _is_build(requirement: str, said: str) -> bool:
+    """Whether a version is a build (`+cpu`) of one that pip has found."""
+    plain, _, build = requirement.partition("+")
+    others = LISTED.search(said)
+    return bool(build and others and plain.rpartition("==")[2] in others[1].split(", "))
 
 
 def _checked(lines: list[str], *words: str) -> str:

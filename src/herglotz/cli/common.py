@@ -27,6 +27,12 @@ def exit_code(run: Run) -> int:
     return NO_FIT if run.metrics["verdict"].startswith("does not fit") else 0
 
 
+def warn_of_misfit(run: Run, means: str) -> None:
+    """Say on stderr what it means that the run does not fit its data, where it does not."""
+    if exit_code(run):
+        say(f"herglotz: warning: the run does not fit its data: {means}; fit it better first", sys.stderr)
+
+
 def positive(text: str) -> float:
     """Parse a finite number > 0 (argparse type)."""
     value = finite(text)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import KICKS, check_output_file, positive, print_json
+from herglotz.cli.common import KICKS, check_output_file, positive, print_json, warn_of_misfit
 from herglotz.cli.flags import add_force_flag
 from herglotz.errors import InputError
 
@@ -70,6 +70,7 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.export import export_run, load_exported
     from herglotz.export.c_header import read_metadata
 
+    warn_of_misfit(result, "the file will not step as the recorded system does")
     export_run(result, arguments.out, arguments.format, h_range=arguments.h_range, name=arguments.name)
     tuned = result.setting
     if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 DESCRIPTION = """\
 Train a discrete contact Lagrangian on positions; the last part of every trajectory is held out and predicted.
 Metrics are printed, and RUN receives model.pt, metrics.json, config.json, fit.npz, checkpoint.pt and the figures
-(*.png). The last line is the verdict: "fits to the noise", "fits, worse than the noise by ...", or "does not fit: ..."
-with what to try; then the exit code is 3.
+(*.png). The summary ends with the verdict: "fits to the noise", "fits, worse than the noise by a factor ...", or "does
+not fit: ..." with what to try; then the exit code is 3.
 
 DATA is .csv (header t[s],theta[rad],...; a column trajectory groups the rows), .npz (arrays t, q), a Schmidt & Lipson
 .txt, or with the extra "tables" .parquet, .h5 or .mat. Steps may differ and samples may be missing.
@@ -107,7 +107,8 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     if exit_code(result):
         say(f"Next: what the verdict says, or herglotz trust {out}, which says what the data leave open")
         return
-    print(f"Next: herglotz verify {out}")
+    print(f"Next: herglotz report {out}")
+    print(f"      herglotz verify {out}")
     print(f"      herglotz export {out} --out {out.name}.pt2")
 
 

@@ -16,6 +16,7 @@ Progress = Literal[False, "lines", "iterations"] | None  # what `herglotz.traini
 
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """Add DATA, --out and --resume, --config, and how the data are read: --angles, --train-fraction."""
+    parser.usage = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
     parser.add_argument("data", metavar="DATA", type=existing, help="file with time and positions")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
@@ -30,7 +31,7 @@ def add_column_flags(parser: argparse.ArgumentParser) -> None:
         help="coordinates that are angles in radians, with commas, or none (default: those with the unit rad or deg)",
     )  # fmt: skip
     for flag, what in (
-        ("--sensor-zeros", "what they read where the coordinates are 0"),
+        ("--sensor-zeros", "what the sensors read where the coordinates are 0"),
         ("--sensor-scales", "what one unit of each reading is worth"),
     ):
         parser.add_argument(

@@ -12,11 +12,12 @@ from herglotz.cli import export, fit, plot, predict, report, rollout, select, si
 from herglotz.cli.common import complain
 
 DESCRIPTION = """\
-Learn a discrete contact Lagrangian from measured positions, step it, and prove that it is a contact integrator.
+From recorded positions to the equation of motion (a learned discrete contact Lagrangian), a fast time stepper, and a
+statement whether to believe it.
 
 Data with a known answer (or bring your own csv):
   herglotz simulate damped_pendulum --out pendulum.csv
-Train; metrics and figures land in the folder:
+Fit; equation and verdict are printed, figures land in the folder:
   herglotz fit pendulum.csv --out runs/pendulum
 One HTML page: the equation, errors, whether to believe it:
   herglotz report runs/pendulum

@@ -24,12 +24,12 @@ examples:
 
 def add(commands: argparse._SubParsersAction) -> None:
     """Add the subcommand."""
-    parser = commands.add_parser("select", help="fit the ladder, keep the simplest level", description=DESCRIPTION)
+    parser = commands.add_parser("select", help="compare kinds of damping, keep the simplest", description=DESCRIPTION)
     add_run_flags(parser)
     parser.add_argument(
         "--levels",
         help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
-        "but full, and auto for joints; with recorded inputs u: forced and auto, which adds dry friction",
+        "but full, and auto where nothing is said of the terms; with recorded inputs u: forced and auto",
     )
     parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
     add_progress_flags(parser)

@@ -199,7 +199,10 @@ def add_expert_flags(parser: argparse._ActionsContainer) -> None:
         "or what explains the data best)",
     )  # fmt: skip
 
-    for flag, what in (("--input-delay", "time by which inputs act later"), ("--actuator-lag", "their time constant")):
+    for flag, what in (
+        ("--input-delay", "time by which inputs act later"),
+        ("--actuator-lag", "time constant of the actuator"),
+    ):
         _setting(
             parser, flag, type=_duration, metavar="T",
             help=f"{what}, in the data's unit; none, or auto, as without this flag: what the file says or else what "

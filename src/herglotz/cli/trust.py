@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import COLUMNS, check_output_folder, exit_code, finite, print_json, print_table, say
+from herglotz.cli.common import COLUMNS, check_output_folder, finite, print_json, print_table, warn_of_misfit
 
 if TYPE_CHECKING:
     from herglotz.training import Bands, Laplace, Run
@@ -58,9 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     numbers = _numbers(result, posterior, bands, arguments.level) | {"parameters": _by_name(physical)}
     folder.mkdir(parents=True, exist_ok=True)
     save_figure(plot_bands(result, bands, arguments.level), folder / "bands.png")
-    if exit_code(result):
-        text = "the run does not fit its data: what is said here of its parameters means little; fit it better first"
-        say(f"herglotz: warning: {text}", sys.stderr)
+    warn_of_misfit(result, "what is said here of its parameters means little")
     if arguments.json:
         print_json(numbers)
     else:

@@ -160,7 +160,7 @@ def other_metadata(metadata: dict[str, Any], run: Any) -> list[str]:
 
 
 def _table(agreement: dict[str, Any], against: Path | None) -> str:
-    lines = [f"beside {against}, 1000 steps, largest difference relative to the largest value:"]
+    lines = [f"beside {against}, 1000 steps:", "largest difference, relative to the largest value"]
     lines.append(f"  {'batch':>6}" + "".join(f"  {name:>9}" for name in "qpsc") + "  failed  other status")
     for size, one in agreement["per_batch"].items():
         numbers = "".join(f"  {one[name]:>9.2g}" if math.isfinite(one[name]) else f"  {'none':>9}" for name in "qpsc")

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.csv_columns import HEADER_CELL, Names, Wanted
+from herglotz.data.csv_columns import Names, Wanted, name_and_unit
 from herglotz.data.extra_formats import Table
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
@@ -133,10 +133,10 @@ def _labels(called: Names | None) -> dict[str, Any]:
     """What names of coordinates say, as cells of a header do: `x[m]` is x, in m. Nothing where there are none."""
     if called is None:
         return {}
-    heads = [HEADER_CELL.fullmatch(name) for name in ((called,) if isinstance(called, str) else called)]
+    heads = [name_and_unit(name) for name in ((called,) if isinstance(called, str) else called)]
     refuse({f"{called!r} names no coordinate; write name or name[unit]": None in heads})
-    names = tuple(head[1] for head in heads if head)
-    units = tuple((head[2] or "").strip() or "1" for head in heads if head)
+    names, units = zip(*(head for head in heads if head), strict=True)
+    units = tuple(unit or "1" for unit in units)
     columns = tuple((name, "coordinate", unit) for name, unit in zip(names, units, strict=True))
     return {"names": names, "units": units, "angles": [unit == "rad" for unit in units], "columns": columns}
 

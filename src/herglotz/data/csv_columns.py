@@ -9,19 +9,22 @@ from dataclasses import dataclass
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
-HEADER_CELL = re.compile(r"([^\[\]]+?)\s*(?:\[([^\[\]]*)\])?")
+HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
 ROLES = {
     "time": re.compile(r"t|time|timestamp|datetime"),
-    "trajectory": re.compile(r"trajectory|trial"),
+    "trajectory": re.compile(r"trajectory|trial|run"),
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
     "input": re.compile(r"u\d*|u_.*|F|(f|forces?|torques?|tau|motor)(\d+|_.*)|forces?|torques?|tau|motor"),
-    "velocity": re.compile(r"v|velocity|.*_dot"),  # left aside: a logged velocity is usually filtered
+    # Left aside: logged velocities and accelerations are usually filtered, and counters of rows are no motion.
+    "rate": re.compile(r"v|v[xyz]|a[xyz]|(vel|velocity|speed|acc|acceleration)(_.*)?|.*_(d?dot|velocity|acceleration)"),
+    "counter": re.compile(r"index|row|sample|frame|unnamed: \d+"),
 }
 AS_SHOWN = {  # roles by their names in the table of columns
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
 }  # fmt: skip
 FORCES = re.compile(r"[kmM]?N([ *·.]?m)?")  # units in which no coordinate is measured
+RATES = re.compile(r".+/ ?(s|ms|min|h)(\^?2|²)?")  # nor in these: m/s, rad/s²
 Names = str | Sequence[str]
 
 
@@ -140,7 +143,8 @@ def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
     """
     key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "q")
-    role = wanted.before(name) or ("input" if role == "q" and FORCES.fullmatch(unit) else role)
+    measured = "input" if FORCES.fullmatch(unit) else "rate" if RATES.fullmatch(unit) else role
+    role = wanted.before(name) or (measured if role == "q" else role)
     taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
     return "dropped" if taken.get(role) is not None else role
 
@@ -159,17 +163,23 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
     names: dict[str, None] = {}
     units = []
     for i, cell in enumerate(cells):
-        match = HEADER_CELL.fullmatch(cell)
-        if match is None or not cell.isprintable():
+        found = name_and_unit(cell if cell or i else "index")  # as pandas writes its rows' numbers
+        if found is None:
             raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
-        name = match[1]
+        name, unit = found
         if name in names:
             raise InputError(f"{where}: the column {quote(name)} comes twice; rename or delete one")
         names[name] = None
-        units.append((match[2] or "").strip())
+        units.append(unit)
     if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")
     return tuple(names), tuple(units)
+
+
+def name_and_unit(cell: str) -> tuple[str, str] | None:
+    """What a cell of a header says, `x[m]` or `x (m)`; None where it is no such cell."""
+    match = HEADER_CELL.fullmatch(cell)
+    return (match[1], (match[2] or match[3] or "").strip()) if match and cell.isprintable() else None
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:

@@ -37,14 +37,16 @@ def read_csv(
 ) -> Trajectories:
     """Read trajectories from a csv file (UTF-8, commas, a decimal point).
 
-    The header's cells are `name` or `name[unit]`. `t`, `time`, `timestamp` or `datetime` is the time; `trajectory` or
-    `trial`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`, `force`, `F`, `torque`,
-    `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs; velocities (`v`, `velocity`,
-    `*_dot`) are left aside; every other column is a coordinate. Times may be dates in ISO 8601: they become seconds
-    since the first row. Lines that start with # and blank lines are skipped, but for `# hold: zero` (or `first`,
-    `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between samples and how late they act,
-    in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`, which make q = scale · (reading − zero) of
-    the coordinates, one after the other (`herglotz.data.sensors`). A coordinate in rad is taken for an angle.
+    The header's cells are `name`, `name[unit]` or `name (unit)`. `t`, `time`, `timestamp` or `datetime` is the time;
+    `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`,
+    `force`, `F`, `torque`, `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs;
+    velocities and accelerations (`v`, `vx`, `velocity`, `*_dot`, `ax`, columns in m/s, rad/s², ...) and counters
+    (`index`, `frame`, `sample`, `row`, a first column without a name) are left aside; every other column is a
+    coordinate. Times may be dates in ISO 8601: they become seconds since the first row. Lines that start with # and
+    blank lines are skipped, but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which
+    say what the inputs do between samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1`
+    and `# scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates, one after the other
+    (`herglotz.data.sensors`). A coordinate in rad is taken for an angle.
 
     Returns
     -------

@@ -94,6 +94,8 @@ def fit(
     >>> run = hz.fit(df, time="t", angles="theta", group="run")
     >>> run = hz.fit([a, b], h=0.01)
     """
+    if not isinstance(config, FitConfig | None):
+        raise InputError(f"config must be a FitConfig, got {type(config).__name__}; times go to time=: fit(q, time=t)")
     reading, changes = split_options(settings)
     config = (config or FitConfig()).changed(changes)
     data = with_waves(as_trajectories(data, **reading), config.frequencies)

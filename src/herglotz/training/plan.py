@@ -118,7 +118,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "objective": "fitted to",
     "network": "network",
     "order": "order of the time step",
-    "features": "terms that were named",
+    "features": "terms of the model",
     "hold": "inputs between samples",
     "delay": "delay of the inputs",
     "lag": "lag of the actuator",

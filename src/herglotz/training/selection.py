@@ -23,7 +23,7 @@ from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
 from herglotz.training.stages import Progress
-from herglotz.training.structure import structure_is_free
+from herglotz.training.structure import structure_is_free, terms_are_free
 
 # Not "full": from positions alone its latent s0 is found at some seeds and missed at others.
 CANDIDATES = tuple(level for level in LEVELS if level != "full")
@@ -203,14 +203,15 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
     """The levels that are compared where none is named.
 
     All but the full one; the forced one alone where forces are told; where inputs are recorded and used, the forced one
-    and "auto", which adds dry friction to it; and "auto" where that is none of these: for several coordinates
-    (`herglotz.training.structure`).
+    and "auto", which adds dry friction to it; and "auto" where `fit` looks for terms or for a structure that no level
+    has (`herglotz.training.structure`).
     """
     if data.u is not None and config.use_inputs and not config.coulomb:
         return ("forced", "auto")
     if config.coulomb or config.coupled or config.input_map:
         return ("forced",)
-    return (*CANDIDATES, "auto") if structure_is_free(data, replace(config, level="auto")) else CANDIDATES
+    left = replace(config, level="auto")
+    return (*CANDIDATES, "auto") if structure_is_free(data, left) or terms_are_free(data, left) else CANDIDATES
 
 
 def block_errors(run: Run) -> Tensor:

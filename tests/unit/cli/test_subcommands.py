@@ -131,7 +131,7 @@ def test_fit_reports_and_says_what_next(tiny_csv, tmp_path, capsys):  # fails if
     assert "extrapolation RMS" in out
     # fails if what the fit found with nothing told stays hidden
     assert "cos(q1)" in next(line for line in out.splitlines() if line.strip().startswith("named terms"))
-    assert f"Next: herglotz verify {folder}" in out
+    assert f"Next: herglotz report {folder}" in out
     assert err.startswith("tiny.csv:\n  column")
     assert "\r" not in err  # no bar where there is no terminal, but a line a stage
     assert re.search(r"^segments of \d+: \d+ iterations?, [\d.]+ s$", err, re.M)
@@ -327,7 +327,7 @@ def test_trust(capsys, tiny_run, tmp_path):  # fails if a number is missing, or 
     assert (tmp_path / "bands.png").stat().st_size > 10_000
 
 
-def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # fails if such numbers pass for results
+def test_commands_warn_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # fails if such numbers pass for results
     shutil.copytree(tiny_run, tmp_path / "run")
     result = load_run(tmp_path / "run")
     result.metrics["verdict"] = "does not fit: it misses 1"
@@ -336,6 +336,8 @@ def test_trust_warns_of_a_run_that_does_not_fit(capsys, tiny_run, tmp_path):  # 
     said = capsys.readouterr().err
     assert "warning: the run does not fit its data" in said
     assert max(map(len, said.splitlines())) <= 80
+    assert main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "a.h")]) == 0
+    assert "warning: the run does not fit its data" in capsys.readouterr().err  # fails if such a file looks like others
     from herglotz.cli.fit import report
 
     report(result, tmp_path / "run", [])

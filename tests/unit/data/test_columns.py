@@ -48,6 +48,30 @@ def test_other_names_stay_coordinates(tmp_path, head):  # fails if a pattern swa
     assert read(tmp_path, f"t,{head}\n0,1\n1,2\n2,3\n").u is None
 
 
+@pytest.mark.parametrize(
+    "head",
+    ["v", "vx", "velocity_x", "x_dot", "x_ddot", "ax", "acc", "gyro[rad/s]", "a[m/s^2]", "b (mm/s²)", "index", "frame",
+     "Unnamed: 0"],
+)  # fmt: skip
+def test_rates_and_counters_are_left_aside(tmp_path, head):
+    # fails if a logged velocity, an acceleration or a number of the row becomes a second coordinate
+    data = read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7]))
+    assert (data.names, data.u) == (("x",), None)
+    assert data.columns[2][1] == "left aside"
+    assert read(tmp_path, "v,t\n1,0\n2,1\n4,2\n", coordinates="v").names == ("v",)
+
+
+def test_headers_of_loggers(tmp_path):
+    # fails if a unit in round brackets hides the time, a name without a blank before them loses a part, or a table
+    # that pandas has written with the numbers of its rows is refused
+    data = read(tmp_path, ",Time (ms),Angle (deg),Run\n0,0,1,a\n1,10,2,a\n2,20,3,a\n")
+    assert (data.names, data.units, data.time_unit, data.degrees) == (("Angle",), ("rad",), "s", ("Angle",))
+    assert [role for _, role, _ in data.columns] == ["left aside", "time", "coordinate", "trajectory"]
+    assert read(tmp_path, "t,x(1),x(2)\n0,1,1\n1,2,1\n2,2,4\n").names == ("x(1)", "x(2)")
+    with pytest.raises(InputError, match="column 2: '' is not a header cell"):
+        read(tmp_path, "t,\n0,1\n1,2\n2,2\n")
+
+
 def test_degrees_and_milliseconds(tmp_path):
     # fails if degrees are fitted as lengths, if an angle is not unwrapped, or if 300 ms are not the float 0.3
     data = read(tmp_path, "t[ms],theta[deg]\n0,170\n100,-175\n300,-160\n")

@@ -109,7 +109,7 @@ def test_the_plan_has_a_box_for_every_reason():
     figure = plot_plan(fake_run(steps=12))
     texts = [text.get_text() for text in figure.axes[0].texts if text.get_text()]
     assert texts == [
-        "level: one damping rate\n(linear)\nterms that were named:\ncos(q1)", TERMS,
+        "level: one damping rate\n(linear)\nterms of the model:\ncos(q1)", TERMS,
         "fitted to: whole\ntrajectories (trajectory)", "the data are noisy",
     ]  # fmt: skip
     with pytest.raises(InputError, match="holds no plan"):

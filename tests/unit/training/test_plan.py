@@ -7,6 +7,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -114,6 +115,12 @@ def test_a_wrong_plan_is_refused_in_words():
         Plan.from_dict({**plan, "colour": "red"})
     with pytest.raises(InputError, match="the plan is incomplete"):
         Plan.from_dict({"level": "linear"})
+
+
+def test_what_is_no_config_is_refused():  # fails if hz.fit(t, q) ends in numpy's words on truth values
+    t = np.arange(10.0)
+    with pytest.raises(InputError, match="config must be a FitConfig, got ndarray; times go to time=: fit"):
+        fit(t, t)  # pyright: ignore[reportArgumentType]
 
 
 def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or of decisions that have no effect
