@@ -94,8 +94,7 @@ class DictionarySearch:
         found = self._braking(found)
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         for _ in range(ADDED):
-            name = self._missing(found)
-            if name is None:
+            if (name := self._missing(found)) is None:
                 break
             more = self._refit(found, self.all.only((*found.terms.names, name)))
             if name == DRY and more is not None and more.pushes:
@@ -109,8 +108,7 @@ class DictionarySearch:
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
-        local = local_polynomials(self.data)
-        if local is None:
+        if (local := local_polynomials(self.data)) is None:
             return None
         start = smoothed(self.data, local)
         found, simpler = self._first(start, local)
@@ -178,7 +176,7 @@ class DictionarySearch:
     def _braking(self, found: Found) -> Found:
         """Without dry friction that pushes: it makes up for another force."""
         less = self._refit(found, replace(found.terms, dry=False)) if found.pushes else None
-        return found if less is None else self._finer(less)
+        return less or found
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""

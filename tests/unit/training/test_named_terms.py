@@ -57,6 +57,38 @@ def test_a_search_begins_with_as_few_samples_as_tell_the_motion(monkeypatch):
     assert found.config.substeps == 1
 
 
+@pytest.mark.parametrize("where", ["joins", "begins"])
+def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
+    # fails if friction that would create energy joins the terms, or stays with those of the linear start
+    data = simulate(scene("duffing"), trajectories=1, steps=200, h=0.1, noise=0.003, seed=0)
+    dry, begin = "friction.coulomb", DictionarySearch._begun
+
+    def begun(self):
+        found = begin(self)
+        if where == "begins":
+            found = self._refit(found, replace(found.terms, dry=True))
+            found = replace(found, values={**found.values, dry: (-1.0,)})
+            assert found.pushes
+        return found
+
+    asked = iter([dry, None, None])
+    refit = DictionarySearch._refit
+
+    def pushed(self, found, terms, *rest, **settings):
+        more = refit(self, found, terms, *rest, **settings)
+        return more if not more.terms.dry else replace(more, values={**more.values, dry: (-1.0,)})
+
+    monkeypatch.setattr(DictionarySearch, "_begun", begun)
+    for last in ("_pruned", "_likeliest", "_last_terms", "_one_rate"):  # which may leave the term out as well
+        monkeypatch.setattr(DictionarySearch, last, lambda _self, found: found)
+    if where == "joins":
+        monkeypatch.setattr(DictionarySearch, "_missing", lambda _self, _found: next(asked))
+        monkeypatch.setattr(DictionarySearch, "_refit", pushed)
+    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
+    assert found is not None
+    assert not found.terms.dry
+
+
 @pytest.mark.parametrize(
     ("rms", "length", "taken"), [(1.0, 300, True), (1.02, 300, True), (1.1, 300, False), (1.0, 150, False)]
 )
