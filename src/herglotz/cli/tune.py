@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, seed
+from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -123,15 +123,15 @@ def _report(found: Tuning, out: Path) -> None:
     if found.own_in_c is not None:
         less += f", {found.own_in_c.us / c.us:.3g} times faster than the unchanged run in C"
     print(f"Chosen: {c.setting.name}: {c.us:.3g} {time_label(found.run)}")
-    print(f"  {less}")
-    print(
+    say(f"  {less}")
+    say(
         f"  over T = {found.horizon:g}, {100 * held['share_within']:.1f} % of {held['starts']} other starts within "
         f"{held['limit']:.3g}; median {held['median']:.2g}, worst {held['worst']:.2g}"
     )
     known = {k: v for k, v in found.model_error.items() if v is not None}
-    print("  the model itself, against its data: " + ", ".join(f"{k} {v:.2g}" for k, v in known.items()))
+    say("  the model itself, against its data: " + ", ".join(f"{k} {v:.2g}" for k, v in known.items()))
     for note in found.notes:
-        print(f"  {note}")
+        say(f"  {note}")
     print(f"Figure: {out / 'tuned.png'}")
     if c.kicks is not None:
         print(f"Next: herglotz export {out} --format c --out kicks.h (the {c.setting.kicks} kicks)")

@@ -7,8 +7,9 @@ import json
 import tokenize
 import zipfile
 import zlib
+from contextlib import suppress
 from pathlib import Path
-from typing import TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 import torch
@@ -149,10 +150,9 @@ def _labels(path: Path, metadata: np.ndarray | None) -> dict:
     """Return the labels that the metadata have, with the types that `Trajectories` wants."""
     if metadata is None:
         return {}
-    try:
+    labels: Any = None
+    with suppress(ValueError, RecursionError):
         labels = json.loads(str(metadata))
-    except (ValueError, RecursionError):
-        labels = None
     check_entries(Metadata, labels, f"{path}: 'metadata' (a JSON object)", "write it again or drop it")
     known = {name: labels[name] for name in LABELS if name in labels}
     return {**known, "columns": tuple(map(tuple, known.get("columns", [])))}

@@ -169,17 +169,17 @@ class Tuning:
         }
 
     def table(self) -> str:
-        """The front, the run as it is and the choice (*), for people."""
+        """The front, the run as it is and the choice (*), for people, in 80 columns."""
         per, share = time_label(self.run), f"{100 * self.config.quantile:g} %"
         shown = self.front
         shown += [c for c in (self.own, self.chosen) if c not in shown]
         width = max(len(c.setting.name) for c in shown)
-        lines = [f"  {'setting':<{width}}  {'median':>8}  {share:>8}  {'worst':>8}  {per:>8}  {'±':>7}  {'µs/step':>8}"]
+        lines = [f"  {'setting':<{width}}{'median':>9}{share:>9}{'worst':>9}{per:>9}{'±':>9}"]
         for c in sorted(shown, key=lambda c: c.us):
             mark = "*" if c is self.chosen else " "
             lines.append(
-                f"{mark} {c.setting.name:<{width}}  {c.median:>8.2g}  {c.bound:>8.2g}  {c.worst:>8.2g}  "
-                f"{c.us:>8.3g}  {c.spread:>7.2g}  {c.cost.step_us:>8.3g}"
+                f"{mark} {c.setting.name:<{width}}{c.median:>9.2g}{c.bound:>9.2g}{c.worst:>9.2g}"
+                f"{c.us:>9.3g}{c.spread:>9.2g}"
             )
         return "\n".join(lines)
 

@@ -72,8 +72,8 @@ def test_the_factor_of_an_exported_file(model):
 def test_what_is_not_finite_is_the_loss_of_one_sample(level, files):
     # fails if a file refuses a batch of which the eager stepper loses one sample, or loses another, or with another
     # status; s = NaN moves nothing at the conservative level
-    driven = {"inputs": 1} if level == "forced" else {}
-    model = ContactLagrangian(ModelConfig(level=level, **driven))
+    driven = int(level == "forced")
+    model = ContactLagrangian(ModelConfig(level=level, inputs=driven))
     named = steppers(model) + ([load_exported(files("onnx"))] if level == "linear" else [])
     fine = [torch.full((3, 1), 0.3).double(), torch.full((3, 1), 0.2).double(), torch.full((3,), 0.1).double()]
     for stepper, k, value in itertools.product(named, range(4 if driven else 3), (float("nan"), float("inf"))):

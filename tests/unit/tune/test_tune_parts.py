@@ -205,6 +205,7 @@ def test_the_run_as_it_is_costs_no_error():
     assert found.chosen is found.own
     assert found.candidates[1].median > 1e-4  # twice the step, the same model: the rule's error
     assert found.held_out["share_within"] == 1.0
+    assert max(map(len, found.table().splitlines())) <= 80  # fails if the table does not fit a terminal as it opens
 
 
 def test_tuned_run_holds_the_chosen_step(tmp_path):
