@@ -66,7 +66,9 @@ def size(value: float, unit: str, degrees: bool = False, digits: int = 3) -> str
 
 
 def span(ends: Sequence[float], unit: str = "", degrees: bool = False) -> str:
-    """A range in words: `-0.5 to 0.5 rad = -28.6 to 28.6 deg` where it was recorded in degrees."""
+    """A range in words: `-1 to 1 rad = -57.3 to 57.3 deg` where it was recorded in degrees, `0.1 s` without width."""
     low, high = ends
+    if f"{low:.3g}" == f"{high:.3g}":
+        return size(high, unit, degrees)
     also = f" = {math.degrees(low):.3g} to {math.degrees(high):.3g} deg" if degrees and unit == "rad" else ""
     return f"{low:.3g} to {size(high, unit)}{also}"

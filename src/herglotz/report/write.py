@@ -13,7 +13,7 @@ from herglotz.data import Trajectories
 from herglotz.data.checks import Labels
 from herglotz.data.column_table import column_rows
 from herglotz.data.files import write_atomically
-from herglotz.data.units import as_recorded, common_unit, size
+from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
 from herglotz.plots.motion import plot_prediction
@@ -145,7 +145,7 @@ def _data(run: Run) -> tuple[Block, ...]:
     precision = m.get("precision")
     rows = [
         ("recording", as_recorded(data)[0].summary()),
-        ("steps", f"{float(h.min()):.4g} to {float(h.max()):.4g} {data.time_unit}, median {data.typical_step:.4g}"),
+        ("steps", f"{span((float(h.min()), float(h.max())), data.time_unit)}, median {data.typical_step:.4g}"),
         ("precision, found in the data", "not found" if precision is None else size(precision, unit, degrees)),
         ("range that was trained on", range_in_words(run.box, data) or "not known"),
         ("gross errors left out", f"{m.get('outliers', 0)} in training, {m.get('outliers_unseen', 0)} beyond"),

@@ -101,8 +101,8 @@ def other_steps(times: Tensor, h_range: tuple[float, float], time_unit: str) -> 
     (low, high), steps = h_range, times.diff()
     if low * (1 - HAIR) <= float(steps.min()) and float(steps.max()) <= high * (1 + HAIR):
         return ""
-    mean = f"steps of {float(steps.mean()):g} {time_unit}"
-    return f"{mean} are outside of {low:g} to {high:g}, those that the model was fitted to"
+    mean = f"steps of {size(float(steps.mean()), time_unit, digits=6)}"
+    return f"{mean} are outside of those that the model was fitted to, {span(h_range, time_unit)}"
 
 
 def range_in_words(box: Mapping[str, Sequence[float]], like: Trajectories) -> str:

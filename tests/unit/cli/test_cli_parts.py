@@ -60,7 +60,7 @@ def test_whole_numbers():  # fails if `none` is a number, or a slip a traceback
 def test_steps_beyond_those_of_the_fit_are_told(step, said, capsys):  # fails if a step at the end of the range is
     source = SimpleNamespace(h_range=(0.1, 0.2), time_unit="s")
     rollout._warn(source, step * torch.arange(4, dtype=torch.float64), None, [])  # type: ignore[arg-type]
-    assert ("are outside of 0.1 to 0.2" in capsys.readouterr().err) is said
+    assert ("fitted to, 0.1 to 0.2 s" in " ".join(capsys.readouterr().err.split())) is said
 
 
 def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothing of its coordinates is not stepped

@@ -82,7 +82,7 @@ def test_the_file_holds_a_model_card(tiny_onnx, tiny_run):
     run = load_run(tiny_run)
     assert card.startswith("Model of tiny.csv (sha256 ")
     assert run.summary() in card
-    assert f"For steps of {run.h:g} to {run.h:g} s, and positions theta " in card
+    assert f"For steps of {run.h:g} s, and positions theta " in card
 
 
 def test_rollout_of_the_file_is_that_of_the_run(tiny_onnx, tiny_run, tmp_path):
@@ -103,7 +103,7 @@ def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     own = f"{load_run(tiny_run).h:g}"
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--h", "0.05"]) == 0
-        note = f"note: steps of 0.05 s are outside of {own} to {own}, those that the model was fitted to"
+        note = f"note: steps of 0.05 s are outside of those that the model was fitted to, {own} s"
         assert note in " ".join(capsys.readouterr().err.split())
     assert main(["export", str(tiny_run), "--format", "c", "--out", out, "--h-range", "0.05", own, "--force"]) == 0
     assert main(["rollout", out, *motion, "--h", "0.05", "--q0", "0.1", "--p0", "0"]) == 0

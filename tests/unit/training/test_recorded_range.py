@@ -6,6 +6,7 @@ from dataclasses import replace
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.data.units import span
 from herglotz.training.recorded_range import farthest, quantities_outside, range_in_words, warning
 
 BOX = {"q_low": [-1.0, 2.0], "q_high": [1.0, 4.0], "p_low": [-3.0, -1.0], "p_high": [3.0, 1.0]}
@@ -59,6 +60,14 @@ def test_of_several_motions_the_farthest_is_told():
 
 def test_the_recorded_range_in_words():  # fails if low and high, or the unit, are lost
     assert range_in_words(BOX, LIKE) == "x -1 to 1 m, its momentum -3 to 3; phi 2 to 4 rad, its momentum -1 to 1"
+
+
+def test_a_range_without_width_is_one_number():  # fails if steps are "0.05 to 0.05 s"
+    assert (span((0.05, 0.05 + 1e-9), "s"), span((-1.0, 2.0), "m"), span((0.1, 0.2))) == (
+        "0.05 s",
+        "-1 to 2 m",
+        "0.1 to 0.2",
+    )
 
 
 def test_what_was_recorded_in_degrees_is_told_in_degrees():
