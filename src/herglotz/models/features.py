@@ -97,7 +97,7 @@ def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
     which = [i for i, angle in enumerate(angles, 1) if angle]
     numbers = product(range(-highest, highest + 1), repeat=len(which))
     forms = [_form(k, which) for k in numbers if 0 < sum(map(abs, k)) <= total and k > (0,) * len(k)]
-    own = [f"1q{i}" for i in which]  # the baseline's
+    own = [f"q{i}" for i in which]  # the baseline's
     pairs = [f"v{i} v{j}" for i, j in combinations_with_replacement(range(1, len(angles) + 1), 2)]
     waves = [f"{f}({form})" for form in forms for f in ("cos", "sin")]
     alone = [f"{f}({form})" for form in forms if form not in own for f in ("cos", "sin")]
@@ -106,7 +106,8 @@ def _waves(angles: Sequence[bool], highest: int, total: int) -> list[str]:
 
 def _form(k: Sequence[int], which: Sequence[int]) -> str:
     """k·q as text, of the coordinates `which`."""
-    return " + ".join(f"{x}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- ")
+    numbers = {1: "", -1: "-"}
+    return " + ".join(f"{numbers.get(x, x)}q{i}" for x, i in zip(k, which, strict=True) if x).replace("+ -", "- ")
 
 
 LIBRARIES: dict[str, Callable[..., list[str]]] = {
