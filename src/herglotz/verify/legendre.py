@@ -55,6 +55,7 @@ def momentum_matching(subject: Subject, w: SampledRollout, bound: float) -> Chec
     both = w.ok[:, :-1] & w.ok[:, 1:]
     size = w.q.abs().amax() + (w.q[:, 1:] - w.q[:, :-1]).abs().amax()
     if subject.L_d is None:
+        statement = "momenta match: |J⁻¹R|/|q|"  # with the mark of its note the row fits a terminal
         note = "no L_d in the file: its derivatives are taken from those of the map"
         D1, D2, Y_p = _from_map(w)
         R = D1[:, 1:] + w.c[:, 1:, None] * D2[:, :-1]

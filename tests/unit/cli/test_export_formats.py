@@ -141,7 +141,10 @@ def test_verify_finds_the_run(tiny_onnx, tiny_run, tmp_path, monkeypatch, capsys
     assert ": NOT verified" in capsys.readouterr().out  # fails if the rows alone make the headline
     shutil.copytree(tiny_run, tmp_path / "runs" / "two")
     assert main(few) == 0
-    assert "beside runs/two, 1000 steps" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "beside runs/two, 1000 steps" in out
+    rows = [line for line in out.splitlines() if str(tiny_onnx) not in line]
+    assert max(map(len, rows)) <= 80  # fails if a row of a file's table is too wide for a terminal as it opens
 
 
 @pytest.mark.parametrize(("form", "name"), [("onnx", "a.pt2"), ("pt2", "a.onnx"), ("aoti", "a.h"), ("c", "a.pt2")])
