@@ -67,6 +67,7 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
         found = begin(self)
         if where == "begins":
             found = self._refit(found, replace(found.terms, dry=True))
+            assert found is not None
             found = replace(found, values={**found.values, dry: (-1.0,)})
             assert found.pushes
         return found
@@ -76,6 +77,7 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
 
     def pushed(self, found, terms, *rest, **settings):
         more = refit(self, found, terms, *rest, **settings)
+        assert more is not None
         return more if not more.terms.dry else replace(more, values={**more.values, dry: (-1.0,)})
 
     monkeypatch.setattr(DictionarySearch, "_begun", begun)

@@ -122,6 +122,7 @@ def test_a_start_is_that_of_the_recording_though_a_force_is_missing():
     start = problem.states(data.q[:1], (data.q[1:2] - data.q[:1]) / 0.05)
     result = levenberg_marquardt(problem, problem.pack(problem.parameters.get(), start), max_iterations=40)
     path = problem.solve(result.x)
+    assert path is not None
     assert float(problem.misfit(path).square().mean().sqrt()) > 0.02
     assert abs(float(path.x[0, 0, 0] - data.q[0, 0])) < 1e-3
 
