@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.mechanics import legendre_minus, mixed_hessian, partials
+from herglotz.mechanics import legendre_minus, partials
 from herglotz.models import ContactLagrangian
 from herglotz.training.distributed import everywhere, of_first
 from herglotz.training.problems.grid import SegmentGrid
@@ -61,7 +61,7 @@ class SmoothingProblem(StatesProblem):
         # What a force that the model does not know adds to v and p in a step, to q by the way, and to s.
         v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
         s = (self.sigma * v.new_tensor([self.action]) / self.scale.max()).expand(*grid.h.shape, 1)
-        self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * v, self._masses() * v, s], -1)[..., :d]  # (S, K, d)
+        self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * v, self.mass * v, s], -1)[..., :d]  # (S, K, d)
         self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
 
     def start(self) -> Tensor:
@@ -86,15 +86,6 @@ class SmoothingProblem(StatesProblem):
         held = p.gather(1, last[..., None].expand(-1, -1, n)).expand(-1, K + 1, -1)
         x[..., n : 2 * n] = torch.where(after[..., None], held, x[..., n : 2 * n])
         return torch.cat([theta, x.flatten()])
-
-    def _masses(self) -> Tensor:
-        """Mass of each coordinate at the start, (n,): RMS of h times the diagonal of the mixed Hessian."""
-        theta, states = self.unpack(self.start())
-        q, h = states[..., : self.n], self.grid.h
-        with torch.no_grad():
-            M = mixed_hessian(partials(self.parameters.at(theta, self.u), q[:, :-1], q[:, 1:], 0 * h, h, 2))
-        own = h[..., None] * M.diagonal(0, -2, -1)
-        return own[self.inside[:, 1:, 0] > 0].square().mean(0).sqrt()
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Parameters (P,) and states (S, M, d)."""
