@@ -103,7 +103,7 @@ class DictionarySearch:
             if name == DRY and more is not None and more.pushes:
                 self.all = replace(self.all, dry=False)
                 continue
-            if more is None or not self._joins(more, found):
+            if more is None or not found.joined_by(more, self.floor):
                 break
             found = self._finer(self._held(self._longer(more)))
         found = self._last_terms(self._likeliest(self._pruned(found)))
@@ -277,12 +277,6 @@ class DictionarySearch:
                 absent[problem.parameters.index(shape)] = True
         best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(self.data.q.numel()))
         return None if best is None else next(name for name in names if int(others[best]) in at[name])
-
-    def _joins(self, more: Found, found: Found) -> bool:
-        """Whether one more term is kept: the criterion that proposed it takes residuals for white noise."""
-        white = not (found.coloured and more.coloured)
-        halved = more.rms < found.rms / 2**0.5  # squared; blocks of time are foretold to first order alone
-        return more.rms < found.rms and (white or halved or found.beaten_by(more, self.floor))
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""

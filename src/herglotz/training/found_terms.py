@@ -98,6 +98,12 @@ class Found:
         own, its = (float(f.held_out.clamp_min(floor).square().mean().sqrt()) for f in (self, other))
         return not own <= MARGIN * its
 
+    def joined_by(self, more: Found, floor: float) -> bool:
+        """Whether one more term is kept: the criterion that proposed it takes residuals for white noise."""
+        white = not (self.coloured and more.coloured)
+        halved = more.rms < self.rms / 2**0.5  # squared; blocks of time are foretold to first order alone
+        return more.rms < self.rms and (white or halved or self.beaten_by(more, floor))
+
     def as_good(self, other: Found, floor: float) -> bool:
         """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""
         return self.rms <= 2**0.5 * max(other.rms, floor) and not self.beaten_by(other, floor)

@@ -339,10 +339,10 @@ def test_lines_of_an_equation_break_between_terms():  # fails if a number stands
 )  # fmt: skip
 def test_a_term_joins_where_it_halves_the_misfit(rms, coloured, beaten, joins):
     # fails if blocks of time, which are foretold to first order, turn away a term that takes half of the squared misfit
-    search: Any = object.__new__(DictionarySearch)
-    search.floor = 0.0
-    found: Any = SimpleNamespace(rms=1.0, coloured=True, beaten_by=lambda *_: beaten)
-    assert search._joins(SimpleNamespace(rms=rms, coloured=coloured), found) is joins
+    found, more = (
+        SimpleNamespace(rms=x, coloured=c, beaten_by=lambda *_: beaten) for x, c in ((1, True), (rms, coloured))
+    )
+    assert Found.joined_by(found, more, 0.0) is joins  # pyright: ignore
 
 
 def test_a_constant_force_is_the_zero_of_an_input():
