@@ -19,6 +19,7 @@ from herglotz.training import FitConfig, Plan, fit, laplace
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
+from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _equation
 from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import linear_starts
@@ -80,8 +81,9 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
         return more if not more.terms.dry else replace(more, values={**more.values, dry: (-1.0,)})
 
     monkeypatch.setattr(DictionarySearch, "_begun", begun)
-    for last in ("_pruned", "_likeliest", "_last_terms", "_one_rate"):  # which may leave the term out as well
+    for last in ("_pruned", "_likeliest", "_last_terms"):  # which may leave the term out as well
         monkeypatch.setattr(DictionarySearch, last, lambda _self, found: found)
+    monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
     if where == "joins":
         monkeypatch.setattr(DictionarySearch, "_missing", lambda _self, _found: next(asked))
         monkeypatch.setattr(DictionarySearch, "_refit", pushed)
