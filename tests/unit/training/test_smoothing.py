@@ -113,6 +113,16 @@ def test_the_unit_of_one_coordinate_decides_nothing():
     assert float((found - truth)[:, 1].square().mean().sqrt()) < 0.5 * NOISE * 1e3
 
 
+def test_joints_of_segments_weigh_momenta_by_their_mass():
+    # fails if a joint between two segments may be off by a velocity where the unknown is a momentum
+    weights = []
+    for unit in (1.0, 1e3):
+        model, data, _ = _two_springs(unit)
+        weights.append(ShootingProblem(model, data, segment_grid(data, 10, 0.3), sigma=NOISE).joint_weight)
+    expected = torch.tensor([1.0, 1.0, 1.0, 1e-6], dtype=torch.float64)  # the noise is in one unit, the mass is not
+    torch.testing.assert_close(weights[1] / weights[0], expected, rtol=1e-6, atol=0)
+
+
 def _held_axis(seed):
     """An axis with a motor that dry friction holds at times, and noisy positions at every 16th of its steps."""
     sizes = {"scale": (1.0,), "speed": (1.0,), "stiffness": (0.0,)}
