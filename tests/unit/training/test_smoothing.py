@@ -90,10 +90,12 @@ def test_a_push_is_followed_with_process_noise():
 
 def _two_springs(unit):
     """Two masses on springs with the second position in another unit, and noisy positions of their motion."""
-    sizes = {"scale": (1.0, unit), "speed": (1.0, unit), "stiffness": (1.0, 2.0 / unit**2), "tilt": (0.0, 0.0)}
     model = ContactLagrangian(
-        ModelConfig(angles=(False, False), diagonal=True, level="linear", rate=0.1, potential_width=0, **sizes)
-    )
+        ModelConfig(
+            angles=(False, False), diagonal=True, level="linear", rate=0.1, potential_width=0, scale=(1.0, unit),
+            speed=(1.0, unit), stiffness=(1.0, 2.0 / unit**2), tilt=(0.0, 0.0),
+        )
+    )  # fmt: skip
     torch.nn.init.constant_(model.get_parameter("kinetic.log_diagonal"), -math.log(unit))
     start = torch.tensor([[0.8, -0.5 * unit]], dtype=torch.float64)
     with torch.no_grad():
@@ -125,10 +127,12 @@ def test_joints_of_segments_weigh_momenta_by_their_mass():
 
 def _held_axis(seed):
     """An axis with a motor that dry friction holds at times, and noisy positions at every 16th of its steps."""
-    sizes = {"scale": (1.0,), "speed": (1.0,), "stiffness": (0.0,)}
     model = ContactLagrangian(
-        ModelConfig(level="forced", rate=0.2, potential_width=0, coulomb=True, sticking=True, inputs=1, **sizes)
-    )
+        ModelConfig(
+            level="forced", rate=0.2, potential_width=0, coulomb=True, sticking=True, inputs=1, stiffness=(0.0,),
+            scale=(1.0,), speed=(1.0,),
+        )
+    )  # fmt: skip
     assert model.friction is not None
     torch.nn.init.constant_(model.friction.coulomb, 0.25)
     torch.nn.init.constant_(model.friction.input_map, 0.5)
