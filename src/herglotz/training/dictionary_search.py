@@ -24,7 +24,8 @@ from herglotz.data.roughness import coarse, precision
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.found_terms import Found
+from herglotz.training.fewer_numbers import FewerNumbers
+from herglotz.training.found_terms import Found, gain
 from herglotz.training.linear_terms import LinearStart, linear_starts
 from herglotz.training.named_terms import (
     DRY,
@@ -52,12 +53,13 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-LIKELIER = 1.0  # log-likelihood that halved steps may cost: parameters that fit longer ones are wrong elsewhere
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
 ROUNDING = 3.0  # times the σ of exact data: smaller misfits and changes are no reason for a term or a step
 FINE = 0.1  # of the misfit that is rounding: steps of exact data that change the motion by less do not show in it
+EXCESS, EXCESS_START = "friction.breakaway", 0.1  # of Coulomb's force: where a fit of Stribeck's excess starts
+SHAPES = 3  # numbers that smooth dry friction has beside Coulomb's force: its width, Stribeck's excess and its width
 SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of order 4
 
 
@@ -93,6 +95,7 @@ class DictionarySearch:
             return None
         found = self._braking(found)
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
+        self.all = replace(self.all, apart=found.terms.apart)
         for _ in range(ADDED):
             if (name := self._missing(found)) is None:
                 break
@@ -100,11 +103,11 @@ class DictionarySearch:
             if name == DRY and more is not None and more.pushes:
                 self.all = replace(self.all, dry=False)
                 continue
-            white = more is not None and not (found.coloured and more.coloured)  # what the criterion takes for granted
-            if more is None or not more.rms < found.rms or not (white or found.beaten_by(more, self.floor)):
+            if more is None or not found.joined_by(more, self.floor):
                 break
             found = self._finer(self._held(self._longer(more)))
-        return self._one_rate(self._last_terms(self._likeliest(self._pruned(found))))
+        found = self._last_terms(self._likeliest(self._pruned(found)))
+        return FewerNumbers(self.data, self.floor, self.order, self._refit, self._problem).of(found)
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
@@ -126,7 +129,7 @@ class DictionarySearch:
         bare = self._grown(*self._bare(), 1, start) if self.coarse and self.data.dof == 1 else None
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
-        families = (self.all, *(self.all.only(family.names) for family in chains(self.data)))
+        families = (self.all, *(replace(self.all.only(x.names), apart=x.apart) for x in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         if bare is None and self._misled(found):
@@ -179,11 +182,22 @@ class DictionarySearch:
         return less or found
 
     def _held(self, found: Found) -> Found:
-        """With dry friction that can hold a joint still, where that meets the data better than smooth friction."""
+        """With dry friction that can hold a joint still, unless smooth friction is worth its widths and its excess."""
         if not found.terms.dry or found.pushes or found.config.sticking or self.config.sticking is False:
             return found
-        other = self._refit(replace(found, config=replace(found.config, sticking=True)), found.terms)
-        return found if other is None or not other.rms < found.rms else self._longer(other)
+        count, plain = self.data.q.numel(), self._sticking(found, 0.0)
+        worth = self.data.dof * math.log(count) / 2  # of one number for each coordinate
+        noise = self.precision if math.isfinite(self.precision) else 0.0  # what smooth friction gains below it is noise
+        if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > noise):
+            return found
+        held = self._sticking(plain, max(plain.values[DRY]) * EXCESS_START)
+        shaped = 0.0 if held is None else gain(plain.rms, held.rms, count, self.floor)
+        return self._longer(held if held is not None and shaped > (SHAPES - 1) * worth else plain)
+
+    def _sticking(self, found: Found, excess: float) -> Found | None:
+        """The fit with set-valued friction, from this excess at breakaway; at 0 there is none."""
+        values, config = {**found.values, EXCESS: (excess,) * self.data.dof}, replace(found.config, sticking=True)
+        return self._refit(replace(found, values=values, config=config), found.terms)
 
     def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
@@ -191,7 +205,7 @@ class DictionarySearch:
         base = started(self.base, self.data, values, config)
         task = Task(self.data, base, config, Stages(False, None, "", resume=False))
         model = build_model(base, config, "none")
-        return SegmentStages(task, with_sticking(model) if config.sticking else model)
+        return SegmentStages(task, with_sticking(model, excess=EXCESS not in values) if config.sticking else model)
 
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
@@ -285,9 +299,9 @@ class DictionarySearch:
 
     def _preferred(self, other: Found, found: Found) -> bool:
         """Whether the criterion of `subsets` prefers the other terms."""
-        count = self.data.q.numel()
-        price, its = (price_of(len(f.terms.names), len(self.all.names), math.log(count)) for f in (found, other))
-        return count * math.log(max(found.rms, self.floor) / max(other.rms, self.floor)) > its - price
+        log = math.log(self.data.q.numel())
+        price, its = (price_of(len(f.terms.names), len(self.all.names), log) for f in (found, other))
+        return gain(found.rms, other.rms, self.data.q.numel(), self.floor) > its - price
 
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""
@@ -298,7 +312,7 @@ class DictionarySearch:
             if less is None or less.rms > (1 + worth / count) ** 0.5 * max(found.rms, self.floor):
                 continue  # far from the minimum it costs more
             less = self._finer(less)
-            if self._as_good(less, found):
+            if less.as_good(found, self.floor):
                 return less
         return found
 
@@ -308,33 +322,19 @@ class DictionarySearch:
             terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
             less = None if terms == found.terms else self._refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
-            if less is None or not self._as_good(less, found):
+            if less is None or not less.as_good(found, self.floor):
                 break
             found = less
         return found
 
-    def _one_rate(self, found: Found) -> Found:
-        """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""
-        terms, count = found.terms, self.data.q.numel()
-        if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
-            return found
-        less = self._refit(found, replace(terms, one_rate=True))
-        if less is None:
-            return found
-        fewer = (len(found.fit.theta) - len(less.fit.theta)) * math.log(count) / count
-        likely = less.rms <= (1 + fewer) ** 0.5 * max(found.rms, self.floor)
-        return less if likely or (found.coloured and self._as_good(less, found)) else found
-
-    def _as_good(self, less: Found, found: Found) -> bool:
-        """Whether fewer terms miss held-out blocks by as little, and all data by less than √2 times as much."""
-        return less.rms <= 2**0.5 * max(found.rms, self.floor) and not less.beaten_by(found, self.floor)
-
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
-            other = self._refit(found, found.terms, 2 * found.config.substeps)
-            count = self.data.q.numel()  # likelihoods of as many parameters compare as they are
-            if other is None or not count * math.log(found.rms / max(other.rms, FINE * self.floor)) > -LIKELIER:
+            finer = (self._refit(found, found.terms, m) for m in (2 * found.config.substeps, 4 * found.config.substeps))
+            count = self.data.q.numel()
+            lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
+            other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
+            if other is None:
                 self.in_vain = found.config.substeps, found.rms
                 break  # the terms make up for the longer steps
             found = self._longer(other)

@@ -31,9 +31,9 @@ from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
 from herglotz.training.problems.prior import NETWORKS, prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import inverse_of
 from herglotz.training.structure import MOST
 from herglotz.training.task import Task, build_model, with_sticking
-from herglotz.training.uncertainty import inverse_of
 
 UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless; as `LOST` of the verdict
 TURNS = 2.0  # a turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation
@@ -184,7 +184,7 @@ def _with_absent_terms(
     full = replace(settings_of(every, data, c, c.order, c.substeps), sticking=c.sticking)
     base = started(task.base, data, values, full)
     more = build_model(base, full, "none")
-    more = with_sticking(more) if full.sticking else more
+    more = with_sticking(more, excess=False) if full.sticking else more
     at = places(ParameterVector(more), every)
     return more, base, {name: where for name, where in at.items() if name not in own.names}
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -16,10 +16,15 @@ from herglotz.training.cross_validation import MARGIN
 from herglotz.training.named_terms import DRY, NamedTerms, places
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.pruning import prune
+from herglotz.training.pruning import inverse_of, prune
 from herglotz.training.trajectory_fit import TrajectoryFit
 
 COLOURED = 3.0  # standard deviations of white noise's autocorrelation
+
+
+def gain(rms: float, other: float, count: int, floor: float) -> float:
+    """By how much the other misfit of so many numbers is likelier, in log-likelihood; below `floor` all are alike."""
+    return count * math.log(max(rms, floor) / max(other, floor))
 
 
 @dataclass(frozen=True)
@@ -75,18 +80,39 @@ class Found:
         stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, late)[0].tolist())
         return self.terms.only([name for name, own in at.items() if stay & set(own)])
 
+    def cost_without(self, names: Sequence[str], floor: float) -> float:
+        """Twice what the absence of these parameters costs by the quadratic model of the fit."""
+        problem, x = (
+            self.fit.problem,
+            self.fit.problem.pack(self.fit.theta, self.fit.path.x[:, 0, : self.fit.problem.d]),
+        )
+        at = torch.cat([problem.parameters.index(name) for name in names])
+        _, A, _ = problem.normal_equations(x)
+        own = inverse_of(A.double())[at][:, at]
+        cost = x[at].double() @ torch.linalg.pinv(own, hermitian=True) @ x[at].double()
+        return float(cost) * (problem.sigma / max(self.rms, floor)) ** 2
+
     def beaten_by(self, other: Found, floor: float) -> bool:
         """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding."""
         # their spread has no say: it is wide where errors grow with time, as on an axis without a spring
         own, its = (float(f.held_out.clamp_min(floor).square().mean().sqrt()) for f in (self, other))
         return not own <= MARGIN * its
 
+    def joined_by(self, more: Found, floor: float) -> bool:
+        """Whether one more term is kept: the criterion that proposed it takes residuals for white noise."""
+        white = not (self.coloured and more.coloured)
+        halved = more.rms < self.rms / 2**0.5  # squared; blocks of time are foretold to first order alone
+        return more.rms < self.rms and (white or halved or self.beaten_by(more, floor))
+
+    def as_good(self, other: Found, floor: float) -> bool:
+        """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""
+        return self.rms <= 2**0.5 * max(other.rms, floor) and not self.beaten_by(other, floor)
+
     def as_likely(self, other: Found, floor: float) -> bool:
         """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
         count, fewer = self.fit.problem.data.q.numel(), len(other.terms.names) - len(self.terms.names)
-        missed = max(self.rms, floor) / max(other.rms, floor)
         longer = self.fit.problem.grid.length >= other.fit.problem.grid.length
-        return longer and count * math.log(missed) < fewer * math.log(count) / 2
+        return longer and gain(self.rms, other.rms, count, floor) < fewer * math.log(count) / 2
 
     def changed_by(self, problem: ShootingProblem) -> float:
         """RMS change of the fitted motion by the steps of another problem with the same terms and segments."""

@@ -121,7 +121,7 @@ class LinearTerms:
         size = r.square().mean().clamp_min((1e-9 * float((X * x[columns][1:]).abs().max())) ** 2 + 1e-300)
         place = self._linear_places(columns)
         free = torch.tensor([i for own in place.values() for i in own])
-        simplest = torch.tensor([i for name in self.own for i in place[name]], dtype=torch.long)
+        simplest = torch.tensor([i for name in self.own for i in place.get(name, ())], dtype=torch.long)
         worth = math.log(max(3, int(r.numel() / overlap)))
         kept, less = prune(X.T @ X / size / overlap, x[columns][1:], free, worth, simplest=simplest)
         stay = set(kept.tolist())
@@ -150,9 +150,9 @@ class LinearTerms:
         return [x for x in self.all.features if "v" in x]
 
     def _columns(self, of: NamedTerms) -> Tensor:
-        """Columns of a family, and all masses, springs and friction of joints; no mass or friction between lengths."""
+        """Columns of a family, and all masses, springs and friction of joints; none between lengths, or `apart`."""
         i, j = pairs(self.data.dof, torch.device("cpu"))
-        joints = any(self.data.angles)
+        joints = any(self.data.angles) and not of.apart
         diagonal = iter((i == j).tolist())
         order = {STILL: iter(self._still), MOVING: iter(self._moving), DRAG: iter(self.all.drag)}
 

@@ -158,15 +158,15 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
 def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) -> _Terms:
     """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
     kept, base, settings, stages = task.data, task.base, task.config, task.stages
-    terms, larger = _Terms(settings, base), False
+    terms = _Terms(settings, base)
     if structure_is_free(kept, user_settings):
         of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)
-        terms, larger = _Terms(of.config, of.base, of.reason), of.larger
+        terms = _Terms(of.config, of.base, of.reason)
     elif settings.features:
         terms = _Terms(settings, start_of_features(kept, base, settings))
     terms = replace(terms, motion=_baseline_motion(replace(task, base=terms.base, config=terms.settings)))
     exact = bool(terms.settings.features) and terms.settings.objective == "residual"
-    if not named or (exact and larger) or not terms_are_free(kept, user_settings):
+    if not named or not terms_are_free(kept, user_settings):
         return terms
     return _searched(task, user_settings, terms, outliers, exact)
 

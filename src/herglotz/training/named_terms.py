@@ -22,6 +22,7 @@ WAVES = 3  # highest harmonic of one angle
 NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
 DRY = "friction.coulomb"
+CONSTANT = "q1"  # the potential of a constant force on a length
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class NamedTerms:
     dry: bool = False
     one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
     springs: bool = True  # the baseline's own of every coordinate; translations leave them out
+    apart: bool = False  # joints have no constant mass and no viscous friction between them
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -46,10 +48,8 @@ class NamedTerms:
 
     def only(self, names: Sequence[str]) -> NamedTerms:
         """Those of them that are among `names`."""
-        return NamedTerms(
-            tuple(x for x in self.features if x in names), tuple(x for x in self.drag if x in names),
-            self.dry and DRY in names, self.one_rate, self.springs,
-        )  # fmt: skip
+        features, drag = (tuple(x for x in own if x in names) for own in (self.features, self.drag))
+        return replace(self, features=features, drag=drag, dry=self.dry and DRY in names)
 
 
 def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTerms:
@@ -58,15 +58,21 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
     if len(angles) == 1:
-        waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
-        powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
-        features = [*own_terms(angles), *(waves if angles[0] else powers)]
+        features = _of_one(data)
     elif any(angles):
         still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
         features = [*revolute(angles), *still]
     else:
         features = [x for x in lengths(angles) if not x.startswith("r^")]
     return NamedTerms(tuple(features), tuple(_frictions(data)), True)
+
+
+def _of_one(data: Trajectories) -> list[str]:
+    """Potentials of one coordinate; a constant force on a driven length is the zero of its input already."""
+    waves = [f"{f}({k}q1)" for k in range(2, WAVES + 1) for f in ("cos", "sin")]
+    powers = [f"q1^{k}" for k in range(3, HIGHEST + 1)]
+    every = [*own_terms(data.angles), *(waves if data.angles[0] else powers)]
+    return [name for name in every if data.u is None or name != CONSTANT]
 
 
 def _frictions(data: Trajectories) -> list[str]:
@@ -118,21 +124,47 @@ def chains(data: Trajectories) -> list[NamedTerms]:
     """Fewer terms for joints: those of a planar chain of links, by the angles between neighbours and by absolute ones.
 
     Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
-    with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone.
+    with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone. Where the chain
+    hangs on slides, the mass of a slide and a joint turns with the angle of a link; by absolute angles no other mass
+    and no friction is shared.
     """
-    if data.dof < 2 or not all(data.angles):
+    if data.dof < 2 or not any(data.angles):
         return []
-    every = [(name, parse(name, data.angles)[0]) for name in revolute(data.angles)]
-    between = [name for name, f in every if _of_neighbours(f)]
-    absolute = [name for name, f in every if {i: w for i, w in enumerate(f.form) if w} == _difference(f)]
-    return [NamedTerms(tuple(names), (), True) for names in (between, absolute)]
+    joints = [i for i, angle in enumerate(data.angles) if angle]
+    across, every = _by_slides(data.angles)
+    absolute = [name for name, f in every if _form(f) == _difference(f)] + [x for x, f in across if _of_own(f)]
+    if across and len(joints) == 1:
+        return [NamedTerms(tuple(absolute), (), True, apart=True)]
+    between = [name for name, f in every if _of_neighbours(f, joints)] + [x for x, f in across if _row(f, joints)]
+    return [NamedTerms(tuple(between), (), True), NamedTerms(tuple(absolute), (), True, apart=bool(across))]
 
 
-def _of_neighbours(f: Product) -> bool:
+def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[tuple[str, Product]]]:
+    """The dictionary of joints: terms of the speeds of a slide and a joint, and those of joints alone."""
+    every = [(name, parse(name, angles)[0]) for name in revolute(angles)]
+    across = [(name, f) for name, f in every if len({angles[i] for i in f.velocities}) == 2]
+    return across, [(name, f) for name, f in every if all(angles[i] for i in f.velocities)]
+
+
+def _form(f: Product) -> dict[int, float]:
+    return {i: w for i, w in enumerate(f.form) if w}
+
+
+def _row(f: Product, joints: Sequence[int]) -> bool:
+    """Whether the angle is a sum of all joints up to one: that of a link, by the angles between neighbours."""
+    return list(_form(f).items()) == [(i, 1.0) for i in joints[: len(_form(f))]]
+
+
+def _of_own(f: Product) -> bool:
+    """Whether the angle is that of the one joint whose speed a term has beside a slide's."""
+    return len(_form(f)) == 1 and set(_form(f)) <= set(f.velocities) and set(_form(f).values()) == {1.0}
+
+
+def _of_neighbours(f: Product, joints: Sequence[int]) -> bool:
     """Whether a chain has this term by the angles between neighbours: a sum of neighbouring angles."""
-    on = [i for i, w in enumerate(f.form) if w]
-    row = all(f.form[i] == 1 for i in on) and on == list(range(on[0], on[-1] + 1))
-    return row and (on[0] == min(f.velocities) + 1 if f.velocities else on[0] == 0)
+    on = [joints.index(i) for i in _form(f)]
+    row = set(_form(f).values()) == {1.0} and on == list(range(on[0], on[-1] + 1))
+    return row and on[0] == (joints.index(min(f.velocities)) + 1 if f.velocities else 0)
 
 
 def _difference(f: Product) -> dict[int, float]:
@@ -147,7 +179,7 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
         return {}
     if angles[0]:
         return {"cos(q1)": ("potential.stiffness", -1.0), "sin(q1)": ("potential.tilt", 1.0)}
-    return {"q1^2": ("potential.stiffness", 0.5), "q1": ("potential.tilt", 1.0)}
+    return {"q1^2": ("potential.stiffness", 0.5), CONSTANT: ("potential.tilt", 1.0)}
 
 
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:
@@ -157,10 +189,10 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     lengths, still = not any(data.angles), any("v" not in name for name in terms.features)
     own = data.dof > 1 and not config.translations  # the baseline's potential
     order = order if still or own else 2  # of a potential: without one it would add a spring
-    joints = data.dof > 1 and not lengths
+    several, apart = data.dof > 1, lengths or terms.apart
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
-        diagonal=lengths and data.dof > 1, coupled=forced and joints, order=order, substeps=substeps,
+        diagonal=several and apart, coupled=forced and several and not apart, order=order, substeps=substeps,
         objective="trajectory", alike=data.dof == 1,  # the potential holds features alone
     )  # fmt: skip
 

@@ -68,7 +68,7 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     """Fit parameters and states to whole trajectories, from a short one-step fit or from values that were found."""
     model, sigma = (task.build(plan.network), plan.sigma or 0.0) if plan.fitted_before else _one_step_start(task, plan)
     if task.config.sticking:
-        model = with_sticking(model)
+        model = with_sticking(model, excess=not plan.fitted_before)
     found = fit_trajectories(task, model, sigma, known=plan.fitted_before)
     if found is None:  # the model keeps the parameters of the one-step fit
         notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}

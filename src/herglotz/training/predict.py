@@ -26,10 +26,11 @@ from herglotz.training.problems.grid import SegmentGrid, segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
+from herglotz.training.smoother import smoothing_start
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 WARMUP = 20  # samples from which the state is estimated
-BELIEVED = 0.1  # noise of a step over that of the data in the warm-up, as in `smooth`: the states follow the model
+BELIEVED = 0.1  # noise of a radian of motion over that of the data, as of steps in `smooth`: states follow the model
 
 
 class Trained(Protocol):
@@ -291,10 +292,12 @@ def _smoothed(
     model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float
 ) -> tuple[Tensor, float] | None:
     """States at every sample of warm-ups, (N, 2n+1), the model held, and ½|r|²; None where it has no step near them."""
+    turn = max_step * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
+    process = BELIEVED * min(1.0, turn) ** 0.5  # a random force adds as much in many short steps as in a long one
     problem = SmoothingProblem(
-        model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=BELIEVED
+        model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=process
     )  # fmt: skip
-    x = problem.start()
+    x = smoothing_start(problem, model)
     states = StatesOnly(problem, x[: problem.P])
     result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
     return None if result.reason == "not_finite" else (problem.states(states.full(result.x)), result.cost)

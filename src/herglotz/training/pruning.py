@@ -7,6 +7,8 @@ import math
 import torch
 from torch import Tensor
 
+NULL = 1e-13  # eigenvalue, relative to the largest, that rounding leaves of a null direction
+
 
 def prune(
     A: Tensor,  # (P, P) JᵀJ at the fit, residuals over their RMS
@@ -64,3 +66,13 @@ def joining(
     gain = torch.where(left > 1e-9, slope.square() / left.clamp_min(1e-300), 0.0)
     best = int(gain.argmax())
     return best if float(gain[best]) > worth + 2 * math.log(len(others)) else None
+
+
+def inverse_of(A: Tensor) -> Tensor:
+    """A⁻¹ of a matrix that may have null directions: very large along them, where a pseudo-inverse would have 0.
+
+    Scaled to a unit diagonal, so that no unit decides what is a null direction.
+    """
+    size = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
+    values, vectors = torch.linalg.eigh(A / size[:, None] / size)
+    return (vectors / values.clamp_min(NULL * float(values[-1]))) @ vectors.T / size[:, None] / size

@@ -4,15 +4,21 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import torch
+from torch import Tensor
+
 from herglotz.data import Trajectories
 from herglotz.data.checks import check_positive
+from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
+from herglotz.training.first_states import first_states
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.least_squares import StatesOnly
+from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
@@ -49,7 +55,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     data = data.unwrapped()
     grid = segment_grid(data, data.samples, GAP * data.typical_step)
     problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
-    x, n, d = problem.start(), data.dof, problem.d
+    x, n, d = smoothing_start(problem, model), data.dof, problem.d
     states = StatesOnly(problem, x[: problem.P])
     result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
     if result.reason == "not_finite":
@@ -60,3 +66,21 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     _, matrix, _ = problem.normal_equations(x, held=True)
     std[:, :d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
     return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (found, std)))
+
+
+def smoothing_start(problem: SmoothingProblem, model: ContactLagrangian) -> Tensor:
+    """Unknowns that smoothing starts from: straight lines between samples, or the model's own motion near them.
+
+    A joint that set-valued friction holds stands still whatever its momentum is, so that a search which starts with
+    defects cannot mend them there; the motion from a start state has none.
+    """
+    x, data = problem.start(), problem.data
+    if model.friction is None or not model.friction.dry:
+        return x
+    local = local_polynomials(data)
+    shooting = ShootingProblem(model, data, problem.grid, sigma=problem.sigma)
+    theta = shooting.parameters.get()
+    states = first_states(shooting, theta, None if local is None else smoothed(data, local))
+    found = levenberg_marquardt(StatesOnly(shooting, theta), states.flatten())
+    path = shooting.solve(shooting.pack(theta, found.x))
+    return x if path is None else torch.cat([theta, path.x[..., : problem.d].flatten()])

@@ -50,7 +50,7 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled")  # fmt: skip
-TOLD = ("reason", "sigma", "doubt", "apart", "larger")  # of `Structure`, as a checkpoint has it
+TOLD = ("reason", "sigma", "doubt", "apart")  # of `Structure`, as a checkpoint has it
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
@@ -64,7 +64,6 @@ class Structure(NamedTuple):
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     doubt: bool = False  # another model may fit better: held-out free runs decide
     apart: bool = False  # sensors whose zeros differ between recordings would lower the misfit
-    larger: bool = False  # features that the search for terms does not try are needed
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
@@ -169,7 +168,7 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
     if not explains_steps(rms, float(fit.errors(x).square().mean().sqrt()), size):
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
-    return Structure(replace(rich, objective=objective), found, f"{words}: exact", larger=joints)
+    return Structure(replace(rich, objective=objective), found, f"{words}: exact")
 
 
 def explains_steps(order4: float, order2: float, size: float) -> bool:

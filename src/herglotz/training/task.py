@@ -94,10 +94,11 @@ def _start(model: ContactLagrangian, base: Baseline, config: FitConfig) -> None:
         numbers[len(numbers) - len(values) :] = numbers.new_tensor(values)  # order 4 has the baseline's features first
 
 
-def with_sticking(model: ContactLagrangian) -> ContactLagrangian:
+def with_sticking(model: ContactLagrangian, *, excess: bool = True) -> ContactLagrangian:
     """The model with set-valued dry friction in place of smooth friction, which a fit starts from.
 
-    Friction at 0 has no slope there; its forces start at `LEAST_GRIP` of the typical speed (mass 1) at least.
+    Friction at 0 has no slope there; its forces start at `LEAST_GRIP` of the typical speed (mass 1) at least. Without
+    `excess` the one of breakaway stays as it is: at 0 or below it is none, and no fit moves it.
     """
     other = ContactLagrangian(replace(model.config, sticking=True))
     known, least = dict(model.named_parameters()), LEAST_GRIP * max(model.config.speed)
@@ -106,6 +107,7 @@ def with_sticking(model: ContactLagrangian) -> ContactLagrangian:
             value.copy_(known[name])
         assert other.friction is not None
         other.friction.coulomb.clamp_(min=least)
-        other.friction.breakaway.clamp_(min=least / 100)
+        if excess:
+            other.friction.breakaway.clamp_(min=least / 100)
     kept = next(model.parameters())
     return other.to(dtype=kept.dtype, device=kept.device)

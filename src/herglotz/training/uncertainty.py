@@ -26,13 +26,12 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import inverse_of
 from herglotz.training.run import Run
 from herglotz.training.solvers.lifted_newton import Path
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 from herglotz.training.trajectory_fit import fit_states
-
-NULL = 1e-13  # eigenvalue, relative to the largest, that rounding leaves of a null direction
 
 
 @dataclass(frozen=True)
@@ -221,16 +220,6 @@ class Laplace:
         if path is None:
             raise InputError("the model cannot be run over its own data, so it has no bands; fit it again")
         return problem, path
-
-
-def inverse_of(A: Tensor) -> Tensor:
-    """A⁻¹ of a matrix that may have null directions: very large along them, where a pseudo-inverse would have 0.
-
-    Scaled to a unit diagonal, so that no unit decides what is a null direction.
-    """
-    size = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
-    values, vectors = torch.linalg.eigh(A / size[:, None] / size)
-    return (vectors / values.clamp_min(NULL * float(values[-1]))) @ vectors.T / size[:, None] / size
 
 
 @one_thread()

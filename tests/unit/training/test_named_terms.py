@@ -4,6 +4,7 @@ import json
 import math
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -18,6 +19,7 @@ from herglotz.training import FitConfig, Plan, fit, laplace
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
+from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _equation
 from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import linear_starts
@@ -81,8 +83,9 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
         return more if not more.terms.dry else replace(more, values={**more.values, dry: (-1.0,)})
 
     monkeypatch.setattr(DictionarySearch, "_begun", begun)
-    for last in ("_pruned", "_likeliest", "_last_terms", "_one_rate"):  # which may leave the term out as well
+    for last in ("_pruned", "_likeliest", "_last_terms"):  # which may leave the term out as well
         monkeypatch.setattr(DictionarySearch, last, lambda _self, found: found)
+    monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
     if where == "joins":
         monkeypatch.setattr(DictionarySearch, "_missing", lambda _self, _found: next(asked))
         monkeypatch.setattr(DictionarySearch, "_refit", pushed)
@@ -331,3 +334,37 @@ def test_lines_of_an_equation_break_between_terms():  # fails if a number stands
         "− 0.123456(10) x − 0.123456(10) x³ − 0.123456(10) x⁵ − 0.123456(10) x⁷",
         "with x in m",
     ]
+
+
+@pytest.mark.parametrize(
+    ("rms", "coloured", "beaten", "joins"),
+    [(0.9, False, False, True), (0.9, True, False, False), (0.9, True, True, True), (0.6, True, False, True),
+     (1.1, False, True, False)],
+)  # fmt: skip
+def test_a_term_joins_where_it_halves_the_misfit(rms, coloured, beaten, joins):
+    # fails if blocks of time, which are foretold to first order, turn away a term that takes half of the squared misfit
+    found, more = (
+        SimpleNamespace(rms=x, coloured=c, beaten_by=lambda *_: beaten) for x, c in ((1, True), (rms, coloured))
+    )
+    assert Found.joined_by(found, more, 0.0) is joins  # pyright: ignore
+
+
+def test_a_constant_force_is_the_zero_of_an_input():
+    # fails if both are candidates: they grew to 2860 m/s² that cancelled
+    t = torch.arange(9.0)
+    free, driven = (candidates(Trajectories.of(t, t[:, None], u=u)) for u in (None, t[:, None]))
+    assert "q1" in free.features
+    assert set(free.features) - set(driven.features) == {"q1"}
+
+
+@pytest.mark.parametrize(("finer", "substeps"), [({2: 1.03}, 2), ({2: 1.1, 4: 1.0}, 4), ({2: 1.1, 4: 1.1}, 1)])
+def test_shorter_steps_may_cost_what_one_number_is_worth(finer, substeps):
+    # fails if noise alone keeps steps that are too long, or the next length is not tried: of 60 samples ½ log N is
+    # worth 3.5 % of the RMS, and dry friction errs by the step in which a velocity changes sign
+    search: Any = object.__new__(DictionarySearch)
+    search.floor, search.data = 0.0, SimpleNamespace(q=torch.zeros(60, 1))
+    at = lambda m, rms: SimpleNamespace(rms=rms, terms=(), config=SimpleNamespace(substeps=m))  # noqa: E731
+    search._refit = lambda *steps: at(steps[-1], finer[steps[-1]])
+    search._longer = lambda found: found
+    search._too_long = lambda found: found.config.substeps == 1 and not hasattr(search, "in_vain")
+    assert search._finer(at(1, 1.0)).config.substeps == substeps

@@ -19,6 +19,7 @@ from herglotz.training.cross_validation import held_out_errors, simplest_not_bea
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import MANY
+from herglotz.training.problems.prior import SPLIT
 from herglotz.training.solvers import lifted_newton
 from herglotz.training.solvers.lifted_newton import solve_path
 from herglotz.training.stages import Stages
@@ -506,10 +507,20 @@ def test_one_standard_deviation_of_friction_is_a_residual_of_one(name):
     # fails if a spread multiplies, the speed of dry friction's is forgotten, or one kind is measured by another's
     model = model_of("forced", 1, coulomb=True)
     prior, start = prior_of(model, data_of()), ParameterVector(model).get()
-    moved = {"viscous": 0.1, "coulomb": 0.1 * 1.2, "log": 0.5}[name]  # spreads in the class's own words
+    moved = {"viscous": 0.1 * SPLIT, "coulomb": 0.1 * 1.2, "log": 0.5}[name]  # spreads in the class's own words
     theta = start.index_add(0, prior._index(f"friction.{name}")[:1], torch.tensor([moved], dtype=start.dtype))
     change = prior.residuals(theta) - prior.residuals(start)
     assert change[change != 0].tolist() == pytest.approx([1.0])
+
+
+def test_friction_of_one_coordinate_is_its_rate():
+    # fails if a rate may grow that friction cancels: both together hide steps that are too long, and no other step or
+    # term can be fitted from there. Friction of several coordinates is their own
+    for n, spread in ((1, 0.1 * SPLIT), (2, 0.1)):
+        model = model_of("forced", n)
+        prior = prior_of(model, data_of(n))
+        at = (prior.index == prior._index("friction.viscous")[0]).nonzero()[0, 0]
+        assert float(prior.spread[at]) == pytest.approx(spread)
 
 
 @pytest.mark.parametrize("level", ["linear", "affine", "forced"])

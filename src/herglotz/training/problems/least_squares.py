@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.mechanics import mixed_hessian, partials
 from herglotz.models import ContactLagrangian
 from herglotz.training.inputs import grid_inputs, step_inputs
 from herglotz.training.parameter_vector import ParameterVector
@@ -16,6 +17,8 @@ from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.robust import loss, root_weights
 from herglotz.training.solvers.levenberg_marquardt import memory_of, remind
+
+SOME = 64  # steps of the data that say how large the masses are
 
 
 class LeastSquares:
@@ -84,6 +87,17 @@ class StatesProblem(LeastSquares, ABC):
         self.u = grid_inputs(model, data, grid)  # (S, K, m)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
+        self.mass = self._masses(model)  # (n,) in the units of p over those of v
+
+    def _masses(self, model: ContactLagrangian) -> Tensor:
+        """Median of h times the diagonal of the mixed Hessian over steps of the data, (n,); 1 where it is no size."""
+        steps, u = self.data.steps(), step_inputs(model, self.data)
+        some = torch.linspace(0, len(steps.h) - 1, min(SOME, len(steps.h)), device=steps.h.device).round().long()
+        i, h = steps.index[some], steps.h[some]
+        with torch.no_grad():
+            P = partials(model if u is None else model.at(u[i]), self.data.q[i], self.data.q[i + 1], 0 * h, h, 2)
+            mass = (h[:, None] * mixed_hessian(P).diagonal(0, -2, -1)).abs().median(0).values
+        return torch.where(mass.isfinite() & (mass > 0), mass, 1.0)
 
     def with_s(self, states: Tensor) -> Tensor:
         """States (..., 2n+1) from the unknowns (..., d), with s = 0 where s is none of them."""

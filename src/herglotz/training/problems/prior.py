@@ -16,6 +16,7 @@ from herglotz.training.parameter_vector import ParameterVector
 NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.network", "action.log_slope",
             "action.weight", "action.bias")  # fmt: skip
 WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
+SPLIT = 1e-3  # of a rate: friction of one coordinate is its rate, and a rate that friction cancels hides long steps
 BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
@@ -79,7 +80,8 @@ class Prior:
         """Which parameters are N(their start, spread²) by themselves, and their spreads, (m,) each."""
         spreads = [
             (self._index(*NETWORKS), weight),
-            (self._index("damping.rate", "damping.drag", "action.rate", "friction.viscous"), rate_spread),
+            (self._index("damping.rate", "damping.drag", "action.rate"), rate_spread),
+            (self._index("friction.viscous"), rate_spread * (SPLIT if len(model.config.scale) == 1 else 1.0)),
             (self._index("friction.coulomb"), rate_spread * max(model.config.speed)),
             (self._index("friction.breakaway"), BREAKAWAY * self.force),
             (self._index("friction.log"), WIDTH),

@@ -64,7 +64,7 @@ class ShootingProblem(StatesProblem):
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
         self.s = s
-        self.joint_weight = torch.cat([self.scale * relative, self.speed * relative, action])
+        self.joint_weight = torch.cat([self.scale * relative, self.mass * self.speed * relative, action])
         self._solved: tuple[Tensor, Path | None] | None = None
         self._at: Tensor | None = None  # the unknowns of `path`
         self._slopes: tuple[Path, Tensor] | None = None  # a path and its `sensitivities`, which end in P + d or d

@@ -39,8 +39,9 @@ class SmoothingProblem(StatesProblem):
     grid
         Whole trajectories, one segment each.
     process
-        Standard deviation of what a step leaves of the model in p, relative to sigma, in the natural units of both; the
-        same share of the natural size in s, and h/√3 of p's in q, as a random force would add.
+        Standard deviation of what a step leaves of the model in v, relative to sigma, in the natural units of both;
+        that times the mass of each coordinate in p, the same share of the natural size in s, and h/√3 of v's in q, as a
+        random force would add.
     freedom
         Degrees of freedom ν of Student's t for the residuals of data and steps (`robust`); None: least squares.
     """
@@ -57,11 +58,10 @@ class SmoothingProblem(StatesProblem):
         self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
         self.seen[self.node], self.target[self.node] = 1.0, data.q
         self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
-        scale, speed = self.scale, self.speed
-        # What a force that the model does not know adds to p in a step, to q by the way, and to s.
-        p = (self.deviations * speed / scale).expand(*grid.h.shape, n)
-        s = (self.sigma * scale.new_tensor([self.action]) / scale.max()).expand(*grid.h.shape, 1)
-        self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * p, p, s], -1)[..., :d]  # (S, K, d)
+        # What a force that the model does not know adds to v and p in a step, to q by the way, and to s.
+        v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
+        s = (self.sigma * v.new_tensor([self.action]) / self.scale.max()).expand(*grid.h.shape, 1)
+        self.w = process * torch.cat([grid.h[..., None] / 3**0.5 * v, self.mass * v, s], -1)[..., :d]  # (S, K, d)
         self._stepped_at: tuple[Tensor, tuple[Tensor, Tensor] | None] | None = None
 
     def start(self) -> Tensor:

@@ -1,0 +1,71 @@
+"""A model that was found is tried with fewer numbers: what joints share, drag beside dry friction, a rate of each.
+
+Each is fitted again. The simpler model stays where it is as likely, by the Bayesian information criterion, or where
+residuals are no noise and held-out blocks of time do not ask for the richer one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from herglotz.data import Trajectories
+from herglotz.training.found_terms import Found
+from herglotz.training.named_terms import NamedTerms
+from herglotz.training.problems.shooting import ShootingProblem
+
+SHARED = ("kinetic.off_diagonal", "kinetic.base.off_diagonal", "coupling.viscous")  # what joints that are apart lack
+HOPELESS = 1.5  # times what the fit and its long steps miss: terms that miss so much more are not fitted in short steps
+
+
+@dataclass(frozen=True)
+class FewerNumbers:
+    """See the head of this module; `of` a found model is the one that stays."""
+
+    data: Trajectories
+    floor: float  # misfits below are rounding
+    order: int  # of the rule
+    refit: Callable[..., Found | None]  # with other terms, and model steps in a recorded one
+    problem: Callable[..., tuple[object, ShootingProblem]]  # that such a fit solves
+
+    def of(self, found: Found) -> Found:
+        """The model with as few numbers as the data ask for."""
+        return self._one_rate(self._apart(self._undragged(found)))
+
+    def _one_rate(self, found: Found) -> Found:
+        """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""
+        terms = found.terms
+        if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
+            return found
+        return self._simplified(found, replace(terms, one_rate=True))
+
+    def _undragged(self, found: Found) -> Found:
+        """Without drag that joined while smooth friction stood for what holds the joints now, one by one."""
+        for name in found.terms.drag if found.config.sticking else ():
+            found = self._simplified(found, found.terms.only([x for x in found.terms.names if x != name]))
+        return found
+
+    def _apart(self, found: Found) -> Found:
+        """Without constant masses and friction between joints, where these say no more."""
+        if self.data.dof == 1 or not any(self.data.angles) or found.terms.apart:
+            return found
+        if found.cost_without(SHARED, self.floor) > 4**self.order * self.data.q.numel():
+            return found  # a fit would only take its time
+        return self._simplified(found, replace(found.terms, apart=True))
+
+    def _simplified(self, found: Found, terms: NamedTerms) -> Found:
+        """With these terms, of fewer parameters, where they are as likely, or as good and residuals are no noise."""
+        if found.config.substeps > 1 and self._hopeless(found, terms):
+            return found
+        less, count = self.refit(found, terms), self.data.q.numel()
+        if less is None:
+            return found
+        fewer = (len(found.fit.theta) - len(less.fit.theta)) * math.log(count) / count
+        likely = less.rms <= (1 + fewer) ** 0.5 * max(found.rms, self.floor)
+        return less if likely or (found.coloured and less.as_good(found, self.floor)) else found
+
+    def _hopeless(self, found: Found, terms: NamedTerms) -> bool:
+        """Whether single model steps, which take less time, show that terms miss more than long steps explain."""
+        less, longer = self.refit(found, terms, 1), self.problem(found, found.terms, 1)[1]
+        return less is None or less.rms > HOPELESS * (max(found.rms, self.floor) + found.changed_by(longer))
