@@ -68,6 +68,7 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
     def begun(self):
         found = begin(self)
         if where == "begins":
+            assert found is not None
             found = self._refit(found, replace(found.terms, dry=True))
             assert found is not None
             found = replace(found, values={**found.values, dry: (-1.0,)})
