@@ -49,13 +49,15 @@ def held_out_errors(
     Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
     there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
     deterministic model misses comes in long runs: single left-out samples, and a likelihood that takes residuals for
-    white noise, would both be fooled by their neighbours.
+    white noise, would both be fooled by their neighbours. Starts that are known better than by σ are never left out: a
+    free run begins there.
     """
     r, J = problem.data_rows(path, theta)
     values, vectors = torch.linalg.eigh(A.double())
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
-    return left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows])) * problem.sigma
+    stay = problem.better.flatten() > 1
+    return left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]), stay) * problem.sigma
 
 
 def _left_out(G: Tensor, r: Tensor) -> Tensor:
@@ -74,6 +76,7 @@ def left_out_errors(
     r: Tensor,  # (N·n,) residuals of the data, in the order of the samples
     data: Trajectories,
     left_out: Callable[[Tensor], Tensor],  # residuals of some of their rows, given as bool (N·n,), without them
+    stay: Tensor | None = None,  # (N·n,) bool, rows that are in no fold
 ) -> Tensor:
     """RMS of r in each fold if its rows had been left out, (FOLDS,).
 
@@ -84,8 +87,10 @@ def left_out_errors(
         for part in parts:
             part[: min(STAY, len(part) // (2 * FOLDS))] = -1
     fold = torch.cat(parts).repeat_interleave(data.dof).to(r.device)
-    errors = torch.stack([left_out(fold == k).square().mean().sqrt() for k in range(FOLDS)])
-    return errors.nan_to_num(nan=torch.inf)
+    fold = fold if stay is None else fold.masked_fill(stay, -1)
+    errors = torch.stack([left_out(fold == k).square().mean().sqrt() for k in range(FOLDS)]).nan_to_num(nan=torch.inf)
+    there = torch.stack([(fold == k).any() for k in range(FOLDS)])  # of short trajectories all of a fold may stay
+    return torch.where(there, errors, errors[there].square().mean().sqrt())
 
 
 def beaten(errors: Tensor, best: Tensor) -> bool:

@@ -59,7 +59,8 @@ class ShootingProblem(StatesProblem):
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
-        self.weight = (self.used.to(data.q)[:, None] * self._known_better())[grid.sample]  # (N', n)
+        self.better = self._known_better()  # (N, n)
+        self.weight = (self.used.to(data.q)[:, None] * self.better)[grid.sample]  # (N', n)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
@@ -78,10 +79,11 @@ class ShootingProblem(StatesProblem):
         Where the model misses more than the noise, states fitted to what it misses would make up for forces: parameters
         with the least misfit would then not be those of the least error of a free run from the recorded start.
         """
+        if self.grid.segments > len(self.data):
+            return torch.ones_like(self.data.q)
         better = (self.sigma / precisions(self.data).to(self.data.q)).clamp(max=KNOWN)
         first = torch.zeros_like(self.data.t, dtype=torch.bool)
-        if self.grid.segments == len(self.data):
-            first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START)).to(first.device)] = True
+        first[(torch.tensor(self.data.offsets)[:, None] + torch.arange(START)).to(first.device)] = True
         return torch.where(first[:, None] & (better > AT_THE_NOISE), better, 1.0)
 
     def memory(self) -> dict[str, Any]:
@@ -274,7 +276,8 @@ class ShootingProblem(StatesProblem):
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
 
-        Both carry the square roots of the weights: those of a robust loss, and 0 for samples that are not used.
+        Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
+        samples that are not used.
         """
         r = self.misfit(path) / self.sigma
         by = self.weight * self.root_weights(self.weight * r)
