@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
@@ -20,6 +22,8 @@ ROLES = {
     "rate": re.compile(r"v|v[xyz]|a[xyz]|(vel|velocity|speed|acc|acceleration)(_.*)?|.*_(d?dot|velocity|acceleration)"),
     "counter": re.compile(r"index|row|sample|frame|unnamed: \d+"),
 }
+LETTERS = re.compile(r"v|[va][xyz]")  # of a velocity or an acceleration, unless the unit is that of a position
+POSITIONS = re.compile(r"rad|deg|°|[kcmµμn]?m|in|ft|px")
 AS_SHOWN = {  # roles by their names in the table of columns
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
 }  # fmt: skip
@@ -56,6 +60,16 @@ class Wanted:
         """All columns that the user names."""
         every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
         return tuple(name for wanted in every if wanted for name in _several(wanted))
+
+    def by_name(self, cells: dict[str, str]) -> Wanted:
+        """The same with the name of each column that is given as its whole cell, `x (m)`."""
+
+        def named(wanted: Names | None) -> Any:
+            of = [cells.get(name, name) for name in _several(wanted or ())]
+            return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
+
+        who = ("time", "group", "drop", "coordinates", "inputs")
+        return replace(self, **{field: named(getattr(self, field)) for field in who})
 
     def before(self, name: str) -> str | None:
         """The role that a column of this name had in the other table; None where it had none."""
@@ -112,6 +126,7 @@ def assign(
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
+    wanted = wanted.by_name({cell: name for cell, name in zip(cells, names, strict=True) if cell not in place})
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
@@ -124,12 +139,19 @@ def assign(
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
-        f"{where}: no coordinate column, only {every}; add a column such as q[rad]": not q,
+        f"{where}: no coordinate column, only {every}; {_remedy([names[i] for i in roles['rate']])}": not q,
         f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
     return Columns(names, units, clock, q, trajectory, action, p, u)
+
+
+def _remedy(rates: list[str]) -> str:
+    """What to do about a table without a coordinate; what its columns are taken for is not printed."""
+    if not rates:
+        return "add a column such as q[rad]"
+    return f"{', '.join(rates)} look like rates: choose with --coordinates NAMES (coordinates= in Python)"
 
 
 def _several(names: Names) -> Sequence[str]:
@@ -144,7 +166,8 @@ def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
     key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "q")
     measured = "input" if FORCES.fullmatch(unit) else "rate" if RATES.fullmatch(unit) else role
-    role = wanted.before(name) or (measured if role == "q" else role)
+    moves = role == "rate" and LETTERS.fullmatch(key) and POSITIONS.fullmatch(unit)
+    role = wanted.before(name) or (measured if role == "q" else "q" if moves else role)
     taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
     return "dropped" if taken.get(role) is not None else role
 
@@ -160,20 +183,24 @@ def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:
 
 
 def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    names: dict[str, None] = {}
-    units = []
+    found = []
     for i, cell in enumerate(cells):
-        found = name_and_unit(cell if cell or i else "index")  # as pandas writes its rows' numbers
-        if found is None:
+        of = name_and_unit(cell if cell or i else "index" if "index" not in cells else "unnamed: 0")  # as pandas writes
+        if of is None:
             raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
-        name, unit = found
-        if name in names:
-            raise InputError(f"{where}: the column {quote(name)} comes twice; rename or delete one")
-        names[name] = None
-        units.append(unit)
+        found.append(of)
+    often = Counter(name for name, _ in found)
+    # Of `x (raw)` and `x (filtered)` the brackets hold no unit.
+    found = [
+        (cell.strip(), "") if often[of[0]] > 1 and cell.endswith(")") else of
+        for cell, of in zip(cells, found, strict=True)
+    ]
+    names, units = tuple(name for name, _ in found), tuple(unit for _, unit in found)
+    for name, count in Counter(names).items():
+        refuse({f"{where}: the column {quote(name)} comes twice; rename or delete one": count > 1})
     if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")
-    return tuple(names), tuple(units)
+    return names, units
 
 
 def name_and_unit(cell: str) -> tuple[str, str] | None:

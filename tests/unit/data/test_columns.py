@@ -61,6 +61,35 @@ def test_rates_and_counters_are_left_aside(tmp_path, head):
     assert read(tmp_path, "v,t\n1,0\n2,1\n4,2\n", coordinates="v").names == ("v",)
 
 
+@pytest.mark.parametrize("head", ["v[m]", "vy (mm)", "ax[rad]", "az[deg]"])
+def test_letters_of_rates_with_the_unit_of_a_position_are_coordinates(tmp_path, head):
+    # fails if a coordinate is lost because its letters mean a velocity elsewhere
+    assert len(read(tmp_path, f"t,x[m],{head}\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7])).names) == 2
+
+
+def test_rates_alone_are_refused_with_a_remedy(tmp_path):
+    # fails if the message asks for a coordinate and does not say what became of the column that the user has
+    with pytest.raises(InputError, match=r"speed look like rates: choose with --coordinates NAMES"):
+        read(tmp_path, "t,speed\n0,1\n1,2\n2,4\n")
+
+
+def test_columns_are_named_as_their_cells_are(tmp_path):
+    # fails if a column of a table is not found by the name that it has there
+    data = read(
+        tmp_path, "Time (s),x (m),y[m],F (N)\n" + rows([0, 1, 2], [5, 6, 7], [8, 9, 7], [1, 2, 3]),
+        time="Time (s)", coordinates=["y[m]", "x (m)"], drop="F (N)",
+    )  # fmt: skip
+    assert (data.names, data.u) == (("y", "x"), None)
+
+
+def test_brackets_that_tell_columns_apart_are_no_units(tmp_path):
+    # fails if two columns become one that comes twice; or if a table with an index and numbers of rows is refused
+    assert read(tmp_path, "t,x (raw),x (kept)\n0,1,1\n1,2,1\n2,2,4\n").names == ("x (raw)", "x (kept)")
+    assert read(tmp_path, ",index,t,x\n0,0,0,1\n1,1,1,2\n2,2,2,2\n").names == ("x",)
+    with pytest.raises(InputError, match="the column 'x' comes twice"):
+        read(tmp_path, "t,x[m],x[mm]\n0,1,1\n1,2,1\n2,2,4\n")
+
+
 def test_headers_of_loggers(tmp_path):
     # fails if a unit in round brackets hides the time, a name without a blank before them loses a part, or a table
     # that pandas has written with the numbers of its rows is refused

@@ -95,7 +95,7 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
         ("#\n\nt;q\n0;1\n", r"data.csv, row 3: columns are separated by commas here; replace"),
         ("a,q\n0,1\n", r"data.csv, row 1: no time column; the columns are a, q: choose one with --time NAME"),
         ("t,time,q\n0,1,2\n", r"data.csv, row 1: two time columns, t and time; choose one with --time NAME"),
-        ("t,v\n0,1\n", r"data.csv, row 1: no coordinate column, only t, v; add a column such as q\[rad\]"),
+        ("t,v\n0,1\n", "data.csv, row 1: no coordinate column, only t, v; v look like rates"),
         ("t,q,q\n0,1,2\n", r"data.csv, row 1: the column 'q' comes twice; rename or delete one"),
         ("t,q[rad\n0,1\n", r"data.csv, row 1, column 2: 'q\[rad' is not a header cell; write name or name\[unit\]"),
         ("t,,q\n0,1,2\n", r"data.csv, row 1, column 2: '' is not a header cell"),
