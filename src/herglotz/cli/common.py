@@ -24,7 +24,7 @@ KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kick
 
 def exit_code(run: Run) -> int:
     """0, or 3 where the run does not fit its data: it is written, and what comes after should know."""
-    return NO_FIT if run.metrics["verdict"].startswith("does not fit") else 0
+    return NO_FIT if run.metrics.get("verdict", "").startswith("does not fit") else 0
 
 
 def warn_of_misfit(run: Run, means: str) -> None:

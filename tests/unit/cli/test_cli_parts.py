@@ -3,12 +3,13 @@
 import signal
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
 from herglotz.cli import SIGNALS, _internal, _orderly, rollout
-from herglotz.cli.common import print_table
+from herglotz.cli.common import exit_code, print_table, warn_of_misfit
 from herglotz.cli.tune import _whole
 from herglotz.errors import InputError
 
@@ -19,6 +20,15 @@ def test_a_long_value_goes_on_below_itself(capsys):  # fails if its second line 
     assert first == "  a     short"
     assert second.startswith("  name  word")
     assert third.startswith(" " * 8 + "word")
+
+
+@pytest.mark.parametrize(
+    ("metrics", "code"), [({}, 0), ({"verdict": "fits to the noise"}, 0), ({"verdict": "does not fit: more data"}, 3)]
+)
+def test_only_a_verdict_warns(capsys, metrics, code):  # fails if a run that was never judged cannot be exported
+    run: Any = SimpleNamespace(metrics=metrics)
+    warn_of_misfit(run, "it steps otherwise")
+    assert (exit_code(run), "it steps otherwise" in capsys.readouterr().err) == (code, code == 3)
 
 
 def test_an_internal_error_names_the_innermost_line():  # fails if another frame of the traceback is named
