@@ -330,7 +330,8 @@ class DictionarySearch:
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
-            finer = (self._refit(found, found.terms, m) for m in (2 * found.config.substeps, 4 * found.config.substeps))
+            shorter = filter(self._possible, (2 * found.config.substeps, 4 * found.config.substeps))
+            finer = (self._refit(found, found.terms, m) for m in shorter)
             count = self.data.q.numel()
             lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
             other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
@@ -340,10 +341,14 @@ class DictionarySearch:
             found = self._longer(other)
         return found
 
+    def _possible(self, substeps: int) -> bool:
+        """Whether there may be as many model steps in a recorded one."""
+        return substeps <= FINEST and substeps * self.data.samples <= STEPS
+
     def _too_long(self, found: Found) -> bool:
         """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
         m = found.config.substeps
-        if 2 * m > FINEST or 2 * m * self.data.samples > STEPS or found.rms <= FINE * self.floor:
+        if not self._possible(2 * m) or found.rms <= FINE * self.floor:
             return False
         if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
             return False
