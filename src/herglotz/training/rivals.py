@@ -88,7 +88,7 @@ def _aligned(
     second = stages.keep("held out, other zeros", lambda: _held_out(other, config, plan))
     numbers = (f"{x['windows']:.2g} and {x['rms']:.2g}" for x in (second, first))
     words = "{}; over held-out time windows and one free run miss {} with them, {} without".format(apart, *numbers)
-    if MARGIN * _both(second, seen) > _both(first, seen):
+    if not MARGIN * _both(second, seen) < _both(first, seen):  # also where both are lost
         return told, first
     return replace(other, apart=words), second
 

@@ -222,6 +222,8 @@ def test_zeros_stay_only_where_held_out_time_asks_for_them(monkeypatch):
     assert not held_out(monkeypatch, (0.0031, 0.0031), (0.003, 0.003))  # by less than a twentieth
     assert held_out(monkeypatch, (0.01, float("inf")), (0.003, 5.0))  # chaos: both are lost, windows are not
     assert not held_out(monkeypatch, (0.003, float("inf")), (0.003, 5.0))  # fails if a lost free run decides
+    for lost in (float("inf"), float("nan")):  # fails if zeros stay that held-out time says nothing of
+        assert not held_out(monkeypatch, (lost, 0.02), (lost, 0.02))
 
 
 def test_recordings_that_zeros_do_not_explain_are_named():
