@@ -61,11 +61,12 @@ class Wanted:
         every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
         return tuple(name for wanted in every if wanted for name in _several(wanted))
 
-    def by_name(self, cells: dict[str, str]) -> Wanted:
+    def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
         """The same with the name of each column that is given as its whole cell, `x (m)`."""
+        called = {cell: name for cell, name in zip(cells, names, strict=True) if cell not in names}
 
         def named(wanted: Names | None) -> Any:
-            of = [cells.get(name, name) for name in _several(wanted or ())]
+            of = [called.get(name, name) for name in _several(wanted or ())]
             return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
 
         who = ("time", "group", "drop", "coordinates", "inputs")
@@ -126,7 +127,7 @@ def assign(
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
-    wanted = wanted.by_name({cell: name for cell, name in zip(cells, names, strict=True) if cell not in place})
+    wanted = wanted.by_name(cells, names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
@@ -139,7 +140,7 @@ def assign(
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
-        f"{where}: no coordinate column, only {every}; {_remedy([names[i] for i in roles['rate']])}": not q,
+        f"{where}: no coordinate column, only {every}; {_remedy(names, roles['rate'])}": not q,
         f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
@@ -147,11 +148,12 @@ def assign(
     return Columns(names, units, clock, q, trajectory, action, p, u)
 
 
-def _remedy(rates: list[str]) -> str:
+def _remedy(names: Sequence[str], rates: list[int]) -> str:
     """What to do about a table without a coordinate; what its columns are taken for is not printed."""
     if not rates:
         return "add a column such as q[rad]"
-    return f"{', '.join(rates)} look like rates: choose with --coordinates NAMES (coordinates= in Python)"
+    which = ", ".join(names[i] for i in rates)
+    return f"{which} look like rates: choose with --coordinates NAMES (coordinates= in Python)"
 
 
 def _several(names: Names) -> Sequence[str]:

@@ -42,11 +42,12 @@ def read_csv(
     `force`, `F`, `torque`, `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs;
     velocities and accelerations (`v`, `vx`, `velocity`, `*_dot`, `ax`, columns in m/s, rad/s², ...) and counters
     (`index`, `frame`, `sample`, `row`, a first column without a name) are left aside; every other column is a
-    coordinate. Times may be dates in ISO 8601: they become seconds since the first row. Lines that start with # and
-    blank lines are skipped, but for `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which
-    say what the inputs do between samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1`
-    and `# scale: 1 0.5`, which make q = scale · (reading − zero) of the coordinates, one after the other
-    (`herglotz.data.sensors`). A coordinate in rad is taken for an angle.
+    coordinate, and so is `v`, `vx`, `ax` in m, rad or deg. A column may be named with its unit. Times may be dates in
+    ISO 8601: they become seconds since the first row. Lines that start with # and blank lines are skipped, but for
+    `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between
+    samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`, which make
+    q = scale · (reading − zero) of the coordinates, one after the other (`herglotz.data.sensors`). A coordinate in rad
+    is taken for an angle.
 
     Returns
     -------

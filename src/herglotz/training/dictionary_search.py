@@ -77,6 +77,7 @@ class DictionarySearch:
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
+        self.finest = min(FINEST, STEPS // data.samples)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
         self.coarse = coarse(data)
@@ -330,26 +331,20 @@ class DictionarySearch:
     def _finer(self, found: Found) -> Found:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
-            shorter = filter(self._possible, (2 * found.config.substeps, 4 * found.config.substeps))
-            finer = (self._refit(found, found.terms, m) for m in shorter)
-            count = self.data.q.numel()
+            m, count = found.config.substeps, self.data.q.numel()
+            finer = (self._refit(found, found.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
             lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
             other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
             if other is None:
-                self.in_vain = found.config.substeps, found.rms
+                self.in_vain = m, found.rms
                 break  # the terms make up for the longer steps
             found = self._longer(other)
         return found
 
-    def _possible(self, substeps: int) -> bool:
-        """Whether there may be as many model steps in a recorded one."""
-        return substeps <= FINEST and substeps * self.data.samples <= STEPS
-
     def _too_long(self, found: Found) -> bool:
         """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
         m = found.config.substeps
-        if not self._possible(2 * m) or found.rms <= FINE * self.floor:
-            return False
-        if m == self.in_vain[0] and found.rms > self.in_vain[1] / 2:
+        vain = m == self.in_vain[0] and found.rms > self.in_vain[1] / 2
+        if vain or 2 * m > self.finest or found.rms <= FINE * self.floor:
             return False
         return found.changed_by(self._problem(found, found.terms, 2 * m)[1]) > max(FINER * found.rms, FINE * self.floor)

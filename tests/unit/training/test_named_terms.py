@@ -17,7 +17,7 @@ from herglotz.models.drag import parse_drag
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, dictionary_search, fit, laplace
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dictionary_search import STEPS, DictionarySearch
+from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _equation
@@ -373,15 +373,15 @@ def test_a_constant_force_is_the_zero_of_an_input():
 
 
 @pytest.mark.parametrize(
-    ("finer", "samples", "substeps"),
-    [({2: 1.03}, 60, 2), ({2: 1.1, 4: 1.0}, 60, 4), ({2: 1.1, 4: 1.1}, 60, 1), ({2: 1.1, 4: 1.0}, STEPS // 3, 1)],
+    ("finer", "most", "substeps"),
+    [({2: 1.03}, 4, 2), ({2: 1.1, 4: 1.0}, 4, 4), ({2: 1.1, 4: 1.1}, 4, 1), ({2: 1.1, 4: 1.0}, 3, 1)],
 )
-def test_shorter_steps_may_cost_what_one_number_is_worth(finer, samples, substeps):
+def test_shorter_steps_may_cost_what_one_number_is_worth(finer, most, substeps):
     # fails if noise alone keeps steps that are too long, or the next length is not tried: of 60 samples ½ log N is
     # worth 3.5 % of the RMS, and dry friction errs by the step in which a velocity changes sign; or if there are more
     # steps than a search has time for
     search: Any = object.__new__(DictionarySearch)
-    search.floor, search.data = 0.0, SimpleNamespace(q=torch.zeros(60, 1), samples=samples)
+    search.floor, search.finest, search.data = 0.0, most, SimpleNamespace(q=torch.zeros(60, 1))
     at = lambda m, rms: SimpleNamespace(rms=rms, terms=(), config=SimpleNamespace(substeps=m))  # noqa: E731
     search._refit = lambda *steps: at(steps[-1], finer[steps[-1]])
     search._longer = lambda found: found
