@@ -63,7 +63,8 @@ class Wanted:
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
         """The same with the name of each column that is given as its whole cell, `x (m)`."""
-        called = {cell: name for cell, name in zip(cells, names, strict=True) if cell not in names}
+        every = set(names)
+        called = {cell: name for cell, name in zip(cells, names, strict=True) if cell not in every}
 
         def named(wanted: Names | None) -> Any:
             of = [called.get(name, name) for name in _several(wanted or ())]
