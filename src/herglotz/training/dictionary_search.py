@@ -37,6 +37,7 @@ from herglotz.training.named_terms import (
     own_terms,
     places,
     settings_of,
+    shapes_of_dry,
     started,
     values_of,
 )
@@ -274,8 +275,7 @@ class DictionarySearch:
         absent = torch.zeros(len(x), dtype=torch.bool)
         absent[others] = True
         if DRY in names:  # what shapes a force of 0 has no effect yet
-            for shape in ("friction.breakaway", "friction.log"):
-                absent[problem.parameters.index(shape)] = True
+            absent[shapes_of_dry(problem.parameters)] = True
         best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(self.data.q.numel()))
         return None if best is None else next(name for name in names if int(others[best]) in at[name])
 

@@ -24,7 +24,16 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.free_run import continued
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
-from herglotz.training.named_terms import DRY, NamedTerms, candidates, places, settings_of, started, values_of
+from herglotz.training.named_terms import (
+    DRY,
+    NamedTerms,
+    candidates,
+    places,
+    settings_of,
+    shapes_of_dry,
+    started,
+    values_of,
+)
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
@@ -217,8 +226,7 @@ def _open(A: Tensor, absent: dict[str, list[int]], problem: ShootingProblem) -> 
     held = torch.zeros(len(A), dtype=torch.bool)
     held[others] = True
     if DRY in absent:  # what shapes a force of 0 has no effect
-        for shape in ("friction.breakaway", "friction.log"):
-            held[problem.parameters.index(shape)] = True
+        held[shapes_of_dry(problem.parameters)] = True
     free = (~held).nonzero()[:, 0]
     C = torch.zeros_like(A)
     C[free[:, None], free] = inverse_of(A[free][:, free])

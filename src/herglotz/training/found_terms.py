@@ -82,10 +82,8 @@ class Found:
 
     def cost_without(self, names: Sequence[str], floor: float) -> float:
         """Twice what the absence of these parameters costs by the quadratic model of the fit."""
-        problem, x = (
-            self.fit.problem,
-            self.fit.problem.pack(self.fit.theta, self.fit.path.x[:, 0, : self.fit.problem.d]),
-        )
+        problem = self.fit.problem
+        x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
         at = torch.cat([problem.parameters.index(name) for name in names])
         _, A, _ = problem.normal_equations(x)
         own = inverse_of(A.double())[at][:, at]

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
+import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
@@ -256,6 +257,11 @@ def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles:
     values |= zip([x for x in of.features if "v" in x], named.pop(MOVING, ()), strict=True)
     values |= zip(of.drag, named.pop(DRAG, ()), strict=True)
     return values | named
+
+
+def shapes_of_dry(parameters: ParameterVector) -> Tensor:
+    """Places of the numbers that shape dry friction: where its force is 0 they have no effect."""
+    return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])
 
 
 def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:

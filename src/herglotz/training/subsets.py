@@ -16,7 +16,7 @@ from torch import Tensor
 
 from herglotz.training.config import FitConfig
 from herglotz.training.found_terms import Found
-from herglotz.training.named_terms import DRY, NamedTerms, places, values_of
+from herglotz.training.named_terms import DRY, NamedTerms, places, shapes_of_dry, values_of
 from herglotz.training.problems.shooting import ShootingProblem
 
 TRIED = 3  # subsets that are proposed: the quadratic model orders them, and fits decide
@@ -50,7 +50,7 @@ def likelier(
     if DRY in found.terms.names:
         at[DRY] += parameters.index("friction.breakaway").tolist()
     elif DRY in at:  # what shapes a force of 0 has no effect yet
-        held = torch.cat([parameters.index(shape) for shape in ("friction.breakaway", "friction.log")])
+        held = shapes_of_dry(parameters)
     x = problem.pack(parameters.get(), found.fit.path.x[:, 0, : problem.d])
     cost, A, b = (y.double() for y in problem.normal_equations(x))
     if not (bool(cost.isfinite()) and bool(A.isfinite().all())):
