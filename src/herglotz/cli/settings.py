@@ -102,6 +102,10 @@ def add_model_flags(parser: argparse._ActionsContainer) -> None:
         "damper between two, '|v| v' of air, or a constant one, 'load 1' (forced); may be given again",
     )  # fmt: skip
     _setting(parser, "--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
+    _setting(
+        parser, "--absent", action="append", metavar="NUMBER",
+        help="a number of the model that is 0 and not learned, 'potential.tilt[0]'; may be given again",
+    )  # fmt: skip
     _setting(parser, "--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
 
 

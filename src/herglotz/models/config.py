@@ -65,6 +65,8 @@ class ModelConfig:
     translations
         Symmetries of L_d, named by what moves together ("q1 + q2"): no part of it depends on where these coordinates
         are, and what is left of the baseline is not learned (`herglotz.models.translations`).
+    absent
+        Numbers of the model that are 0 and not learned, as `numbers_of` names them: "potential.tilt[0]".
 
     Raises
     ------
@@ -104,6 +106,7 @@ class ModelConfig:
     order: int = 2
     terms: tuple[str, ...] = ()
     translations: tuple[str, ...] = ()
+    absent: tuple[str, ...] = ()
 
     def __post_init__(self):
         self._check_sizes()

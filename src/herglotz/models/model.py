@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,6 +23,17 @@ from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
 from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
+
+
+def numbers_of(model: nn.Module) -> list[str]:
+    """Every number that a model learns, in the order of its parameters: `damping.rate`, `friction.viscous[1]`."""
+    sizes = [(name, parameter.numel()) for name, parameter in model.named_parameters()]
+    return [name if size == 1 else f"{name}[{i}]" for name, size in sizes for i in range(size)]
+
+
+def entry_of(number: str) -> int:
+    """Which entry of its parameter a number is: 1 of `friction.viscous[1]`."""
+    return int(number.partition("[")[2].removesuffix("]") or 0)
 
 
 @dataclass(frozen=True)
@@ -70,6 +82,15 @@ class ContactLagrangian(nn.Module):
         self.drag = Drag([parse_drag(text, c.angles) for text in c.drag], c.dof) if c.drag else None
         self.more = nn.ModuleList(TERMS[name](c) for name in c.terms)
         self.potential.more = tuple(self.named_terms)
+        self._leave_out(c.absent)
+
+    def _leave_out(self, absent: Sequence[str]) -> None:
+        """Set these numbers to 0, where they stay: `herglotz.training.parameter_vector` leaves them out of a fit."""
+        known = numbers_of(self)
+        for name in absent:
+            if name not in known:
+                raise InputError(f"absent: the model has no number '{name}'; its numbers are {', '.join(known)}")
+            self.get_parameter(name.partition("[")[0]).data.view(-1)[entry_of(name)] = 0.0
 
     @property
     def named_terms(self) -> list[Term]:

@@ -17,7 +17,7 @@ RESTARTS = 4  # random initialisations of a single layer: some stall at a hundre
 AS_SET = "as set, or by default"
 HALVED = "the fit needed shorter steps: halved ones change the motion"
 KEPT_STEPS = "halved steps change the motion too little to be worth their time, or other terms stand in for them"
-AS_FOUND = ("order", "features", "drag")  # what the search for terms sets, where the user does not
+AS_FOUND = ("order", "features", "drag", "absent")  # what the search for terms sets, where the user does not
 
 
 class Rule(NamedTuple):
@@ -107,6 +107,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
+        absent=c.absent,
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, zeros=seen.zeros,

@@ -128,6 +128,8 @@ class FitConfig:
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
+    absent
+        Numbers of the model that are 0 and not learned: "potential.tilt[0]" (`herglotz.models.numbers_of`).
     substeps
         Model steps in a recorded step, in trajectory fitting: for samples further apart than the rule is good for. The
         model is then stepped at that part of the data's step.
@@ -171,6 +173,7 @@ class FitConfig:
     drag: tuple[str, ...] = ()
     order: int = 2
     substeps: int = 1
+    absent: tuple[str, ...] = ()
 
     def __post_init__(self):
         for name, choices in CHOICES.items():

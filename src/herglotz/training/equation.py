@@ -25,6 +25,7 @@ from herglotz.models.jet import coordinates
 from herglotz.models.terms import Kinetic
 from herglotz.models.translations import across_in_words
 from herglotz.training.equation_words import drag_in_words, feature_in_words, number, raised, slope, unit_of
+from herglotz.training.parameter_vector import ParameterVector
 
 
 class Run(Protocol):
@@ -114,20 +115,17 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
     run
         A finished fit.
     covariance
-        (P, P) of the parameters in the model's order (`herglotz.training.laplace`), for standard deviations.
+        (P, P) of the numbers that were fitted (`herglotz.training.laplace`), for standard deviations.
     """
-    spread, first, at = covariance, {}, 0
-    for name, parameter in run.model.named_parameters():
-        first[name] = at
-        at += parameter.numel()
-    terms = []
+    spread, terms = covariance, []
+    at = {name: k for k, name in enumerate(ParameterVector(run.model).numbers)}
     for left, what, unit, parts in _parts(run):
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
         deviation = None
         if spread is not None:
             w = spread.new_zeros(len(spread))
             for name, i, by in parts:
-                w[first[name] + i] += by
+                w[[k for k in (at.get(name), at.get(f"{name}[{i}]")) if k is not None]] += by
             deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))

@@ -21,6 +21,7 @@ from herglotz.training.free_run import states_everywhere
 from herglotz.training.inputs import step_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
+from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.plan import Plan
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.supervised import SupervisedProblem
@@ -128,7 +129,7 @@ def _errors(
         "objective": fitted.objective,
         "sigma": fitted.sigma,
         "rate": None if rate is None else float(rate.detach()),
-        "parameters": sum(p.numel() for p in fitted.model.parameters()),
+        "parameters": len(ParameterVector(fitted.model).numbers),
         **fitted.notes,
     }
     return numbers, free

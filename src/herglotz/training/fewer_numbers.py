@@ -10,11 +10,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import torch
+
 from herglotz.data import Trajectories
 from herglotz.training.found_terms import Found
-from herglotz.training.named_terms import NamedTerms
+from herglotz.training.named_terms import STILL, NamedTerms
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import prune
 
+# Numbers that each coordinate has whether the data ask for them or not.
+OWN = ("potential.stiffness", "potential.tilt", "damping.rate", "friction.viscous", "coupling.viscous",
+       "friction.input_map", "friction.input_zero")  # fmt: skip
 SHARED = ("kinetic.off_diagonal", "kinetic.base.off_diagonal", "coupling.viscous")  # what joints that are apart lack
 HOPELESS = 1.5  # times what the fit and its long steps miss: terms that miss so much more are not fitted in short steps
 
@@ -31,7 +37,19 @@ class FewerNumbers:
 
     def of(self, found: Found) -> Found:
         """The model with as few numbers as the data ask for."""
-        return self._one_rate(self._apart(self._undragged(found)))
+        return self._absent(self._one_rate(self._apart(self._undragged(found))))
+
+    def _absent(self, found: Found) -> Found:
+        """Without the springs, tilts, friction and inputs of single coordinates that say nothing."""
+        if self.data.dof == 1 or not found.terms.springs:
+            return found
+        parameters, worth = found.fit.problem.parameters, math.log(self.data.q.numel())
+        baseline = [f"{STILL}[{i}]" for i in range(2 * self.data.dof)] if found.config.order == 4 else []
+        free = [i for i, name in enumerate(parameters.numbers) if name.startswith(OWN) or name in baseline]
+        x, A = found.information(self.floor)
+        kept = prune(A, x, torch.tensor(free, dtype=torch.long), worth)[0].tolist()
+        absent = tuple(parameters.numbers[i] for i in free if i not in kept)
+        return self._simplified(found, replace(found.terms, absent=absent)) if absent else found
 
     def _one_rate(self, found: Found) -> Found:
         """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""

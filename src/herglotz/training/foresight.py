@@ -194,8 +194,9 @@ def _with_absent_terms(
     base = started(task.base, data, values, full)
     more = build_model(base, full, "none")
     more = with_sticking(more, excess=False) if full.sticking else more
-    at = places(ParameterVector(more), every)
-    return more, base, {name: where for name, where in at.items() if name not in own.names}
+    numbers = ParameterVector(more)
+    at = {name: where for name, where in places(numbers, every).items() if name not in own.names}
+    return more, base, at | {name: [i] for i, name in enumerate(numbers.numbers) if name in c.absent}
 
 
 def _summary(A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]]) -> Foresight:

@@ -63,18 +63,21 @@ class Found:
         with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
         return float(with_next) > COLOURED / r.numel() ** 0.5
 
+    def information(self, floor: float) -> tuple[Tensor, Tensor]:
+        """All unknowns, and JᵀJ of residuals over their RMS; misfits below `floor` are rounding."""
+        problem = self.fit.problem
+        x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
+        return x, problem.normal_equations(x)[1] * (problem.sigma / max(self.rms, floor)) ** 2
+
     def needed(self, worth: float, simplest: Collection[str], floor: float, *, one_less: bool = False) -> NamedTerms:
         """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least.
 
         The `simplest` go only where no other one can; misfits below `floor` are rounding.
         """
-        problem = self.fit.problem
-        at = places(problem.parameters, self.terms)
+        at = places(self.fit.problem.parameters, self.terms)
         if not at:
             return self.terms
-        x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
-        _, A, _ = problem.normal_equations(x)
-        A = A * (problem.sigma / max(self.rms, floor)) ** 2
+        x, A = self.information(floor)
         free = torch.tensor([i for own in at.values() for i in own])
         late = torch.tensor([i for name in simplest for i in at.get(name, ())], dtype=torch.long)
         stay = set(prune(A, x, free, worth, len(free) - 1 if one_less else 0, late)[0].tolist())
@@ -82,13 +85,10 @@ class Found:
 
     def cost_without(self, names: Sequence[str], floor: float) -> float:
         """Twice what the absence of these parameters costs by the quadratic model of the fit."""
-        problem = self.fit.problem
-        x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
-        at = torch.cat([problem.parameters.index(name) for name in names])
-        _, A, _ = problem.normal_equations(x)
-        own = inverse_of(A.double())[at][:, at]
-        cost = x[at].double() @ torch.linalg.pinv(own, hermitian=True) @ x[at].double()
-        return float(cost) * (problem.sigma / max(self.rms, floor)) ** 2
+        x, A = (y.double() for y in self.information(floor))
+        at = torch.cat([self.fit.problem.parameters.index(name) for name in names])
+        own = inverse_of(A)[at][:, at]
+        return float(x[at] @ torch.linalg.pinv(own, hermitian=True) @ x[at])
 
     def beaten_by(self, other: Found, floor: float) -> bool:
         """Whether the other one errs less over held-out blocks, by more than a twentieth and more than rounding."""

@@ -94,9 +94,8 @@ class LinearFit:
         R = torch.cat([torch.einsum("apb,tb->tap", unit, kick), R[..., columns]], -1)
         own = -unit.movedim(1, 2) / t.h1[:, None, None, None]
         J = torch.cat([own, J[..., columns]], -1)
-        sizes = dict(zip(parameters.names, parameters.sizes, strict=True))
         R, J = R * balance[:, None], J * (balance[:, None] * balance)[..., None]
-        return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in range(sizes[name])))
+        return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in parameters.index(name)))
 
     def rows(self, which: Tensor) -> LinearFit:
         """The same over some of the triples, (T,) bool."""

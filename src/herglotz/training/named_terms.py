@@ -36,6 +36,7 @@ class NamedTerms:
     one_rate: bool = False  # of several coordinates: damped alike, by the contact form alone, and no forces
     springs: bool = True  # the baseline's own of every coordinate; translations leave them out
     apart: bool = False  # joints have no constant mass and no viscous friction between them
+    absent: tuple[str, ...] = ()  # numbers of the model that are 0
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -194,7 +195,7 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     return replace(
         config, level="forced" if forced else "linear", features=terms.features, drag=terms.drag, coulomb=terms.dry,
         diagonal=several and apart, coupled=forced and several and not apart, order=order, substeps=substeps,
-        objective="trajectory", alike=data.dof == 1,  # the potential holds features alone
+        objective="trajectory", absent=terms.absent, alike=data.dof == 1,  # the potential holds features alone
     )  # fmt: skip
 
 
@@ -266,9 +267,9 @@ def shapes_of_dry(parameters: ParameterVector) -> Tensor:
 
 def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    config = parameters.model.config
-    still = parameters.index(STILL)[2 * config.dof if baseline_is_named(config) else 0 :].tolist()
-    at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
+    names, still = [x for x in terms.features if "v" not in x], parameters.index(STILL).tolist()
+    own = still[len(still) - len(names) :]  # the baseline's come first, where they are features
+    at = dict(zip(names, ([i] for i in own), strict=True))
     at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
     at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)
     if terms.dry:

@@ -9,31 +9,43 @@ from torch import Tensor, nn
 from torch.func import functional_call
 
 from herglotz.mechanics import Partials
-from herglotz.models import Capabilities, ContactLagrangian
+from herglotz.models import Capabilities, ContactLagrangian, numbers_of
 
 
 class ParameterVector:
-    """Partials of a model at any vector of parameters, without touching the model; usable inside vmap and jacrev."""
+    """Partials of a model at any vector of parameters, without touching the model; usable inside vmap and jacrev.
+
+    Numbers that the model's configuration calls `absent` are 0 and no part of the vector.
+    """
 
     def __init__(self, model: ContactLagrangian):
         self.model = model
-        named = dict(model.named_parameters())
+        named, every = dict(model.named_parameters()), numbers_of(model)
         self.names = list(named)
         self.shapes = [p.shape for p in named.values()]
-        self.sizes = [p.numel() for p in named.values()]
+        self.numbers = [name for name in every if name not in model.config.absent]  # (P,) by name
+        self.whole = None if len(self.numbers) == len(every) else torch.tensor([name in self.numbers for name in every])
 
     def get(self) -> Tensor:
         """The current parameters as one vector (P,)."""
-        return nn.utils.parameters_to_vector(self.model.parameters()).detach().clone()
+        theta = nn.utils.parameters_to_vector(self.model.parameters()).detach().clone()
+        return theta if self.whole is None else theta[self.whole.to(theta.device)]
 
     def set(self, theta: Tensor) -> None:
         """Write a vector back into the model."""
-        nn.utils.vector_to_parameters(theta.detach(), self.model.parameters())
+        nn.utils.vector_to_parameters(self._with_absent(theta.detach()), self.model.parameters())
 
     def unflatten(self, theta: Tensor) -> dict[str, Tensor]:
-        """Named parameter tensors."""
-        parts = theta.split(self.sizes)
+        """Named parameter tensors, absent numbers being 0."""
+        parts = self._with_absent(theta).split([shape.numel() for shape in self.shapes])
         return {n: p.reshape(shape) for n, p, shape in zip(self.names, parts, self.shapes, strict=True)}
+
+    def _with_absent(self, theta: Tensor) -> Tensor:
+        """The numbers of all parameters, (N,)."""
+        if self.whole is None:
+            return theta
+        at = self.whole.nonzero()[:, 0].to(theta.device)
+        return theta.new_zeros(len(self.whole)).index_copy(0, at, theta)
 
     def partials(
         self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int, u: Tensor | None = None
@@ -46,11 +58,8 @@ class ParameterVector:
         return FixedModel(self, theta, u)
 
     def index(self, prefix: str) -> Tensor:
-        """Positions in the vector of the parameters whose name starts with `prefix`."""
-        ends = torch.tensor(self.sizes).cumsum(0).tolist()
-        spans = zip(self.names, ends, self.sizes, strict=True)
-        chosen = [torch.arange(end - size, end) for name, end, size in spans if name.startswith(prefix)]
-        return torch.cat(chosen) if chosen else torch.zeros(0, dtype=torch.long)
+        """Positions in the vector of the numbers whose name starts with `prefix`."""
+        return torch.tensor([i for i, name in enumerate(self.numbers) if name.startswith(prefix)], dtype=torch.long)
 
 
 class FixedModel:

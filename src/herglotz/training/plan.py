@@ -40,6 +40,7 @@ class Plan:
     fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
+    absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
 
@@ -47,7 +48,8 @@ class Plan:
         """The settings with what this plan decides."""
         return replace(
             settings, level=self.level, objective=self.objective, order=self.order, features=self.features,
-            departures=self.departures, drag=self.drag, substeps=self.substeps, **self.forces,
+            departures=self.departures, drag=self.drag, substeps=self.substeps, absent=self.absent,
+            **self.forces,
         )  # fmt: skip
 
     def started(self, base: Baseline) -> Baseline:
@@ -75,6 +77,7 @@ class Plan:
             "lag": not self.lag,
             "zeros": not self.zeros,
             "drag": not self.drag,
+            "absent": not self.absent,
             "substeps": self.substeps == 1,
             "continues_probe": not self.continues_probe,
             "fitted_before": not self.fitted_before,
@@ -126,6 +129,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "drag": "friction beside the viscous one",
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",
+    "absent": "numbers that are 0",
     "outliers": "outliers expected",
     "continues_probe": "starts from the fit that measured the noise",
     "sigma": "noise assumed",

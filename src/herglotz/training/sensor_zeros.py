@@ -228,9 +228,10 @@ def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
     at = places(parameters, NamedTerms(config.features, config.drag))
     turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
     turned += [name for name in config.drag if _pushes_on(parse_drag(name, angles))]
-    tilt = parameters.index("potential.tilt").tolist()
+    tilts = [f"potential.tilt[{i}]" for i in range(len(angles))]
     if baseline_is_named(model.config):
-        tilt += parameters.index(STILL)[1 : 2 * len(angles) : 2].tolist()
+        tilts = [f"{STILL}[{i}]" for i in range(1, 2 * len(angles), 2)]
+    tilt = [i for i, name in enumerate(parameters.numbers) if name in tilts]
     return torch.tensor([*tilt, *(i for name in turned for i in at[name])], dtype=torch.long)
 
 

@@ -49,7 +49,7 @@ EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs
 EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
-         "coupled")  # fmt: skip
+         "coupled", "absent")  # fmt: skip
 TOLD = ("reason", "sigma", "doubt", "apart")  # of `Structure`, as a checkpoint has it
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"

@@ -19,7 +19,7 @@ EXACT = {"float64": 1e-8, "float32": 1e-5}  # σ of exact data relative to the m
 
 # Settings of a fit that its model has under the same name.
 AS_SET = ("level", "seed", "activation", "mass_width", "action_width", "coulomb", "input_map", "known", "alike",
-          "diagonal", "coupled", "drag", "order", "terms", "translations")  # fmt: skip
+          "diagonal", "coupled", "drag", "order", "terms", "translations", "absent")  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -174,9 +174,7 @@ class Laplace:
 
     def names(self) -> list[str]:
         """Every entry of the parameters θ by name: `damping.rate`, `potential.network.weights.0[3]`."""
-        parameters = self.problem.parameters
-        every = zip(parameters.names, parameters.sizes, strict=True)
-        return [name if size == 1 else f"{name}[{i}]" for name, size in every for i in range(size)]
+        return self.problem.parameters.numbers
 
     def effective_parameters(self) -> float:
         """How many of the parameters the data determine: P − tr(C A_prior) (MacKay 1992)."""

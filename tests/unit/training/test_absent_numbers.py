@@ -1,0 +1,95 @@
+"""Numbers of a model that are 0 and no unknowns of a fit."""
+
+from types import SimpleNamespace
+
+import pytest
+import torch
+from torch.func import jacrev
+
+from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
+from herglotz.training.equation import equation_of
+from herglotz.training.fewer_numbers import FewerNumbers
+from herglotz.training.named_terms import NamedTerms
+from herglotz.training.parameter_vector import ParameterVector
+
+ABSENT = ("potential.stiffness[0]", "friction.viscous[1]")
+
+
+def two_bodies(absent=ABSENT):
+    pair = {name: (1.0, 1.0) for name in ("scale", "speed", "tilt")}
+    settings = {**pair, "angles": (False, False), "stiffness": (4.0, 5.0), "potential_width": 0, "level": "forced"}
+    return ContactLagrangian(ModelConfig(**settings, diagonal=True, absent=absent))
+
+
+def test_absent_numbers_are_zero_and_no_unknowns():
+    # fails if one of them is moved, is counted, or shifts the places of those behind it
+    whole, model = numbers_of(two_bodies(())), two_bodies()
+    vector = ParameterVector(model)
+    assert vector.numbers == [name for name in whole if name not in ABSENT]
+    assert model.potential.stiffness.tolist() == [0.0, 5.0]
+    vector.set(torch.arange(1.0, len(vector.numbers) + 1, dtype=torch.float64))
+    values = dict(zip(whole, torch.cat([p.detach().reshape(-1) for p in model.parameters()]).tolist(), strict=True))
+    assert [values[name] for name in ABSENT] == [0.0, 0.0]
+    assert [values[name] for name in vector.numbers] == vector.get().tolist()
+    assert [vector.numbers[i] for i in vector.index("potential")] == [x for x in vector.numbers if "potential" in x]
+
+
+def test_derivatives_see_what_is_left():
+    # fails if an absent number gets a column, or a column its neighbour's derivative
+    vector, q = ParameterVector(two_bodies()), torch.tensor([0.3, -0.2], dtype=torch.float64)
+    value = lambda theta: vector.partials(theta, q, 2 * q, q[0] * 0, q[0], 1).L  # noqa: E731
+    slope = jacrev(value)(vector.get())
+    theta, eps = vector.get(), 1e-6
+    for i in range(len(theta)):
+        ahead, behind = (theta.index_add(0, torch.tensor([i]), theta.new_tensor([d])) for d in (eps, -eps))
+        assert float(slope[i]) == pytest.approx(float(value(ahead) - value(behind)) / (2 * eps), abs=1e-9)
+
+
+def test_a_number_that_is_not_there_is_named():
+    # fails if a misspelt name leaves everything as it is
+    with pytest.raises(InputError, match=r"no number 'potential.stiffness\[2\]'; its numbers are .*stiffness\[1\]"):
+        two_bodies(("potential.stiffness[2]",))
+
+
+def test_the_equation_gives_each_number_its_own_deviation():
+    # fails if deviations are read at the places that numbers have in a model without absent ones
+    model = two_bodies()
+    numbers = ParameterVector(model).numbers
+    deviations = torch.arange(1.0, len(numbers) + 1, dtype=torch.float64)
+    data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
+    terms = equation_of(SimpleNamespace(model=model, data=data), deviations.square().diag()).terms  # pyright: ignore
+    found = {(term.left, term.what): term.deviation for term in terms}
+    assert found[("b″", "b")] == pytest.approx(float(deviations[numbers.index("potential.stiffness[1]")]))
+    assert found[("b″", "")] == pytest.approx(float(deviations[numbers.index("potential.tilt[1]")]))
+    assert ("a″", "a") not in found
+
+
+class OneNumber(SimpleNamespace):
+    """A fit of two bodies with the numbers `x`, each known to 1."""
+
+    def information(self, _floor):
+        return self.x, torch.eye(len(self.x), dtype=self.x.dtype)
+
+
+@pytest.mark.parametrize(("value", "absent"), [(2.0, True), (3.0, False)])
+def test_numbers_that_say_nothing_are_left_out(value, absent):
+    # fails if one that is worth less than half the logarithm of the number of data stays, or one that is worth more
+    # goes: 2² < ln 500 = 6.2 < 3²
+    vector = ParameterVector(two_bodies(()))
+    x = torch.full((len(vector.numbers),), 10.0, dtype=torch.float64)
+    x[vector.numbers.index("friction.viscous[0]")] = value
+    fit = SimpleNamespace(theta=x, problem=SimpleNamespace(parameters=vector))
+    config = SimpleNamespace(order=2, substeps=1, level="forced", sticking=False)
+    start = OneNumber(x=x, fit=fit, config=config, terms=NamedTerms(("q1 v2",)), rms=1.0, coloured=False)
+    tried = []
+
+    def refit(_of, terms):
+        tried.append(terms.absent)
+        return SimpleNamespace(terms=terms, rms=1.0, fit=SimpleNamespace(theta=x[1:]), config=config)
+
+    data = SimpleNamespace(q=torch.zeros(250, 2), dof=2, angles=(False, False), u=None)
+    kept = FewerNumbers(data, 0.0, 2, refit, lambda *_: (None, None))._absent(start)  # type: ignore[arg-type]
+    assert tried == [("friction.viscous[0]",)] * absent
+    assert kept.terms.absent == ("friction.viscous[0]",) * absent
