@@ -36,7 +36,9 @@ def test_one_triple_is_data_but_cannot_be_split():
     assert len(data.triples()) == 1
     base = estimate_baseline(data)
     assert torch.isfinite(torch.tensor([base.rate, *base.stiffness, *base.tilt, *base.speed])).all()
-    with pytest.raises(InputError, match=r"cuts trajectory 0 into 2 and 1 samples, each part needs 3; change the frac"):
+    with pytest.raises(
+        InputError, match=r"cuts the 3 samples of trajectory 0 into 2 and 1, each part needs 3; record more"
+    ):
         herglotz.fit(data)
 
 
@@ -59,8 +61,11 @@ def test_one_trajectory_is_enough():
 def test_a_constant_trajectory_is_refused(value):
     # fails if a motion that determines nothing is fitted: every L_d with M ≠ 0 that rests there would do
     data = Trajectories.of(torch.arange(50) * 0.1, torch.full((50,), value))
-    with pytest.raises(InputError, match="coordinate 'q' never moves; leave it out"):
+    with pytest.raises(InputError, match="coordinate 'q' never moves; record a motion"):
         herglotz.fit(data)
+    two = Trajectories.of(data.t, torch.stack([data.t.sin(), data.q[:, 0]], 1), names=("x", "temperature"))
+    with pytest.raises(InputError, match=r"'temperature' never moves; leave it out: --drop temperature \(drop= in"):
+        herglotz.fit(two)
 
 
 def test_steps_that_vary_by_ten_thousand():

@@ -6,11 +6,18 @@ import argparse
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_folder, exit_code, print_json, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
-from herglotz.cli.settings import add_expert_flags, add_machine_flags, add_model_flags, add_optimiser_flags, settings_of
+from herglotz.cli.settings import (
+    add_expert_flags,
+    add_machine_flags,
+    add_model_flags,
+    add_optimiser_flags,
+    data_of,
+    settings_of,
+)
 
 if TYPE_CHECKING:
     from herglotz.data import Trajectories
@@ -55,15 +62,13 @@ def run(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     check_run_folder(out, arguments.resume)
 
-    from herglotz.data import load
     from herglotz.training import load_run
 
     config = settings_of(arguments)
     if arguments.tensorboard is not None:
         check_output_folder(arguments.tensorboard)
-    data = load(arguments.data, **columns_of(arguments))
-    data = replace(data, hold=arguments.hold or data.hold).thinned(arguments.every)
-    _fit_into(out, data, config, arguments)
+    data, reading = data_of(arguments, columns_of(arguments))
+    _fit_into(out, data, config, reading, arguments)
     result = load_run(out)  # what later commands will see, and on the cpu
     drawn = _draw(result, out) if not arguments.no_plots else []
     if arguments.json:
@@ -73,7 +78,9 @@ def run(arguments: argparse.Namespace) -> int:
     return exit_code(result)
 
 
-def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argparse.Namespace) -> None:
+def _fit_into(
+    out: Path, data: Trajectories, config: FitConfig, reading: dict[str, Any], arguments: argparse.Namespace
+) -> None:
     """Train and save; a folder that was made for nothing goes again."""
     from herglotz.data.lock import locked
     from herglotz.training import fit, save_run
@@ -82,7 +89,8 @@ def _fit_into(out: Path, data: Trajectories, config: FitConfig, arguments: argpa
     try:
         with locked(out):
             shown = {"progress": progress(arguments), "tensorboard": arguments.tensorboard}
-            save_run(fit(data, config, out=out, resume=arguments.resume, **shown), out)
+            done = fit(data, config, out=out, resume=arguments.resume, **shown)
+            save_run(replace(done, reading=reading), out)
     except KeyboardInterrupt:
         if (out / "checkpoint.pt").exists():
             raise KeyboardInterrupt("; the same command with --resume goes on") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
+from pathlib import Path
 from typing import NoReturn
 
 import herglotz
@@ -66,7 +67,8 @@ class Parser(argparse.ArgumentParser):
         """Refuse what no flag takes here, where the subcommand's own help is the one to name."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
-            self.error(f"unrecognized arguments: {' '.join(rest)}")
+            files = "; several recordings: name the folder they are in" if Path(rest[0]).exists() else ""
+            self.error(f"unrecognized arguments: {' '.join(rest)}{files}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:

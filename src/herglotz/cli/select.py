@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import replace
 from pathlib import Path
 
 from herglotz.cli.common import count, exit_code, print_json
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
-from herglotz.cli.settings import LEVELS, add_machine_flags, settings_of
+from herglotz.cli.settings import LEVELS, add_machine_flags, data_of, settings_of
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -42,13 +43,12 @@ def run(arguments: argparse.Namespace) -> int:
     out: Path = arguments.out
     check_run_folder(out, arguments.resume)
 
-    from herglotz.data import load
     from herglotz.data.files import write_atomically
     from herglotz.data.lock import locked
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
 
-    data = load(arguments.data, **columns_of(arguments))
+    data, reading = data_of(arguments, columns_of(arguments))
     config = settings_of(arguments)
     levels = None
     if arguments.levels is not None:
@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         found = select(
             data, levels, arguments.seeds, config, out=out, resume=arguments.resume, progress=progress(arguments)
         )
-        save_run(found.run, out)
+        save_run(replace(found.run, reading=reading), out)
         write_atomically(out / "selection.json", found.to_json().encode())
         save_figure(plot_selection(found), out / "selection.png")
     if arguments.json:

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import fields
+import sys
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import count, existing, finite, positive, seed
+from herglotz.cli.common import count, existing, finite, positive, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
+    from herglotz.data import Trajectories
     from herglotz.training import FitConfig
 
 # Copies, so that help does not import PyTorch; a test compares them.
@@ -34,22 +36,52 @@ def settings_of(arguments: argparse.Namespace) -> FitConfig:
     """
     from herglotz.training import FitConfig
 
-    path: Path | None = arguments.config
-    config = FitConfig() if path is None else _read(path, FitConfig)
+    config = FitConfig() if arguments.config is None else _read(arguments.config)[0]
     names = {field.name for field in fields(FitConfig)}
     given = {name: x for name, x in vars(arguments).items() if name in names}
     return config.changed({name: tuple(x) if isinstance(x, list) else x for name, x in given.items()})
 
 
-def _read(path: Path, kind: type[FitConfig]) -> FitConfig:
+def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Trajectories, dict[str, Any]]:
+    """The recording and how it was read: as --config says of its own data, with the flags that were given over it.
+
+    Raises
+    ------
+    InputError
+        If the file is no `config.json` of a run, or the recording cannot be read that way.
+    """
+    from herglotz.data import load
+
+    before = {} if arguments.config is None else _read(arguments.config)[1]
+    given = {name: x for name in ("hold", "every") if (x := getattr(arguments, name, None)) is not None}
+    told = before | columns | given
+    if before:
+        told_before = ", ".join(f"{name} {_in_words(x)}" for name, x in before.items() if told[name] is x)
+        say(
+            f"herglotz: note: read as {arguments.config} says: {told_before or 'nothing, flags stand over it'}",
+            sys.stderr,
+        )
+    data = load(arguments.data, **{name: x for name, x in told.items() if name not in ("hold", "every")})
+    return replace(data, hold=told.get("hold", data.hold)).thinned(told.get("every", 1)), told
+
+
+def _in_words(value: Any) -> str:
+    return (",".join(map(str, value)) or "none") if isinstance(value, list) else str(value)
+
+
+def _read(path: Path) -> tuple[FitConfig, dict[str, Any]]:
+    """The settings in a run's config.json, and how its data were read."""
     from herglotz.data.files import read_bytes
+    from herglotz.training import FitConfig
+    from herglotz.training.reading import reading_in
 
     file = path / "config.json" if path.is_dir() else path
     content = read_bytes(file)
     try:
         values: Any = json.loads(content)
-        return kind.from_dict({**values, "device": "cpu"})
-    except (ValueError, TypeError, RecursionError) as error:
+        reading = reading_in(values, "config.json")
+        return FitConfig.from_dict({**values, "device": "cpu"}), reading
+    except (ValueError, TypeError, AttributeError, RecursionError) as error:
         line = " ".join(str(error).split())[:200]
         raise InputError(f"--config {file}: {line}; give the config.json of a run, or the run's folder") from None
 
@@ -58,8 +90,8 @@ def add_data_settings(parser: argparse._ActionsContainer) -> None:
     """Add --config and --train-fraction."""
     parser.add_argument(
         "--config", type=existing, metavar="FILE",
-        help="settings that another run was told: its folder or its config.json; flags that are given stand over them. "
-        "On the same data, read the same way, it is the same fit",
+        help="settings that another run was told, and how its data were read: its folder or its config.json; flags "
+        "that are given stand over them. On the same data it is the same fit",
     )  # fmt: skip
     _setting(
         parser, "--train-fraction", type=finite, metavar="F",
@@ -154,8 +186,8 @@ def _add_amount_flags(parser: argparse._ActionsContainer) -> None:
         help="model steps in a recorded step, for samples far apart; with --objective trajectory (default 1)",
     )  # fmt: skip
     parser.add_argument(
-        "--every", type=count, default=1, metavar="M",
-        help="use every M-th sample only; inputs are averaged over the steps (default %(default)s)",
+        "--every", type=count, metavar="M",
+        help="use every M-th sample only; inputs are averaged over the steps (default 1)",
     )  # fmt: skip
     _setting(
         parser, "--iterations", type=count, metavar="K",

@@ -14,12 +14,13 @@ def column_table(
     columns: Sequence[tuple[str, str, str]],  # name, role and unit of each column, as it was read
     labels: Labels,  # of what was made of them
     source: str,
+    notes: Sequence[str] = (),
 ) -> str:
-    """Return a line a column: its role, and its unit with the conversion that was made."""
+    """Return a line a column: its role, and its unit with the conversion that was made; then the notes."""
     rows = [("column", "is taken for", "unit"), *column_rows(columns, labels)]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
-    return "\n".join([f"{source or 'table'}:", *lines])
+    return "\n".join([f"{source or 'table'}:", *lines, *(f"  {note}" for note in notes)])
 
 
 def column_rows(columns: Sequence[tuple[str, str, str]], labels: Labels) -> list[tuple[str, str, str]]:

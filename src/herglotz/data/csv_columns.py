@@ -12,6 +12,8 @@ from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
+# A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
+SUFFIX = re.compile(r"(?!p_|u_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 ROLES = {
     "time": re.compile(r"t|time|timestamp|datetime"),
     "trajectory": re.compile(r"trajectory|trial|run"),
@@ -193,9 +195,9 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
             raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
         found.append(of)
     often = Counter(name for name, _ in found)
-    # Of `x (raw)` and `x (filtered)` the brackets hold no unit.
+    # Of `x (raw)` and `x (filtered)` the brackets hold no unit, and `x_deg` beside `x_rad` has its whole name.
     found = [
-        (cell.strip(), "") if often[of[0]] > 1 and cell.endswith(")") else of
+        (cell.strip(), "" if cell.endswith(")") else of[1]) if often[of[0]] > 1 and not cell.endswith("]") else of
         for cell, of in zip(cells, found, strict=True)
     ]
     names, units = tuple(name for name, _ in found), tuple(unit for _, unit in found)
@@ -207,9 +209,13 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
 
 
 def name_and_unit(cell: str) -> tuple[str, str] | None:
-    """What a cell of a header says, `x[m]` or `x (m)`; None where it is no such cell."""
+    """What a cell of a header says, `x[m]`, `x (m)` or `x_deg`; None where it is no such cell."""
     match = HEADER_CELL.fullmatch(cell)
-    return (match[1], (match[2] or match[3] or "").strip()) if match and cell.isprintable() else None
+    if not match or not cell.isprintable():
+        return None
+    if match[2] is None and match[3] is None and (ends := SUFFIX.fullmatch(match[1])):
+        return ends[1] or ends[3], (ends[2] or ends[4]).lower().replace("_", "/")
+    return match[1], (match[2] or match[3] or "").strip()
 
 
 def _momenta(where: str, q: list[str], p: dict[str, int]) -> tuple[int, ...]:

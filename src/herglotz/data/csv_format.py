@@ -14,8 +14,9 @@ import numpy as np
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
+from herglotz.data.csv_dialect import cells_of, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import SHOWN, number, quote
+from herglotz.data.rows import SHOWN, number, number_or_none, quote
 from herglotz.data.sensors import measured
 from herglotz.data.table import from_numbers, from_table, moment
 from herglotz.data.trajectories import Trajectories
@@ -73,18 +74,16 @@ def read_table(path: PathLike, wanted: Wanted) -> Trajectories:
 def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
     """Row by row: dates, names of trajectories, and the place of every mistake."""
     lines = read_lines(path)
-    rows = [(i, line) for i, line in enumerate(lines, 1) if line.strip() and not line.lstrip().startswith("#")]
+    rows, notes = in_commas(path, lines)
     if not rows:
         raise InputError(f"{Path(path)}: there is no header; add a first line such as t[s],q[rad]")
     at, header = rows[0]
-    if "," not in header and (";" in header or "\t" in header):
-        raise InputError(f"{Path(path)}, row {at}: columns are separated by commas here; replace ';' or tabs by ','")
-    columns = assign(_cells(header), f"{path}, row {at}", wanted)
-    found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]))
-    if not is_number(_cells(rows[1][1])[columns.time]):
+    columns = assign(cells_of(header), f"{path}, row {at}", wanted)
+    found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]), lambda found: _held(found, lines))
+    if not is_number(cells_of(rows[1][1])[columns.time]):
         roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
         found = replace(found, columns=tuple(roles))
-    return _held(found, lines)
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
@@ -105,7 +104,7 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
     try:
         with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
             lines = rows(file)
-            columns = assign(_cells(next(lines)), str(path), wanted)
+            columns = assign(cells_of(next(lines)), str(path), wanted)
             table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
     except (OSError, ValueError, StopIteration, InputError):
         return None  # read row by row, the mistake has a place
@@ -163,18 +162,15 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     write_atomically(path, ("\n".join(lines) + "\n").encode())
 
 
-def _cells(line: str) -> list[str]:
-    return [cell.strip().strip('"').strip() for cell in line.split(",")]
-
-
 def _parse_rows(
     path: Path, columns: Columns, rows: Sequence[tuple[int, str]]
 ) -> tuple[list[int], list[str], list[list[float]]]:
     """Return line number, trajectory label and numbers of every row."""
     width, labels, values = len(columns.names), [], []
     first = None  # date of the first row, where times are dates
+    parse = {i: number if i in (columns.time, *columns.u) else number_or_none for i in columns.numeric}
     for at, line in rows:
-        cells = _cells(line)
+        cells = cells_of(line)
         if len(cells) != width:
             raise InputError(
                 f"{path}, row {at}: {len(cells)} cells where the header has {width}; correct or delete the row"
@@ -183,7 +179,7 @@ def _parse_rows(
         if date is not None and not is_number(cells[columns.time]):
             first = first or date
             cells[columns.time] = repr(_since(first, date, f"{path}, row {at}"))
-        values.append([number(cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
+        values.append([parse[i](cells[i], f"{path}, row {at}, column '{columns.names[i]}'") for i in columns.numeric])
         labels.append("" if columns.trajectory is None else cells[columns.trajectory])
     if any(labels) and not all(labels):
         at = rows[labels.index("")][0]
@@ -201,7 +197,7 @@ def _check_header(path: Path, header: list[str], trajectories: Trajectories) -> 
     """Raise unless `read_csv` would give every column of this header its present role."""
     line = ",".join(header)
     try:
-        back = assign(_cells(line), "header")
+        back = assign(cells_of(line), "header")
         same = [back.names[i] for i in back.q] == list(trajectories.names) and len(back.names) == len(header)
         units = tuple(back.units[i] for i in back.q) == trajectories.units
         clock = back.time == 1 and back.units[1] == trajectories.time_unit

@@ -14,6 +14,7 @@ from herglotz.errors import InputError
 
 PathLike = str | os.PathLike[str]
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or what this user may take of it
+UNITS = "°µ²³·".encode("cp1252")  # what spreadsheets that do not write UTF-8 write in units
 TEMPORARY = ".{}.????????.tmp"  # names that `tempfile.mkstemp` gives to what becomes a file of this name
 
 
@@ -46,16 +47,17 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
 
 
 def read_lines(path: PathLike) -> list[str]:
-    r"""Return the lines of a UTF-8 text file, without their ends (\n, \r\n or \r).
+    r"""Return the lines of a text file, without their ends (\n, \r\n or \r): UTF-8, or else units in Windows' letters.
 
     Raises
     ------
     InputError
-        As `read_bytes`, and if the file is not UTF-8.
+        As `read_bytes`, and if the file is neither.
     """
     content = read_bytes(path)
+    windows = all(byte < 128 or byte in UNITS for byte in set(content))
     try:
-        text = content.decode("utf-8-sig")  # spreadsheets put a byte-order mark first
+        text = content.decode("cp1252" if windows else "utf-8-sig")  # spreadsheets put a byte-order mark first
     except UnicodeDecodeError as error:
         row = content.count(b"\n", 0, error.start) + 1
         raise InputError(

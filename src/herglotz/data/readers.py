@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
+import textwrap
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,18 +38,20 @@ FORMATS = (
     Format(
         "IBM double pendulum, six marker columns (.csv)", ".csv", read_ibm_double_pendulum, False, looks_like_markers,
     ),
-    Format("t[s],q[rad],... (.csv)", ".csv", lambda path, **columns: read_table(path, Wanted(**columns)), True),
     Format("arrays t, q, ... (.npz)", ".npz", read_npz),
     Format(
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
         lambda line: line.startswith("%"),
     ),
+    *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_table(path, Wanted(**columns)), True)
+      for end in (".csv", ".txt", ".tsv", ".dat")),
     Format("columns as in csv (.parquet)", ".parquet", read_parquet, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_hdf5, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_hdf5, True),
     Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_mat, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
+SHOWN = 76  # characters of the note that names the files of a folder: a line of a terminal
 
 
 def load(
@@ -67,7 +70,8 @@ def load(
     Parameters
     ----------
     path
-        .csv, .npz, .txt of Schmidt & Lipson, or with the extra `tables` .parquet, .h5 or .mat.
+        .csv (or such a table in .txt, .tsv, .dat), .npz, .txt of Schmidt & Lipson, or with the extra `tables` .parquet,
+        .h5 or .mat; or a folder of such files: each holds a recording, in the order of their names.
     angles
         Coordinates that are angles; left out: those in rad or deg; () for none.
     unwrap
@@ -95,7 +99,13 @@ def load(
         If the format is not known (the message lists those that are), or from the reader of that format.
     """
     columns.setdefault("known", () if like is None else like.columns)
-    found = measured(in_radians_and_seconds(_read(Path(path), Wanted(**columns))), sensor_zeros, sensor_scales)
+    wanted = Wanted(**columns)
+    files = _files(path := Path(path))
+    found = Trajectories.cat([in_radians_and_seconds(_read(file, wanted)) for file in files])
+    if path.is_dir():
+        which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
+        found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
+    found = measured(found, sensor_zeros, sensor_scales)
     if angles is not None:
         found = found.with_angles(angles)
     elif like is not None:
@@ -136,6 +146,19 @@ def save(path: PathLike, trajectories: Trajectories) -> None:
             write_npz(path, trajectories)
         case other:
             raise InputError(f"{path}: cannot write {other or 'a file without extension'}; written are {WRITES}")
+
+
+def _files(path: Path) -> list[Path]:
+    """The file itself, or the files of a folder that can be read."""
+    if not path.is_dir():
+        return [path]
+    if (path / "model.pt").exists():
+        raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
+    known = {one.suffix for one in FORMATS}
+    found = sorted(file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    if not found:
+        raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
+    return found
 
 
 def _read(path: Path, wanted: Wanted) -> Trajectories:

@@ -11,6 +11,7 @@ from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.errors import InputError
 
 SHOWN = 40  # characters of a bad cell that a message quotes
+MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # what programs write where a value is missing
 
 
 def quote(text: str) -> str:
@@ -41,6 +42,11 @@ def number(
     if not math.isfinite(value):
         raise InputError(f"{where}: {quote(text)} is not finite; correct or delete the row")
     return value
+
+
+def number_or_none(text: str, where: str) -> float:
+    """As `number`, but NaN for a cell without a value: the sample is missing."""
+    return math.nan if text.casefold() in MISSING else number(text, where)
 
 
 def group_rows(

@@ -35,8 +35,9 @@ def time_split(
     for b, (cut, left) in enumerate(zip(cuts, rest, strict=True)):
         if min(cut, left) < MIN_SAMPLES:
             raise InputError(
-                f"{source or 'trajectories'}: fraction {fraction:g} cuts trajectory {b} into {cut} and {left} "
-                f"samples, each part needs {MIN_SAMPLES}; change the fraction or leave the trajectory out"
+                f"{source or 'trajectories'}: fraction {fraction:g} cuts the {cut + left} samples of trajectory {b} "
+                f"into {cut} and {left}, each part needs {MIN_SAMPLES}; record more, change the fraction, or leave the "
+                "trajectory out"
             )
         train.append(torch.arange(start, start + cut))
         test.append(torch.arange(start + cut, start + cut + left))

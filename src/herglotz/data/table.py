@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
@@ -21,9 +23,13 @@ def from_table(
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
     labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one; whole numbers, or else names
-    values: Any,  # (N, columns.numeric) numbers
+    values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s or a momentum is missing
+    said: Callable[[Trajectories], Trajectories] = lambda found: found,  # adds what the file says beside the table
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
+
+    Rows in which a value is missing are left out, and a note says how many: the step over them is longer, with the mean
+    of their inputs.
 
     Raises
     ------
@@ -32,7 +38,33 @@ def from_table(
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
-    return _trajectories(path, columns, values[[i for group in groups for i in group]], tuple(map(len, groups)))
+    missing = np.isnan(values).any(1)
+    if not missing.any():
+        order, lengths = [i for group in groups for i in group], tuple(map(len, groups))
+        return said(_trajectories(path, columns, values[order], lengths))
+    for group in groups:
+        _check_enough(path, columns, at, values, group)
+    # A step starts at a sample that is known, so that a trajectory does.
+    groups = [group[int(np.argmin(missing[group])) :] for group in groups]
+    order = [i for group in groups for i in group]
+    found = said(_trajectories(path, columns, np.nan_to_num(values[order]), tuple(map(len, groups))))
+    found = found.keep(torch.from_numpy(~missing[order]))
+    first = int(missing.argmax())
+    name = columns.names[columns.numeric[int(np.isnan(values[first]).argmax())]]
+    count = "a row is" if missing.sum() == 1 else f"{missing.sum()} rows are"
+    return replace(found, notes=(f"{count} left out, without a value: the first is row {at[first]}, column '{name}'",))
+
+
+def _check_enough(path: Path, columns: Columns, at: Sequence[int], values: np.ndarray, group: list[int]) -> None:
+    """Raise unless three rows of this trajectory have all their values."""
+    gone = np.isnan(values[group])
+    if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
+        name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
+        raise InputError(
+            f"{path}, row {at[group[0]]}: of the {len(group)} rows from here, {known} have a value in every column, at "
+            f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
+            "(drop= in Python), or fill it in"
+        )
 
 
 def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
@@ -101,7 +133,9 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     heads = [str(name) for name in frame.columns]
     columns = assign(heads, str(where), wanted)
     raw = [np.asarray(frame[name]) for name in frame.columns]
-    numbers = np.stack([_numbers(where, columns.names[i], raw[i], i == columns.time) for i in columns.numeric], 1)
+    known = (columns.time, *columns.u)  # columns without which no other value of the row has a meaning
+    every = [_numbers(where, columns.names[i], raw[i], i == columns.time, i in known) for i in columns.numeric]
+    numbers = np.stack(every, 1)
     labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     return from_table(where, columns, range(len(numbers)), labels, numbers)
 
@@ -130,8 +164,8 @@ def _called(columns: Columns) -> tuple[str, str]:
     return label, columns.names[columns.time]
 
 
-def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool) -> np.ndarray:
-    """A column as finite float64; dates become seconds since the first of them."""
+def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool, known: bool) -> np.ndarray:
+    """A column as float64, finite or, unless it must be known, NaN; dates become seconds since the first of them."""
     if is_time and column.dtype.kind == "M":
         return (column - column[:1]) / np.timedelta64(1, "s")
     try:
@@ -140,7 +174,7 @@ def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool) -> np.nd
         raise InputError(f"{where}, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
     if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
         raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
-    bad = np.nonzero(~np.isfinite(found))[0]
+    bad = np.nonzero(~np.isfinite(found) if known else np.isinf(found))[0]
     if len(bad):
         raise InputError(f"{where}, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
     return found

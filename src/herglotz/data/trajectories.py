@@ -18,7 +18,7 @@ from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import liveliest_rows, time_split
 from herglotz.data.thinning import every_mth, inputs_of_kept
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 DEGREES = ("deg", "°", "degree", "degrees")
 GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
@@ -37,8 +37,8 @@ class Trajectories:
         (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
     s, p, u
         (N,) action, (N, n) momentum and (N, m) control input, where they are known.
-    time_unit, source, columns
-        Of t; origin, for messages; name, role and unit of each column that was read.
+    time_unit, source, columns, notes
+        Of t; origin, for messages; name, role and unit of each column that was read, and what else was made of them.
     hold, delay, lag
         What u does between samples, and the delay and the time constant with which it acts; 0: u is what acts.
 
@@ -63,6 +63,7 @@ class Trajectories:
     delay: float | None = None  # with which u acts (`herglotz.data.actuator`); None: not said
     lag: float | None = None  # time constant of the actuator; None: not said
     columns: tuple[tuple[str, str, str], ...] = ()  # name, role and unit of each column of a table, as it was read
+    notes: tuple[str, ...] = ()  # on reading the table: its separators, rows left out
 
     def __post_init__(self) -> None:
         labels = Labels(self.names, self.units, self.angles, self.time_unit)
@@ -206,8 +207,7 @@ class Trajectories:
     def irregular(self) -> bool:
         """Whether the steps differ by more than clocks do, also where no sample is missing."""
         h = self.steps().h
-        h = h[h <= GAP * h.median()]
-        return float(h.std(correction=0)) > IRREGULAR * float(h.median())
+        return float(h[h <= GAP * h.median()].std(correction=0)) > IRREGULAR * self.typical_step
 
     @property
     def gaps(self) -> int:
@@ -269,12 +269,12 @@ class Trajectories:
         columns = {name: torch.cat([getattr(one, name) for one in sets]) for name in present}
         lengths = tuple(length for one in sets for length in one.lengths)
         source = ", ".join(dict.fromkeys(one.source for one in sets if one.source))
-        return replace(sets[0], **columns, lengths=lengths, source=source)
+        notes = tuple(dict.fromkeys(note for one in sets for note in one.notes))
+        return replace(sets[0], **columns, lengths=lengths, source=source, notes=notes)
 
     def to(self, dtype: torch.dtype | None = None, device: torch.device | str | None = None) -> Trajectories:
         """Return the set in another dtype (float32 or float64) or on another device."""
-        if dtype is not None and dtype not in DTYPES:
-            raise InputError(f"dtype must be torch.float32 or torch.float64, got {dtype}")
+        refuse({f"dtype must be torch.float32 or torch.float64, got {dtype}": dtype not in (None, *DTYPES)})
         return replace(self, **self._map(lambda x: x.to(device=device, dtype=dtype or x.dtype)))
 
     def unwrapped(self) -> Trajectories:
@@ -317,10 +317,9 @@ class Trajectories:
         known += "".join(f", input {name}" + (f" [{unit}]" if unit else "") for name, unit in self.input_labels)
         plural, unit = "y" if len(self) == 1 else "ies", "" if self.time_unit == "1" else f" {self.time_unit}"
         gaps = f", {self.gaps} gap{'' if self.gaps == 1 else 's'}" if self.gaps else ""
-        step = f"step {self.typical_step:.4g}{unit}{gaps}"
-        if self.irregular:
-            h = self.steps().h
-            step = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
+        h = self.steps().h
+        irregular = f"irregular steps, {float(h.min()):.3g} to {float(h.max()):.3g}{unit}"
+        step = irregular if self.irregular else f"step {self.typical_step:.4g}{unit}{gaps}"
         return (
             f"{self.source or 'trajectories'}: {len(self)} trajector{plural}, {self.samples} samples of "
             f"{coordinates}{known}; {step}"
@@ -328,7 +327,8 @@ class Trajectories:
 
     def table(self) -> str:
         """Return what every column of the table that was read was taken for, a line each, for people."""
-        return column_table(self.columns, Labels(self.names, self.units, self.angles, self.time_unit), self.source)
+        labels = Labels(self.names, self.units, self.angles, self.time_unit)
+        return column_table(self.columns, labels, self.source, self.notes)
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}

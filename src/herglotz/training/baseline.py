@@ -48,9 +48,12 @@ class Baseline:
 
 
 def _check_moved(data: Trajectories, speed: list[float]) -> None:
-    for name, moved in zip(data.names, speed, strict=True):
-        if moved == 0:
-            raise InputError(f"{data.source or 'data'}: coordinate '{name}' never moves; leave it out")
+    still = [name for name, moved in zip(data.names, speed, strict=True) if moved == 0]
+    remedy = (
+        "record a motion" if len(still) == data.dof else f"leave it out: --drop {','.join(still)} (drop= in Python)"
+    )
+    for name in still:
+        raise InputError(f"{data.source or 'data'}: coordinate '{name}' never moves; {remedy}")
 
 
 def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool = False, substeps: int = 1) -> Baseline:

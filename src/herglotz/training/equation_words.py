@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from herglotz.models.drag import DragFeature
 from herglotz.models.feature_grammar import Product
 
+SMALL = 1e-4  # below it a number has its power of ten: more than four zeros are not counted at a glance
 RELATIVE = 1e-12  # smaller deviations are rounding
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
@@ -59,9 +60,12 @@ def unit_of(unit: str, power: int, time: str, per: int) -> str:
 
 
 def number(value: float, deviation: float | None) -> str:
-    """A value with its standard deviation in units of its last digit: 25.0(3)."""
+    """A value with its standard deviation in units of its last digit: 25.0(3), and 4.7(2)e-8 of small ones."""
     if deviation is None or not math.isfinite(deviation) or deviation <= RELATIVE * value:
         return f"{value:.4g}"
+    if 0 < (size := max(value, deviation)) < SMALL:
+        power = math.floor(math.log10(size))
+        return f"{number(value / 10.0**power, deviation / 10.0**power)}e{power}"
     digits = -math.floor(math.log10(deviation))
     last = round(deviation * 10.0**digits)
     digits, last = (digits + 1, round(deviation * 10.0 ** (digits + 1))) if last == 1 else (digits, last)

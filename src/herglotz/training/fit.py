@@ -28,6 +28,7 @@ from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
+from herglotz.training.reading import reading_told
 from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST
@@ -106,6 +107,7 @@ def fit(
         if checkpoint is not None and is_first():  # only its process holds the lock
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
+        run = replace(run, reading=reading_told(reading))
         if log is not None:
             log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run

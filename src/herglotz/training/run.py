@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -48,8 +48,8 @@ class Run:
         All N samples, and how many leading ones of each trajectory were trained on.
     states
         q (N, n), p (N, n) and s (N,) at every sample; the first coordinate's mass is 1: its p is close to a velocity.
-    h, box
-        Typical step, in the data's unit of time; lowest and highest q, p, s of the training part.
+    h, box, reading
+        Typical step, in the data's unit of time; lowest and highest q, p, s of the training part; how data were read.
     """
 
     model: ContactLagrangian
@@ -61,6 +61,7 @@ class Run:
     h: float  # typical model step
     box: dict[str, list[float]]  # range of q, p, s over the training part: where the model can be trusted
     history: list[dict[str, Any]]  # stage, iteration, cost
+    reading: dict[str, Any] = field(default_factory=dict)  # what was told of reading the data (`Reading`)
 
     @property
     def prediction(self) -> Tensor:

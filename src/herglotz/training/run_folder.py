@@ -20,13 +20,13 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.schema import check_entries
 from herglotz.stepping import State
 from herglotz.training.config import FitConfig
+from herglotz.training.reading import REMEDY, reading_in
 from herglotz.training.run import Run
 
 FORMAT = 1  # of the folder; a change that older versions cannot read raises it
 FILES = ("model.pt", "config.json", "metrics.json", "fit.npz")
 MANIFEST = "manifest.json"
 LOG = "history.csv"  # for people; nothing reads it back
-REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
 
 
 class Manifest(TypedDict):
@@ -107,7 +107,7 @@ def save_run(run: Run, folder: str | Path) -> None:
     torch.save(model, buffer)
     contents = {
         "model.pt": buffer.getvalue(),
-        "config.json": _json_bytes(run.config.to_dict()),
+        "config.json": _json_bytes(run.config.to_dict() | ({"reading": run.reading} if run.reading else {})),
         "metrics.json": _json_bytes(run.metrics),
         "fit.npz": npz_bytes(run.data),
     }
@@ -152,6 +152,7 @@ def load_run(folder: str | Path) -> Run:
     if stored["format"] != FORMAT:
         raise InputError(f"{path}: is of format {stored['format']}, not {FORMAT}; {REMEDY}")
     settings = _json(folder / "config.json", contents["config.json"])
+    reading = reading_in(settings, str(folder / "config.json"))
     metrics = _json(folder / "metrics.json", contents["metrics.json"])
     check_entries(Metrics, metrics, str(folder / "metrics.json"), REMEDY)
     try:
@@ -165,7 +166,7 @@ def load_run(folder: str | Path) -> Run:
     data = trajectories_of(contents["fit.npz"], folder / "fit.npz")
     run = Run(
         model, config, metrics, data, tuple(stored["train_lengths"]), states, float(stored["h"]), stored["box"],
-        stored["history"],
+        stored["history"], reading,
     )  # fmt: skip
     _check_sizes(run, stored["data_digest"], folder)
     return run

@@ -1,6 +1,7 @@
 """--config RUN: what a fit was told is kept apart from what it decided, so that the same data give the same fit."""
 
 import json
+import re
 from dataclasses import replace
 
 import pytest
@@ -43,6 +44,75 @@ def test_the_same_fit_from_a_runs_settings(folder):
     assert fitted(folder, "again", "--config", str(folder / "run")) == 0
     assert_same(run, load_run(folder / "again"))
     assert_same(run, fit(load(folder / "motion.csv", show=False), run.config, progress=False))
+
+
+READ = ("--time", "clock", "--coordinates", "x", "--inputs", "drive", "--every", "2", "--hold", "first")
+
+
+@pytest.fixture(scope="module")
+def driven(tmp_path_factory):
+    """A driven recording whose columns have to be told: `driven.csv`, and the run `told` of it."""
+    folder = tmp_path_factory.mktemp("driven")
+    data = simulate(scene("driven_duffing"), trajectories=1, steps=120, h=0.1, noise=0.001, gaps=0, seed=3)
+    assert data.u is not None
+    columns = zip(data.t.tolist(), data.q[:, 0].tolist(), data.u[:, 0].tolist(), strict=True)
+    rows = "".join(f"{t!r},{x!r},{u!r},{k}\n" for k, (t, x, u) in enumerate(columns))
+    (folder / "driven.csv").write_text("clock,x,drive,ticks\n" + rows)
+    assert main(["fit", str(folder / "driven.csv"), "--out", str(folder / "told"), "--no-plots", *READ]) in (0, 3)
+    return folder
+
+
+def test_the_data_are_read_the_same_way(driven, capsys):
+    # fails if columns, hold or thinning are forgotten: the refit would take drive and ticks for coordinates
+    file, told = str(driven / "driven.csv"), str(driven / "told")
+    assert main(["fit", file, "--out", str(driven / "again"), "--no-plots", "--config", told]) in (0, 3)
+    said = capsys.readouterr().err
+    assert f"note: read as {told} says: time clock, coordinates x, inputs drive, hold first, every 2" in " ".join(
+        said.split()
+    )
+    one, other = load_run(driven / "told"), load_run(driven / "again")
+    assert_same(one, other)
+    assert one.data.digest() == other.data.digest()
+    assert one.reading == other.reading == {
+        "time": "clock", "coordinates": ["x"], "inputs": ["drive"], "every": 2, "hold": "first",
+    }  # fmt: skip
+
+
+def test_flags_stand_over_what_was_read(driven):  # fails if a flag beside --config is not heard
+    file, told = str(driven / "driven.csv"), str(driven / "told")
+    more = ["--every", "3", "--inputs", "none", "--drop", "drive,ticks", "--level", "linear"]
+    assert main(["fit", file, "--out", str(driven / "other"), "--no-plots", "--config", told, *more]) in (0, 3)
+    run = load_run(driven / "other")
+    assert run.data.u is None
+    assert run.data.samples == 41
+    assert run.reading["every"] == 3
+
+
+def test_python_remembers_how_data_were_read(driven, tmp_path):
+    # fails if a run of `hz.fit(path, time=...)` cannot be repeated by --config, or arrays end up in config.json
+    file = driven / "driven.csv"
+    run = fit(file, time="clock", coordinates="x", inputs=("drive",), iterations=5, objective="trajectory")
+    assert run.reading == {"time": "clock", "coordinates": "x", "inputs": ["drive"]}
+    save_run(run, tmp_path / "run")
+    assert load_run(tmp_path / "run").reading == run.reading
+    x = load(file, time="clock", coordinates="x", inputs=(), show=False)
+    assert fit(x.q[:, 0].numpy(), time=x.t.numpy(), iterations=5).reading == {}
+
+
+@pytest.mark.parametrize(
+    ("reading", "message"),
+    [
+        ({"every": "2"}, r"reading: every must be int, got '2' \(str\)"),
+        ({"path": "/etc"}, "reading has no path"),
+        ([], "must hold named entries, got"),
+    ],
+)
+def test_a_damaged_reading_is_refused(driven, tmp_path, capsys, reading, message):
+    # fails if what config.json says of reading the data goes unchecked into `load`
+    (tmp_path / "config.json").write_text(json.dumps({**FitConfig().to_dict(), "reading": reading}))
+    words = ["fit", str(driven / "driven.csv"), "--out", str(tmp_path / "run"), "--config", str(tmp_path)]
+    assert main(words) == 2
+    assert re.search(message, capsys.readouterr().err)
 
 
 def test_decisions_stand_over_what_was_told(folder):

@@ -201,8 +201,14 @@ def test_a_frame_is_read_like_a_csv_file():  # fails if a DataFrame's columns ge
         ["2026-01-01T00:00:00", "2026-01-01T00:00:02", "2026-01-01T00:00:03"] * 2, "datetime64[ns]"
     )
     assert from_frame(frame, Wanted(group="lap")).t.tolist() == [0, 2, 3, 0, 2, 3]
+    frame["x[m]"][4] = np.inf
+    with pytest.raises(InputError, match=r"DataFrame, row 4, column 'x': inf is not finite; drop that row"):
+        from_frame(frame, Wanted(group="lap"))
     frame["x[m]"][4] = np.nan
-    with pytest.raises(InputError, match=r"DataFrame, row 4, column 'x': nan is not finite; drop that row"):
+    with pytest.raises(InputError, match=r"row 3: of the 3 rows from here, 2 have a value in every column"):
+        from_frame(frame, Wanted(group="lap"))
+    frame["torque"][4], frame["x[m]"][4] = np.nan, 4
+    with pytest.raises(InputError, match=r"DataFrame, row 4, column 'torque': nan is not finite; drop that row"):
         from_frame(frame, Wanted(group="lap"))
 
 

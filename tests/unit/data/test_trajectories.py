@@ -168,15 +168,15 @@ def test_typical_step_and_gaps():  # fails if the mean is taken for the median
 def test_split_time():  # fails if the cut is not per trajectory, or a sample is lost or seen twice
     data = full().select([0, 2])  # 4 and 6 samples
     with pytest.raises(
-        InputError, match=r"set: fraction 0.5 cuts trajectory 0 into 2 and 2 samples, each part needs 3"
+        InputError, match=r"set: fraction 0.5 cuts the 4 samples of trajectory 0 into 2 and 2, each part needs 3"
     ):
         data.split_time(0.5)
     long = Trajectories.of(
         torch.arange(20.0).double(), torch.arange(20.0).double(), (8, 12), s=torch.arange(20).double()
     )
-    with pytest.raises(InputError, match=r"fraction 0.7 cuts trajectory 0 into 6 and 2 samples"):
+    with pytest.raises(InputError, match=r"fraction 0.7 cuts the 8 samples of trajectory 0 into 6 and 2"):
         long.split_time(0.7)
-    with pytest.raises(InputError, match=r"fraction 0.2 cuts trajectory 0 into 2 and 6 samples"):
+    with pytest.raises(InputError, match=r"fraction 0.2 cuts the 8 samples of trajectory 0 into 2 and 6"):
         long.split_time(0.2)
     train, test = long.split_time(0.6)
     assert (train.lengths, test.lengths) == ((5, 7), (3, 5))

@@ -19,6 +19,7 @@ from herglotz.training import FitConfig, Plan, dictionary_search, fit, laplace
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
+from herglotz.training.equation_words import number
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _equation
 from herglotz.training.found_terms import Found
@@ -349,6 +350,22 @@ def test_lines_of_an_equation_break_between_terms():  # fails if a number stands
         "− 0.123456(10) x − 0.123456(10) x³ − 0.123456(10) x⁵ − 0.123456(10) x⁷",
         "with x in m",
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "deviation", "written"),
+    [
+        (4.7512e-8, 2e-10, "4.75(2)e-8"),
+        (3e-5, 2e-4, "0.0000(2)"),
+        (9.9e-5, 1e-9, "9.90000(10)e-5"),
+        (5e-4, 1e-7, "0.00050000(10)"),
+        (0.0, 3e-9, "0(3)e-9"),
+        (25.0, 0.3, "25.0(3)"),
+    ],
+)
+def test_numbers_with_their_deviations(value, deviation, written):
+    # fails if a small coefficient stands behind a row of zeros, or loses its power of ten
+    assert number(value, deviation) == written
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,47 @@
+"""How a fit was told to read its data: stored in config.json beside the settings, so that `--config` repeats it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict, get_type_hints
+
+from herglotz.errors import refuse
+from herglotz.schema import check_entries, matches
+
+REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
+
+
+class Reading(TypedDict, total=False):
+    """Options of `herglotz.data.load` by their names, then what `herglotz fit` makes of the recording."""
+
+    time: str
+    group: str
+    coordinates: str | list[str]
+    inputs: str | list[str]
+    drop: str | list[str]
+    angles: str | list[str]
+    sensor_zeros: list[float]
+    sensor_scales: list[float]
+    hold: Literal["zero", "first", "smooth"]
+    every: int
+
+
+def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
+    """Take what config.json says of reading the data out of its settings; {} where the user said nothing.
+
+    Raises
+    ------
+    InputError
+        If an entry is not known, or of another type than the flag of its name.
+    """
+    reading = settings.pop("reading", {})
+    check_entries(Reading, reading, f"{where}: reading", REMEDY)
+    unknown = ", ".join(sorted(set(reading) - set(Reading.__annotations__)))
+    refuse({f"{where}: reading has no {unknown}; {REMEDY}": unknown})
+    return reading
+
+
+def reading_told(options: Mapping[str, Any]) -> dict[str, Any]:
+    """The options of `as_trajectories` that a file could be read with: names and numbers, no arrays."""
+    plain = {name: list(x) if isinstance(x, tuple) else x for name, x in options.items()}
+    return {name: plain[name] for name, hint in get_type_hints(Reading).items() if matches(plain.get(name), hint)}

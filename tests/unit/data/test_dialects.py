@@ -1,0 +1,168 @@
+"""Tables as spreadsheets, loggers and numpy write them, and rows in which a sample is missing."""
+
+import numpy as np
+import pytest
+import torch
+
+from herglotz.data import load, read_csv
+from herglotz.data.extra_formats import Table
+from herglotz.data.table import from_frame
+from herglotz.errors import InputError
+
+T = np.arange(6) * 0.5
+X = np.array([1.25, -0.5, 3e-3, 4.0, -5.125, 6.0])
+
+
+def written(tmp_path, text, name="a.csv", encoding="utf-8"):
+    (tmp_path / name).write_bytes(text.encode(encoding))
+    return tmp_path / name
+
+
+def table(separator, decimal=".", header=("t[s]", "x[m]")):
+    rows = [header, *zip(map(str, T), map(str, X), strict=True)]
+    return "".join(separator.join(row).replace(".", decimal) + "\r\n" for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("separator", "decimal", "note"),
+    [
+        (",", ".", None),
+        (";", ".", "columns are separated by ';'"),
+        (";", ",", "columns are separated by ';', and decimals by commas"),
+        ("\t", ".", "columns are separated by tabs"),
+        ("\t", ",", "columns are separated by tabs, and decimals by commas"),
+        ("  ", ".", "columns are separated by spaces"),
+    ],
+)
+def test_separators_and_decimals(tmp_path, separator, decimal, note):
+    # fails if a table of a European spreadsheet is refused, read with other numbers, or nothing is said of it
+    data = load(written(tmp_path, table(separator, decimal)))
+    assert data.t.tolist() == T.tolist()
+    assert data.q[:, 0].tolist() == X.tolist()
+    assert (data.names, data.units) == (("x",), ("m",))
+    assert data.notes == (() if note is None else (note,))
+    assert note is None or f"  {note}" in data.table().splitlines()
+
+
+def test_a_comma_that_may_be_of_thousands_is_refused(tmp_path):
+    # fails if 1,250 beside 2.5 is read as 1.25: the comma may stand between thousands
+    with pytest.raises(InputError, match=r"row 3: '2.5' beside '1,250' in row 2"):
+        load(written(tmp_path, "t;x\n0;1,250\n1;2.5\n2;3\n"))
+    with pytest.raises(InputError, match=r"row 2, column 'x': '1.250.5' is not a number"):
+        load(written(tmp_path, "t;x\n0;1.250,5\n1;2,5\n2;3\n"))
+
+
+@pytest.mark.parametrize("delimiter", [",", " ", ";"])
+def test_a_header_as_numpy_writes_it(tmp_path, delimiter):
+    # fails if the header that numpy.savetxt puts behind # is skipped as a comment
+    header = delimiter.join(["t", "x[m]"])
+    np.savetxt(tmp_path / "a.csv", np.c_[T, X], delimiter=delimiter, header=header)
+    data = load(tmp_path / "a.csv")
+    assert data.q[:, 0].tolist() == X.tolist()
+    assert data.notes[0] == "the header is row 1, behind #"
+    with pytest.raises(InputError, match="the header is missing"):
+        load(written(tmp_path, "# made by hand, on Monday, at noon\n" + "0,1\n1,2\n2,3\n"))
+
+
+@pytest.mark.parametrize("name", ["a.txt", "a.tsv", "a.dat"])
+def test_tables_with_other_endings(tmp_path, name):  # fails if only .csv is read as a table
+    data = load(written(tmp_path, table("\t"), name), time="t")
+    assert data.q[:, 0].tolist() == X.tolist()
+
+
+def test_units_in_the_letters_of_windows(tmp_path):
+    # fails if the ° of a spreadsheet that does not write UTF-8 is refused, or any other such byte is let in
+    text = table(";", ",", ("t (µs)", "Winkel (°)"))
+    data = load(written(tmp_path, text, encoding="cp1252"))
+    assert data.digest() == load(written(tmp_path, text)).digest()
+    assert (data.degrees, data.time_unit) == (("Winkel",), "s")
+    with pytest.raises(InputError, match=r"row 1: not UTF-8 text \(byte 0xe4\)"):
+        load(written(tmp_path, "t,Länge\n0,1\n1,2\n2,3\n", encoding="cp1252"))
+
+
+@pytest.mark.parametrize("gap", ["", "nan", "NaN", "NA", "null", "#N/A"])
+def test_rows_without_a_value_are_left_out(tmp_path, gap):
+    # fails if a missing sample stops the reading, becomes a number, or goes without a word
+    data = load(written(tmp_path, f"t,x,y\n0,{gap},0\n1,1,1\n2,2,2\n3,3,{gap}\n4,4,4\n5,5,{gap}\n"))
+    assert data.t.tolist() == [1, 2, 4]
+    assert data.q.tolist() == [[1, 1], [2, 2], [4, 4]]
+    assert data.notes == ("3 rows are left out, without a value: the first is row 2, column 'x'",)
+
+
+def test_rows_left_out_of_several_recordings(tmp_path):
+    # fails if rows are left out of another recording, or a first row without a value is taken for a start
+    rows = [f"{run},{k},{'' if k in (0, 4) else 10 * run + k}" for k in range(6) for run in (1, 2)]
+    data = load(written(tmp_path, "\n".join(["run,t,x", *rows]) + "\n,,\n"))
+    assert data.lengths == (4, 4)
+    assert data.q[:, 0].tolist() == [11, 12, 13, 15, 21, 22, 23, 25]
+
+
+def test_the_inputs_of_a_missing_sample_still_act(tmp_path):
+    # fails if the input at a row without a position is lost: the step over it has the mean of both
+    data = load(written(tmp_path, "t,x,u\n0,0,1\n1,,3\n2,2,5\n3,3,7\n4,4,9\n"))
+    assert data.u is not None
+    assert data.t.tolist() == [0, 2, 3, 4]
+    assert data.u[:, 0].tolist() == [2, 5, 7, 9]
+    held = load(written(tmp_path, "# hold: zero\nt,x,u\n0,0,1\n1,,3\n2,2,5\n3,3,7\n4,4,9\n"))
+    assert held.hold == "zero"
+    assert held.u is not None
+    assert torch.equal(held.u, data.u)
+
+
+def test_rows_left_out_of_a_frame(tmp_path):  # fails if a NaN of a DataFrame stops the reading, unlike one of a file
+    columns = {"t": T, "x[m]": np.where(T == 1.0, np.nan, X)}
+    data = from_frame(Table(tmp_path, columns))
+    assert data.t.tolist() == [0, 0.5, 1.5, 2, 2.5]
+    assert data.notes == ("a row is left out, without a value: the first is row 2, column 'x'",)
+
+
+@pytest.mark.parametrize(
+    ("header", "name", "unit", "time_unit"),
+    [
+        ("t,angle_deg", "angle", "deg", "s"),
+        ("time_ms,angle_rad", "angle", "rad", "ms"),
+        ("t_s,theta_m", "theta_m", "1", "s"),
+        ("t,x_deg[m]", "x_deg", "m", "s"),
+    ],
+)
+def test_units_at_the_end_of_a_name(tmp_path, header, name, unit, time_unit):
+    # fails if degrees that only the name tells are taken for radians or metres, or milliseconds for seconds
+    data = read_csv(written(tmp_path, header + "\n0,1\n1,2\n2,3\n"))
+    assert (data.names, data.units, data.time_unit) == ((name,), (unit,), time_unit)
+
+
+def test_names_with_units_at_their_end_stay_apart(tmp_path):
+    # fails if angle_deg beside angle_rad is one column twice, or the whole name cannot be told
+    path = written(tmp_path, "t,angle_deg,angle_rad,gyro_deg_s\n0,1,2,3\n1,2,3,4\n2,3,4,5\n")
+    data = read_csv(path, drop="angle_rad")
+    assert (data.names, data.units) == (("angle_deg",), ("deg",))
+    assert ("gyro", "left aside", "deg/s") in data.columns
+    path = written(tmp_path, "t,angle_deg\n0,1\n1,2\n2,3\n")
+    assert read_csv(path, coordinates="angle_deg").names == read_csv(path, coordinates="angle").names == ("angle",)
+
+
+def test_a_folder_of_recordings(tmp_path, capsys):
+    # fails if a folder is refused, its files are joined in another order, or other files of it are read
+    folder = tmp_path / "lab"
+    folder.mkdir()
+    for k, name in enumerate(["b.csv", "a.tsv"]):
+        (folder / name).write_text("t\tx_deg\n" + "".join(f"{i}\t{i + 10 * k}\n" for i in range(3)))
+    (folder / "notes.md").write_text("nothing")
+    data = load(folder)
+    assert data.lengths == (3, 3)
+    assert data.q[:, 0].rad2deg().tolist() == pytest.approx([10, 11, 12, 0, 1, 2])
+    lines = capsys.readouterr().err.splitlines()
+    assert (lines[0], len(lines)) == ("lab:", 6)
+    assert "  2 recordings: a.tsv, b.csv" in lines
+    (folder / "c.csv").write_text("t,y\n0,1\n1,2\n2,3\n")
+    with pytest.raises(InputError, match="sets with different names cannot be joined"):
+        load(folder)
+
+
+def test_folders_without_recordings(tmp_path):  # fails if an empty folder, or that of a run, ends in a traceback
+    with pytest.raises(InputError, match=r"is a folder without recordings; files end in \.csv"):
+        load(tmp_path)
+    (tmp_path / "history.csv").write_text("stage,iteration,cost\n")
+    (tmp_path / "model.pt").write_text("")
+    with pytest.raises(InputError, match="is the folder of a run, not data"):
+        load(tmp_path)
