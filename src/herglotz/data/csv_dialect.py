@@ -33,15 +33,7 @@ def in_commas(
     InputError
         If numbers have decimal commas in some rows and decimal points in others.
     """
-    written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
-    rows = [(i, line) for i, line in written if not line.lstrip().startswith("#")]
-    if not rows:
-        return [], ()
-    notes: list[str] = []
-    before = [(i, line.lstrip("# ")) for i, line in written if i < rows[0][0]]
-    if before and (found := _separator(before[-1][1], rows[0][1])) and _all_numbers(rows[0][1], found):
-        rows.insert(0, before[-1])
-        notes.append(f"the header is row {before[-1][0]}, behind #")
+    rows, notes = _with_header([(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")])
     separator = _separator(rows[0][1], rows[1][1]) if len(rows) > 1 else None
     if separator in (None, ","):
         return rows, tuple(notes)
@@ -50,6 +42,15 @@ def in_commas(
         _check_decimals(path, rows[1:], separator)
         notes[-1] += ", and decimals by commas"
     return [(i, ",".join(_with_points(cells_of(line, separator)))) for i, line in rows], tuple(notes)
+
+
+def _with_header(written: Rows) -> tuple[Rows, list[str]]:
+    """The rows without comments, but for one that is the header; and the note that says so."""
+    rows = [(i, line) for i, line in written if not line.lstrip().startswith("#")]
+    before = [(i, line.lstrip("# ")) for i, line in written if rows and i < rows[0][0]]
+    if before and (found := _separator(before[-1][1], rows[0][1])) and _all_numbers(rows[0][1], found):
+        return [before[-1], *rows], [f"the header is row {before[-1][0]}, behind #"]
+    return rows, []
 
 
 def _separator(header: str, row: str) -> str | None:
