@@ -128,6 +128,8 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         _report(source, found, times, f"{out}: {arguments.steps} steps")
     _warn(source, times, left, far)
+    if source.inputs and u is None:
+        _note("the model is driven: without --inputs FILE or --u all of its inputs are 0")
     return 0
 
 

@@ -242,7 +242,11 @@ def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
     data = with_waves(data, run.config.frequencies)
     u = data.u if run.model.inputs else None
     p = None if data.p is None else data.p[:, at]
-    data = replace(data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles)
+    called = {data.names[i]: name for i, name in zip(at, wanted.names, strict=True)}
+    data = replace(
+        data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
+        columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
+    )  # fmt: skip
     return acting(data, arrival_of(run))
 
 

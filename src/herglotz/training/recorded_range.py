@@ -12,6 +12,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.units import size, span
 
+MARGIN = 0.01  # of the width: recordings of fits predicted again leave their own range by up to 0.006 of it
 HAIR = 1e-6  # of a step: recorded times are rounded
 QUANTITIES = {"q": "position", "p": "momentum"}  # the first coordinate's mass is 1: its momentum is its velocity
 
@@ -61,7 +62,10 @@ def quantities_outside(
     q: Tensor,  # (..., N, n) motions at the same times; NaN after a failed step
     p: Tensor,  # (..., N, n)
 ) -> list[Beyond]:
-    """Every position and momentum that leaves its range, of the motion that leaves it farthest; angles modulo 2π."""
+    """Every position and momentum that leaves its range by more than `MARGIN`, of the motion that leaves it farthest.
+
+    Angles are taken modulo 2π.
+    """
     found = []
     for key, x in (("q", q), ("p", p)) if box else ():
         for i, name in enumerate(like.names):
@@ -70,10 +74,11 @@ def quantities_outside(
             if key == "q" and like.angles[i]:
                 y = y - 2 * math.pi * torch.round((y - (low + high) / 2) / (2 * math.pi))
             every = torch.maximum(low - y, y - high).nan_to_num(nan=0.0)
-            if bool((every > 0).any()):
+            outside = every > MARGIN * (high - low)
+            if bool(outside.any()):
                 b = int(every.amax(1).argmax())
                 by = float(every[b].max()) / (high - low) if high > low else math.inf
-                since, unit = float(t[(every[b] > 0).nonzero()[0, 0]]), like.units[i] if key == "q" else ""
+                since, unit = float(t[outside[b].nonzero()[0, 0]]), like.units[i] if key == "q" else ""
                 turned = key == "q" and name in like.degrees
                 found.append(Beyond(name, QUANTITIES[key], by, since, low, high, unit, turned, b))
     return found

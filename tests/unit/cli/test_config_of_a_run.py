@@ -99,6 +99,15 @@ def test_python_remembers_how_data_were_read(driven, tmp_path):
     assert fit(x.q[:, 0].numpy(), time=x.t.numpy(), iterations=5).reading == {}
 
 
+def test_a_driven_run_without_inputs_says_so(driven, capsys):
+    # fails if a free run of a driven model has inputs 0 without a word, or says so although they are given
+    words = ["rollout", str(driven / "told"), "--steps", "3", "--force", "--out", str(driven / "free.csv")]
+    assert main(words) == 0
+    assert "all of its inputs are 0" in " ".join(capsys.readouterr().err.split())
+    assert main([*words, "--u", "0.5"]) == 0
+    assert "inputs are 0" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("reading", "message"),
     [

@@ -13,6 +13,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
 from herglotz.training.predict import predict
+from herglotz.training.recorded_range import MARGIN
 
 predict_module = sys.modules[predict.__module__]  # the package has the function's name
 
@@ -211,6 +212,13 @@ def test_coordinates_are_found_by_name():
     assert predict(named, both).rms < 1e-9  # type: ignore[operator]
 
 
+def test_a_coordinate_by_another_name_keeps_its_degrees():
+    # fails if errors of a recording in deg are in rad alone, because its column is not called as the run's
+    model = model_of("linear")
+    data = replace(recording(model), names=("Winkel",), columns=(("Winkel", "angle", "deg"),))
+    assert predict(run_of(model), data).data.degrees == run_of(model).data.names
+
+
 def test_a_free_run_beyond_the_recorded_range_is_noted():
     # fails if the warm-up counts, another trajectory or time is named, or the range has no say at all
     model = model_of("conservative")
@@ -224,7 +232,7 @@ def test_a_free_run_beyond_the_recorded_range_is_noted():
     found = predict(replace(run, box=ends), data)
     (left,) = found.beyond
     assert left.by == pytest.approx(0.1 / (2.5 + top - 0.1))
-    first = b * data.lengths[0] + 20 + int((q[b] > top - 0.1).nonzero()[0])
+    first = b * data.lengths[0] + 20 + int((q[b] > top - 0.1 + MARGIN * (2.5 + top - 0.1)).nonzero()[0])
     assert (left.trajectory, left.since) == (b, float(data.t[first]))
     assert found.metrics()["beyond"][0]["coordinate"] == data.names[0]
     start = [x[first - 1].numpy() for x in found.states[:2]]

@@ -41,6 +41,16 @@ def test_what_leaves_how_far_and_since_when():
     assert warning([], "s") == ""
 
 
+def test_a_hair_beyond_is_not_told():
+    # fails if a recording that is predicted again is said to leave its own range, or the margin is of no width
+    q = INSIDE.clone()
+    q[2, 0], q[3, 0] = 1.019, 1.021
+    (found,) = quantities_outside(BOX, LIKE, LIKE.t, q, 0 * INSIDE)
+    assert (found.since, round(found.by, 4)) == (3.0, 0.0105)
+    q[3, 0] = 1.019
+    assert quantities_outside(BOX, LIKE, LIKE.t, q, 0 * INSIDE) == []
+
+
 def test_of_several_motions_the_farthest_is_told():
     # fails if the nearest one, or another trajectory's number, is told
     q = INSIDE.clone()
