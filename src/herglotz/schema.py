@@ -13,7 +13,7 @@ UNION = (Union, types.UnionType)
 LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, and 10^400 is no float either
 
 
-def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
+def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
     """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
 
     Parameters
@@ -58,11 +58,8 @@ def matches(value: Any, hint: Any) -> bool:
         return value in inner
     if origin in (list, tuple):
         return isinstance(value, (list, tuple)) and _match_each(value, inner)
-    if is_dataclass(hint):
-        named = isinstance(value, dict) and all(key in value for key in _needed(hint))
-        return named and all(matches(value[key], one) for key, one in get_type_hints(hint).items() if key in value)
-    if origin is dict:
-        return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
+    if is_dataclass(hint) or origin is dict:
+        return isinstance(value, dict) and _match_items(value, hint, inner)
     return _is_number(value, hint) if hint in (int, float) else isinstance(value, hint)
 
 
@@ -75,6 +72,16 @@ def _needed(kind: Any) -> Collection[str]:
     if is_typeddict(kind):
         return kind.__required_keys__
     return [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+
+
+def _match_items(values: dict[Any, Any], hint: Any, inner: tuple[Any, ...]) -> bool:
+    """Whether entries are those of a dataclass, or of dict[K, V]."""
+    if inner:
+        return all(matches(key, inner[0]) and matches(x, inner[1]) for key, x in values.items())
+    hints = get_type_hints(hint)
+    return all(key in values for key in _needed(hint)) and all(
+        matches(x, hints.get(key, Any)) for key, x in values.items()
+    )
 
 
 def _match_each(values: Sequence[Any], hints: tuple[Any, ...]) -> bool:

@@ -102,9 +102,9 @@ def test_the_unit_of_length_decides_nothing():
     start, end = pairs(60, 1, H, scene("duffing"))
     for unit in (1.0, 1000.0):
         model = ContactLagrangian(ModelConfig(angles=(False,), scale=(unit,), rate=0.1, potential_width=0))
-        given = [State(unit * x.q, unit * x.p, unit**2 * x.s) for x in (start, end)]
-        kicks = fit_kicks(model, *given, H, kicks=2, iterations=40)
-        found.append(kicks.step(given[0], H).state.q / unit)
+        before, after = (State(unit * x.q, unit * x.p, unit**2 * x.s) for x in (start, end))
+        kicks = fit_kicks(model, before, after, H, kicks=2, iterations=40)
+        found.append(kicks.step(before, H).state.q / unit)
         assert kicks.error / unit > 1e-3
     assert float((found[0] - found[1]).abs().max()) < 1e-7
 
