@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import types
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from herglotz.errors import InputError
 
+UNION = (Union, types.UnionType)
 LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, and 10^400 is no float either
 
 
-def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
+def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
     """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
 
     Parameters
@@ -19,7 +21,7 @@ def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
     kind
         Keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, another
         `TypedDict`, and list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. A list and a tuple are one, as in
-        JSON. No key of a dataclass is needed.
+        JSON. Keys of a dataclass that have a default may be missing.
     values
         What was read.
     where, remedy
@@ -32,15 +34,15 @@ def check_entries(kind: type, values: Any, where: str, remedy: str) -> None:
     """
     if not isinstance(values, Mapping):
         raise InputError(f"{where}: must hold named entries, got {_shown(values)}; {remedy}")
-    needed = kind.__required_keys__ if is_typeddict(kind) else ()
-    missing = [key for key in needed if key not in values]
+    missing = [key for key in _needed(kind) if key not in values]
     if missing:
         raise InputError(f"{where}: lacks {', '.join(sorted(missing))}; {remedy}")
     for key, hint in get_type_hints(kind).items():
         if key not in values or (values[key] is None and types.NoneType in get_args(hint)):
             continue
-        if inner := [one for one in (hint, *get_args(hint)) if is_typeddict(one)]:
-            check_entries(inner[0], values[key], f"{where}: {key}", remedy)
+        alone = [one for one in _alternatives(hint) if is_typeddict(one) or is_dataclass(one)]
+        if alone:  # looked into key by key, so that the message names one
+            check_entries(alone[0], values[key], f"{where}: {key}", remedy)
         elif not matches(values[key], hint):
             raise InputError(f"{where}: {key} must be {_named(hint)}, got {_shown(values[key])}; {remedy}")
 
@@ -50,15 +52,36 @@ def matches(value: Any, hint: Any) -> bool:
     origin, inner = get_origin(hint), get_args(hint)
     if hint is Any:
         return True
-    if origin in (Union, types.UnionType):
+    if origin in UNION:
         return any(matches(value, one) for one in inner)
     if origin is Literal:
         return value in inner
     if origin in (list, tuple):
         return isinstance(value, (list, tuple)) and _match_each(value, inner)
-    if origin is dict:
-        return isinstance(value, dict) and all(matches(k, inner[0]) and matches(x, inner[1]) for k, x in value.items())
+    if is_dataclass(hint) or origin is dict:
+        return isinstance(value, dict) and _match_items(value, hint, inner)
     return _is_number(value, hint) if hint in (int, float) else isinstance(value, hint)
+
+
+def _alternatives(hint: Any) -> tuple[Any, ...]:
+    return get_args(hint) if get_origin(hint) in UNION else (hint,)
+
+
+def _needed(kind: Any) -> Collection[str]:
+    """The keys that must be there: of a dataclass those without a default."""
+    if is_typeddict(kind):
+        return kind.__required_keys__
+    return [f.name for f in fields(kind) if f.default is MISSING and f.default_factory is MISSING]
+
+
+def _match_items(values: dict[Any, Any], hint: Any, inner: tuple[Any, ...]) -> bool:
+    """Whether entries are those of a dataclass, or of dict[K, V]."""
+    if inner:
+        return all(matches(key, inner[0]) and matches(x, inner[1]) for key, x in values.items())
+    hints = get_type_hints(hint)
+    return all(key in values for key in _needed(hint)) and all(
+        matches(x, hints.get(key, Any)) for key, x in values.items()
+    )
 
 
 def _match_each(values: Sequence[Any], hints: tuple[Any, ...]) -> bool:

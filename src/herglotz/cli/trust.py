@@ -100,7 +100,7 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     from herglotz.data.units import size
     from herglotz.training.uncertainty import determined
 
-    data, equation = result.data, result.metrics.get("equation")
+    data = result.data
     noises = zip(numbers["noise"].items(), data.units, strict=True)
     percent = f"{100 * numbers['level']:g} % band"
     rows = [(f"{percent}, training", f"{100 * numbers['inside_training']:.1f} % of the samples inside")]
@@ -111,9 +111,9 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     rows.append(("noise of a sample", f"{noise}; held-out blocks miss {worse} times as much"))
     rows.append(("parameters the data fix", determined(numbers["effective_parameters"], numbers["all_parameters"])))
     print_table(rows)
-    if equation:  # the coefficients of named terms stand there with their deviations
+    if result.metrics.get("equation"):  # the coefficients of named terms stand there with their deviations
         print("Learned equation, standard deviations in brackets, of the last digits:")
-        print(*(f"  {line}" for line in equation["text"].splitlines()), sep="\n")
+        print(*(f"  {line}" for line in str(result.equation()).splitlines()), sep="\n")
     print("Value ± standard deviation (the first mass is 1):")
     for x in physical:
         print(fill(f"{x.words}: {x}", COLUMNS, initial_indent="  ", subsequent_indent="      "))

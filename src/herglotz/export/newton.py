@@ -66,7 +66,8 @@ class NewtonIteration(nn.Module):
         settled = left <= TOLERANCE * eps * scale
         rounding = FLOOR * eps * torch.maximum(torch.maximum(scale, length(q)), self.speed * h)
         stalled = ~better & (length(delta) <= rounding)  # rounding, not a wrong direction
-        hopeless = first & ~torch.isfinite(merit_trial + left)  # there is no direction to follow
+        # No direction to follow; as in `status_of`, for a sum of two large numbers may overflow where neither does.
+        hopeless = first & ~(torch.isfinite(merit_trial) & torch.isfinite(left))
         accept = ~done & (better | settled)
         pairs = zip((trial, delta_trial, merit_trial, *values_trial), (x, delta, merit, *values), strict=True)
         x, delta, merit, *values = (torch.where(accept[:, None] if a.ndim > 1 else accept, a, b) for a, b in pairs)

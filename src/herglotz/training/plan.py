@@ -109,11 +109,10 @@ class Plan:
     @classmethod
     def from_dict(cls, values: dict[str, Any]) -> Plan:
         """Inverse of `to_dict`; unknown keys are an error."""
-        start = {name: tuple(x) for name, x in values.get("start", {}).items()}
-        try:
-            return from_plain(cls, {**values, "start": start})
-        except TypeError as error:
-            raise InputError(f"the plan is incomplete ({error}); take one that `fit` wrote") from None
+        plan = from_plain(cls, values)
+        if missing := [name for name in STARTS if not plan.start.get(name)]:
+            raise InputError(f"the plan's start lacks {', '.join(missing)}; take one that `fit` wrote")
+        return replace(plan, start={name: tuple(x) for name, x in plan.start.items()})
 
 
 WORDS = {  # what a decision is called; the starting values are too many to be told

@@ -20,6 +20,8 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.schema import check_entries
 from herglotz.stepping import State
 from herglotz.training.config import FitConfig
+from herglotz.training.equation import Equation
+from herglotz.training.plan import Plan
 from herglotz.training.reading import REMEDY, reading_in
 from herglotz.training.run import Run
 
@@ -54,7 +56,8 @@ class StoredModel(TypedDict):
 class Metrics(TypedDict, total=False):
     """What later commands take from metrics.json, where it is there."""
 
-    plan: dict[str, Any]
+    plan: Plan
+    equation: Equation
     verdict: str
     level: str | None
     objective: str | None
@@ -169,6 +172,7 @@ def load_run(folder: str | Path) -> Run:
         stored["history"], reading,
     )  # fmt: skip
     _check_sizes(run, stored["data_digest"], folder)
+    _check_metrics(run, folder / "metrics.json")
     return run
 
 
@@ -206,6 +210,13 @@ def _check_sizes(run: Run, digest: str, folder: Path) -> None:
     sizes = {f"{name}_{end}": 1 if name == "s" else n for name in "qps" for end in ("low", "high")}
     if {name: len(x) for name, x in run.box.items()} != sizes or not run.h > 0:
         raise InputError(f"{path}: box and h are not those of a model with dof {n}; {REMEDY}")
+
+
+def _check_metrics(run: Run, path: Path) -> None:
+    """Refuse numbers of samples, or zeros of sensors, that the data have not."""
+    outliers, zeros = run.metrics.get("outlier_samples", ()), run.metrics.get("plan", {}).get("zeros", ())
+    if not all(0 <= k < run.data.samples for k in outliers) or len(zeros) not in (0, len(run.data) * run.data.dof):
+        raise InputError(f"{path}: outlier_samples or the plan's zeros are not those of the run's data; {REMEDY}")
 
 
 def _log(history: list[dict[str, Any]]) -> bytes:

@@ -9,6 +9,7 @@ from typing import Any, Protocol
 from herglotz.data import Trajectories
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.config import FitConfig
+from herglotz.training.equation import Equation
 from herglotz.training.recorded_range import range_in_words
 
 MOST_FEATURES, COLUMNS = 5, 80
@@ -62,7 +63,7 @@ def summary(run: Judged) -> str:
         lines.append(fill(f"Note: {run.metrics['extrapolation_status']}", COLUMNS))
     equation = run.metrics.get("equation")
     if equation:
-        lines += ["Learned equation:", *(f"  {line}" for line in equation["text"].splitlines())]
+        lines += ["Learned equation:", *(f"  {line}" for line in str(Equation.from_dict(equation)).splitlines())]
     return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
 
 

@@ -92,7 +92,9 @@ class Laplace:
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
         self.base = estimate_baseline(train, outliers=found, substeps=run.decided.substeps)
-        self.sigma = float(run.metrics["sigma"])
+        self.sigma = run.metrics.get("sigma") or 0.0
+        if not 0 < self.sigma * self.sigma < float("inf"):
+            raise InputError(f"the run's metrics have sigma {self.sigma:g}, and it must be a size > 0; fit again")
         departure = run.metrics.get("departure") or run.decided.departures[-1]
         self.prior = prior_of(run.model, self.base, departure)
         self.problem, self.path = self._solved(train, _starts(run), ~out, guess=states)

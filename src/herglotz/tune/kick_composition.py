@@ -16,6 +16,7 @@ Source: D. Turaev, Nonlinearity 16 (2003) 123 (Hénon-like maps); S. Blanes, F. 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -30,7 +31,6 @@ from herglotz.training import levenberg_marquardt
 
 LEVELS = ("conservative", "linear")  # the levels with a constant c and no force
 DEGREE = 4  # of the polynomials of a kick
-EXACT = 1e-8  # σ of the residuals relative to the motion's size, as in `distil`
 
 
 @dataclass(frozen=True)
@@ -156,29 +156,33 @@ def fit_kicks(
         d, a, b = x.split(sizes)
         return replace(start, drifts=d, cosines=a.reshape(start.cosines.shape), sines=b.reshape(start.sines.shape))
 
-    size = float(max(model.config.scale))
-    weights = torch.tensor([1.0, size / float(before.p.square().mean().sqrt().clamp(min=1e-12))], dtype=torch.float64)
-    weights = weights / (EXACT * size)
-    data = [y.double().reshape(-1) for y in (*before, *after)]
+    pairs = [y.double().reshape(-1) for y in (*before[:2], *after[:2])]
+    problem = _Flow(unpacked, float(max(model.config.scale)), pairs)
+    found = unpacked(levenberg_marquardt(problem, first, max_iterations=iterations, rtol=1e-5).x.detach())
+    q, _, s = found.map(*(y.double().reshape(-1) for y in before))
+    q1, _, s1 = (y.double().reshape(-1) for y in after)
+    return replace(found, offset=float((s1 - s).mean()), error=float((q - q1).square().mean().sqrt()))
 
-    def local(theta: Tensor, q0: Tensor, p0: Tensor, q1: Tensor, p1: Tensor) -> Tensor:
-        q, p, _ = unpacked(theta).map(q0, p0, torch.zeros_like(q0))
-        return torch.stack([q - q1, p - p1], -1) * weights
 
-    pairs = (data[0], data[1], data[3], data[4])
+class _Flow:
+    """½|r|² of the states that kicks reach and those that they should, q and p each in units of their own size."""
 
-    class Problem:
-        def cost(self, x: Tensor) -> Tensor:
-            return local(x, *pairs).square().sum() / 2
+    def __init__(self, unpacked: Callable[[Tensor], KickStepper], scale: float, pairs: list[Tensor]):
+        self.unpacked, self.pairs = unpacked, pairs  # q0, p0, q1, p1, (T,) each
+        p = pairs[1].square().mean().sqrt()
+        self.sizes = torch.stack([torch.full_like(p, scale), torch.where(p > 0, p, 1.0)])
 
-        def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-            r = local(x, *pairs).reshape(-1)
-            J = vmap(jacrev(local), (None, 0, 0, 0, 0))(x, *pairs).reshape(-1, len(x))
-            return self.cost(x), J.T @ J, J.T @ r
+    def _local(self, theta: Tensor, q0: Tensor, p0: Tensor, q1: Tensor, p1: Tensor) -> Tensor:
+        q, p, _ = self.unpacked(theta).map(q0, p0, torch.zeros_like(q0))
+        return torch.stack([q - q1, p - p1], -1) / self.sizes
 
-    found = unpacked(levenberg_marquardt(Problem(), first, max_iterations=iterations, rtol=1e-5).x.detach())
-    q, _, s = found.map(*data[:3])
-    return replace(found, offset=float((data[5] - s).mean()), error=float((q - data[3]).square().mean().sqrt()))
+    def cost(self, x: Tensor) -> Tensor:
+        return self._local(x, *self.pairs).square().sum() / 2
+
+    def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        r = self._local(x, *self.pairs).reshape(-1)
+        J = vmap(jacrev(self._local), (None, 0, 0, 0, 0))(x, *self.pairs).reshape(-1, len(x))
+        return self.cost(x), J.T @ J, J.T @ r
 
 
 def _leapfrog(model: ContactLagrangian, before: State, h: float, kicks: int) -> KickStepper:

@@ -1,5 +1,9 @@
 """Every mistake is one line on stderr with exit code 2, and leaves nothing behind."""
 
+import hashlib
+import json
+import shutil
+from functools import reduce
 from pathlib import Path
 
 import pytest
@@ -161,3 +165,29 @@ def test_a_damaged_run_and_file(tmp_path, capsys):  # fails if torch's own error
     (tmp_path / "a.pt2").write_bytes(b"junk")
     assert "has no manifest.json" in mistake(capsys, tmp_path, "verify", tmp_path)
     assert "does not end with its sha256" in mistake(capsys, tmp_path, "verify", tmp_path / "a.pt2")
+
+
+@pytest.mark.parametrize(
+    ("where", "value", "message"),
+    [
+        (("sigma",), None, "sigma"),
+        (("sigma",), 0.0, "sigma 0, and it must be a size > 0"),
+        (("sigma",), 1e200, "sigma 1e+200, and it must be a size > 0"),
+        (("outlier_samples",), [61], "outlier_samples or the plan's zeros are not those of the run's data"),
+        (("plan",), {}, "plan: lacks continues_probe"),
+        (("plan", "start"), {"rate": "x"}, "plan: start must be dict"),
+        (("plan", "zeros"), [0.0, 0.1], "outlier_samples or the plan's zeros are not those of the run's data"),
+        (("equation",), {"terms": []}, "equation: lacks lefts, network, units"),
+        (("equation", "terms", 0), {"left": "x"}, "equation: terms must be tuple"),
+        (("equation", "units"), 3, "equation: units must be str, got 3"),
+    ],
+)
+def test_wrong_entries_of_a_run(tmp_path, capsys, tiny_run, where, value, message):
+    # fails if a wrong entry of metrics.json is met later than at the door, by Python's own error (exit code 70)
+    run = shutil.copytree(tiny_run, tmp_path / "run")
+    metrics, manifest = (json.loads((run / name).read_text()) for name in ("metrics.json", "manifest.json"))
+    reduce(lambda x, key: x[key], where[:-1], metrics)[where[-1]] = value
+    (run / "metrics.json").write_text(json.dumps(metrics))
+    manifest["files"]["metrics.json"] = hashlib.sha256((run / "metrics.json").read_bytes()).hexdigest()
+    (run / "manifest.json").write_text(json.dumps(manifest))
+    assert message in mistake(capsys, tmp_path, "trust", run)

@@ -6,8 +6,9 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
+from herglotz.data.holds import Arrival
 from herglotz.scenes import scene
-from herglotz.training.hold import with_arrival
+from herglotz.training.hold import DELAY, FINEST, Way, Ways, with_arrival
 
 
 def test_the_hold_of_a_recording_is_found():
@@ -35,3 +36,16 @@ def test_a_hold_that_explains_no_more_is_not_taken(seed):
     noise, u = torch.randn(2, 200, generator=make, dtype=torch.float64)
     data = Trajectories.of(t, t.sin() + 0.01 * noise, u=u)
     assert with_arrival(data, data)[1] == ("zero", 0.0, 0.0)
+
+
+def test_the_best_delay_is_looked_for_between_those_that_were_tried(monkeypatch):
+    # fails if the search around the best of the delays steps over a nearer minimum: the next ones tried are half and
+    # 1.5 times as late, and here a better one lies at 5 times
+    def of(_, arrival):
+        steps = arrival.delay / 0.1
+        return Way(arrival, torch.full((3,), min(abs(steps - 1.9), 0.05 + abs(steps - 10))).square())
+
+    monkeypatch.setattr(Ways, "of", of)
+    data = simulate(scene("driven_pendulum"), trajectories=1, steps=60, h=0.1, seed=1)
+    found = Ways(data).along(DELAY, Arrival("zero", 0.0, 0.0))
+    assert found.arrival.delay == pytest.approx(0.19, abs=0.1 * FINEST)

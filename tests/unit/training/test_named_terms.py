@@ -111,6 +111,34 @@ def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
     assert Found.as_likely(simple, rich, 0.0) is taken  # pyright: ignore
 
 
+@pytest.mark.parametrize("moved", [0.0, 3.0])
+def test_the_change_of_a_motion_is_counted_sample_by_sample(moved):
+    # fails if misfits of two problems are added, or compared in the order of their segments: every sample moves by
+    # `moved` times the size of its own misfit
+    def problem(order, misfit):
+        path = SimpleNamespace(x=torch.zeros(2, 1, 3))
+        grid = SimpleNamespace(sample=torch.tensor(order))
+        return SimpleNamespace(d=2, grid=grid, pack=lambda *_: None, solve=lambda _: path, misfit=lambda _: misfit)
+
+    misfit = torch.tensor([1.0, -2.0, 2.0])
+    own, other = (problem(order, size * misfit[order]) for order, size in (([1, 2, 0], 1.0), ([2, 1, 0], 1.0 + moved)))
+    found = SimpleNamespace(fit=SimpleNamespace(theta=None, path=own.solve(None), problem=own))
+    assert Found.changed_by(found, other) == pytest.approx(moved * 3**0.5)  # pyright: ignore
+
+
+def test_with_translations_the_candidates_are_those_that_no_translation_moves():
+    # fails if the potential of what is not translated is left out, or the baseline's springs, which hold every
+    # coordinate where it is, stay
+    t = torch.arange(30, dtype=torch.float64) / 10
+    q = torch.stack([t.sin(), t.cos(), (2 * t).sin()], 1)
+    data = Trajectories.of(t, q, angles=(False, False, True), units=("m", "m", "rad"))
+    found = candidates(data, ("q1 + q2",))
+    assert (found.one_rate, found.springs, found.drag) == (True, False, ())
+    potentials = {text for text in found.features if "v" not in text}
+    assert {f"(q1 - q2)^{k}" for k in range(1, 5)} | {"sin(q3)", "cos(q3)"} <= potentials
+    assert not any(text.startswith(("q1", "q2")) for text in potentials)
+
+
 def test_the_equation_is_printed_with_deviations(duffing):
     # fails if a sign, a factor of a derivative, a unit or a covariance is wrong: 4 deviations are 6e-5 of chance
     terms = {term.what: term for term in duffing.equation().terms}

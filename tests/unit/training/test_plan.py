@@ -113,8 +113,10 @@ def test_a_wrong_plan_is_refused_in_words():
     plan = choose(*seen(0.0)).to_dict()
     with pytest.raises(InputError, match="unknown setting colour for Plan"):
         Plan.from_dict({**plan, "colour": "red"})
-    with pytest.raises(InputError, match="the plan is incomplete"):
+    with pytest.raises(InputError, match="the settings of Plan: lacks continues_probe, delay, departures"):
         Plan.from_dict({"level": "linear"})
+    with pytest.raises(InputError, match="the plan's start lacks stiffness, rate"):
+        Plan.from_dict({**plan, "start": {"tilt": [0.0], "stiffness": []}})
 
 
 def test_what_is_no_config_is_refused():  # fails if hz.fit(t, q) ends in numpy's words on truth values

@@ -16,7 +16,7 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import Apart, FoundZeros, ZerosOf, odd, refined, sensor_zeros
+from herglotz.training.sensor_zeros import Apart, FoundZeros, ZerosOf, _by_steps, odd, refined, sensor_zeros
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.verdict import Errors, in_words
@@ -100,6 +100,16 @@ def test_a_planted_zero_is_found_with_its_deviation(planted):
     # fails if terms make up for a part of it; chance exceeds four standard deviations once in 16 000
     assert abs(found.zeros[1] - planted) < 4 * found.deviations[1]
     assert found.deviations[1] < 0.5 * NOISE
+
+
+@pytest.mark.parametrize("planted", [-0.5, 0.02, PLANTED, 1.0])
+def test_single_steps_tell_a_zero_between_those_that_are_tried(planted):
+    # fails if Gauss–Newton does not go on from the best of the twelve angles around a turn, which are 0.52 rad apart:
+    # over 20 recordings its zeros were within 0.0023 rad
+    of = seen(0.0)
+    model = build_model(of.base, of.settings, "none")
+    shifted = pendulums(planted, seed=1)[1]
+    assert float(_by_steps(model, shifted, of.base.max_step)) == pytest.approx(planted, abs=0.007)
 
 
 def test_symmetry_says_where_the_reference_is_too():

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.export import ExportedStepper, compile_c, load_exported
+from herglotz.export import ExportedStepper, compile_c, export_onnx, load_exported
 from herglotz.export.metadata import describe
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, StepError, Stepper
@@ -90,6 +90,18 @@ def test_what_is_not_finite_is_the_loss_of_one_sample(level, files):
         torch.testing.assert_close(out.q[0], alone.q[0], rtol=1e-13, atol=0)
         with pytest.raises(InputError, match="q1 must be finite"):
             stepper.init(fine[0], fine[1] * value, fine[2], 0.1)
+
+
+def test_a_momentum_at_the_end_of_the_numbers_moves_a_file(tmp_path):
+    # fails if a file calls a guess that it gave up CONVERGED: q stayed where it was for p > 1.63e308, where the size of
+    # the equation and of its first move are numbers, and their sum is none
+    pytest.importorskip("onnxruntime")
+    model = ContactLagrangian(ModelConfig(level="linear", angles=(False,), correction_width=2))  # it iterates
+    file = load_exported(export_onnx(model, tmp_path / "model.onnx", h=0.1))
+    p = torch.linspace(1.5e308, 1.79e308, 30, dtype=torch.float64)[:, None]
+    out = file.rollout(torch.zeros_like(p), p, h=0.1, steps=1)
+    moved = (out.q[:, 1] / p - 0.1).abs() < 0.01
+    assert bool((moved[:, 0] | (out.status[:, 0] != 0)).all())
 
 
 def test_s_that_is_no_number_where_nothing_depends_on_it():

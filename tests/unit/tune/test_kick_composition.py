@@ -14,7 +14,7 @@ from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import State, Status, Stepper
 from herglotz.tune import CompiledKicks, KickStepper, export_kicks_c, fit_kicks
-from herglotz.tune.kick_composition import _leapfrog
+from herglotz.tune.kick_composition import _Flow, _leapfrog
 from herglotz.tune.kick_composition_c import kicks_c
 
 try:
@@ -93,6 +93,38 @@ def test_two_kicks_are_the_oscillator_wherever_the_data_lie(h):
     found = fit_kicks(model, start, State(*system.flow(*start, h)), h, kicks=2, iterations=60)
     assert found.error < 1e-12
     torch.testing.assert_close(found.step(start, h).state.p, system.flow(*start, h)[1], rtol=0, atol=1e-12)
+
+
+def test_the_unit_of_length_decides_nothing():
+    # fails if q or p is weighted by anything but its own size: two kicks cannot follow this spring, and what they do
+    # instead would depend on the unit
+    found = []
+    start, end = pairs(60, 1, H, scene("duffing"))
+    for unit in (1.0, 1000.0):
+        model = ContactLagrangian(ModelConfig(angles=(False,), scale=(unit,), rate=0.1, potential_width=0))
+        before, after = (State(unit * x.q, unit * x.p, unit**2 * x.s) for x in (start, end))
+        kicks = fit_kicks(model, before, after, H, kicks=2, iterations=40)
+        found.append(kicks.step(before, H).state.q / unit)
+        assert kicks.error / unit > 1e-3
+    assert float((found[0] - found[1]).abs().max()) < 1e-7
+
+
+def test_the_normal_equations_of_kicks_are_the_derivatives_of_the_cost():
+    # fails if a factor or a sign of the cost is not that of its slope
+    start, end = pairs(20, 1, H, scene("damped_pendulum"))
+    own = random_kicks(angle=True)
+    given = [y.reshape(-1) for y in (*start[:2], *end[:2])]
+    problem = _Flow(lambda x: replace(own, drifts=x), 0.7, given)
+    cost, A, b = problem.normal_equations(own.drifts)
+    x = own.drifts.clone().requires_grad_(True)
+    (slope,) = torch.autograd.grad(problem.cost(x), x)
+    torch.testing.assert_close(b, slope)
+    J = torch.func.jacrev(lambda x: problem._local(x, *given).reshape(-1))(own.drifts)
+    torch.testing.assert_close(A, J.T @ J)
+    p = start.p.square().mean()
+    q1, p1, _ = own.step(start, H).state
+    errors = (q1 - end.q).square().sum() / 0.7**2 + (p1 - end.p).square().sum() / p
+    torch.testing.assert_close(cost, errors / 2)
 
 
 @needs_c
