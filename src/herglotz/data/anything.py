@@ -16,6 +16,7 @@ from torch import Tensor
 
 from herglotz.data.csv_columns import Names, Wanted, name_and_unit
 from herglotz.data.extra_formats import Table
+from herglotz.data.gaps import parted
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
@@ -156,7 +157,7 @@ def _floats(name: str, x: Any) -> np.ndarray:
 def _marked(data: Trajectories, angles: Any) -> Trajectories:
     if angles is not None:
         data = data.with_angles((data.names if angles else ()) if isinstance(angles, bool) else angles)
-    return data.unwrapped()
+    return parted(data).unwrapped()
 
 
 def _shown(data: Trajectories) -> Trajectories:

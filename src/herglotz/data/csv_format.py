@@ -16,7 +16,7 @@ from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
 from herglotz.data.csv_dialect import cells_of, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import SHOWN, number, number_or_none, quote
+from herglotz.data.rows import MISSING, SHOWN, number, number_or_none, quote
 from herglotz.data.sensors import measured
 from herglotz.data.table import from_numbers, from_table, moment
 from herglotz.data.trajectories import Trajectories
@@ -79,6 +79,7 @@ def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
         raise InputError(f"{Path(path)}: there is no header; add a first line such as t[s],q[rad]")
     at, header = rows[0]
     columns = assign(cells_of(header), f"{path}, row {at}", wanted)
+    _check_kinds(path, columns, rows[1:])
     found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]), lambda found: _held(found, lines))
     if not is_number(cells_of(rows[1][1])[columns.time]):
         roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
@@ -185,6 +186,18 @@ def _parse_rows(
         at = rows[labels.index("")][0]
         raise InputError(f"{path}, row {at}, column 'trajectory': blank, but other rows name a trajectory; fill it in")
     return [at for at, _ in rows], labels, values
+
+
+def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) -> None:
+    """Raise where a column of text would be read as numbers: neither of its first two cells is one."""
+    two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
+    for i in columns.numeric if len(two) == 2 else ():
+        if any(is_number(x) or x.casefold() in MISSING or moment(x) for x in (cells[i] for cells in two)):
+            continue
+        name, remedy = columns.names[i], "write numbers, or dates such as 2026-03-01 12:00:00.25"
+        if i != columns.time:
+            remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
+        raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(two[0][i])} is not a number; {remedy}")
 
 
 def _since(first: datetime, date: datetime, where: str) -> float:

@@ -13,6 +13,7 @@ from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_format import read_table, write_csv
 from herglotz.data.extra_formats import read_hdf5, read_mat, read_parquet
 from herglotz.data.files import PathLike, read_bytes
+from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
@@ -105,7 +106,7 @@ def load(
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
-    found = measured(found, sensor_zeros, sensor_scales)
+    found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = found.with_angles(angles)
     elif like is not None:

@@ -218,12 +218,12 @@ class Trajectories:
         """Cut every trajectory in time: its first `round(fraction * length)` samples train, the others test."""
         (train, train_lengths), (test, test_lengths) = time_split(self.lengths, fraction, self.source)
         device = self.t.device
-        return self._rows(train.to(device), train_lengths), self._rows(test.to(device), test_lengths)
+        return self.rows(train.to(device), train_lengths), self.rows(test.to(device), test_lengths)
 
     def liveliest(self, most: int) -> Trajectories:
         """Return at most about `most` samples: of trajectories evenly chosen the run of samples that moves most."""
         rows, lengths = liveliest_rows(self.q, self.lengths, most)
-        return self if len(rows) == self.samples else self._rows(rows.to(self.t.device), lengths)
+        return self if len(rows) == self.samples else self.rows(rows.to(self.t.device), lengths)
 
     def thinned(self, every: int) -> Trajectories:
         """Return samples 0, m, 2m, … of each trajectory, with inputs averaged over the steps they then span.
@@ -258,7 +258,7 @@ class Trajectories:
                 raise InputError(f"{where}: there is no trajectory {i}; select from 0 to {len(self) - 1}")
         spans = [torch.arange(self.offsets[i], self.offsets[i] + self.lengths[i]) for i in chosen]
         rows = torch.cat(spans) if spans else torch.arange(0)
-        return self._rows(rows.to(self.t.device), tuple(self.lengths[i] for i in chosen))
+        return self.rows(rows.to(self.t.device), tuple(self.lengths[i] for i in chosen))
 
     @classmethod
     def cat(cls, sets: Iterable[Trajectories]) -> Trajectories:
@@ -290,11 +290,9 @@ class Trajectories:
     def with_angles(self, angles: str | Iterable[str]) -> Trajectories:
         """Return the set with exactly these coordinates marked as angles; a unit "1" among them becomes "rad"."""
         wanted = (angles,) if isinstance(angles, str) else tuple(angles)
-        for name in wanted:
-            if name not in self.names:
-                raise InputError(
-                    f"{self.source or 'trajectories'}: angles names {name!r}, but the coordinates are {self.names}"
-                )
+        where = self.source or "trajectories"
+        wrong = [name for name in wanted if name not in self.names]
+        refuse({f"{where}: angles names {name!r}, but the coordinates are {self.names}": name for name in wrong})
         flags = tuple(name in wanted for name in self.names)
         units = tuple("rad" if a and unit == "1" else unit for a, unit in zip(flags, self.units, strict=True))
         return replace(self, angles=flags, units=units)
@@ -333,7 +331,8 @@ class Trajectories:
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}
 
-    def _rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
+    def rows(self, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
+        """Return these rows of the concatenation, as trajectories of these lengths."""
         return replace(self, **self._map(lambda x: x[rows]), lengths=lengths)
 
 
