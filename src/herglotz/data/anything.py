@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Names, Wanted, name_and_unit
 from herglotz.data.extra_formats import Table
-from herglotz.data.gaps import parted
+from herglotz.data.gaps import parted, without
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
@@ -72,10 +73,14 @@ def as_trajectories(
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
-        found = _of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like})
+        return measured(_of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like}), sensor_zeros)
     else:
         found = _array(data, h, time, names)
-    return _marked(measured(found, sensor_zeros, sensor_scales), angles)
+    known = data.notes if isinstance(data, Trajectories) else ()
+    found = _marked(measured(found, sensor_zeros, sensor_scales), angles)
+    for note in found.notes[len(known) :]:
+        print(f"{found.source or 'trajectories'}: {note}", file=sys.stderr)
+    return found
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -127,7 +132,12 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     n = len(q)
     t = np.arange(n) * float(h) if h is not None else _floats("time", time)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
-    return in_radians_and_seconds(Trajectories.of(t, q, u=u, source="array", **_labels(called)))
+    missing = q.isnan().reshape(n, -1).any(1)
+    known = n - int(missing.sum())
+    refuse({f"array: {known} of its {n} samples have a value, {MIN_SAMPLES} are needed": known < MIN_SAMPLES < n})
+    found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
+    first = f"sample {int(missing.long().argmax())}" if known < n else ""
+    return in_radians_and_seconds(without(found, missing, first) if known < n else found)
 
 
 def _labels(called: Names | None) -> dict[str, Any]:

@@ -1,15 +1,28 @@
-"""Recordings that were written into one: a gap longer than all that was recorded begins another."""
+"""Gaps in recordings: samples without a value are left out; a gap longer than all that was recorded begins another."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.trajectories import Trajectories
 
 CROSSED = 1000  # typical steps: a gap of so many is crossed in any recording, as that costs little
+
+
+def without(data: Trajectories, missing: Tensor, first: str) -> Trajectories:
+    """Return the set without the samples that are `missing`, (N,) bool; a note counts them and names the `first`.
+
+    A step over them is longer, and has the mean of their inputs. Each trajectory starts at its first known sample.
+    """
+    begun = torch.cat([(~own).cumsum(0) > 0 for own in missing.split(list(data.lengths))])
+    lengths = tuple(int(own.sum()) for own in begun.split(list(data.lengths)))
+    found = data.rows(begun.nonzero()[:, 0], lengths).keep(~missing[begun])
+    count = "a row is" if int(missing.sum()) == 1 else f"{int(missing.sum())} rows are"
+    return replace(found, notes=(*data.notes, f"{count} left out, without a value: the first is {first}"))
 
 
 def parted(data: Trajectories) -> Trajectories:

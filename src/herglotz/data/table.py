@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
+from herglotz.data.gaps import without
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
@@ -38,21 +38,16 @@ def from_table(
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
+    order, lengths = [i for group in groups for i in group], tuple(map(len, groups))
     missing = np.isnan(values).any(1)
     if not missing.any():
-        order, lengths = [i for group in groups for i in group], tuple(map(len, groups))
         return said(_trajectories(path, columns, values[order], lengths))
     for group in groups:
         _check_enough(path, columns, at, values, group)
-    # A step starts at a sample that is known, so that a trajectory does.
-    groups = [group[int(np.argmin(missing[group])) :] for group in groups]
-    order = [i for group in groups for i in group]
-    found = said(_trajectories(path, columns, np.nan_to_num(values[order]), tuple(map(len, groups))))
-    found = found.keep(torch.from_numpy(~missing[order]))
     first = int(missing.argmax())
     name = columns.names[columns.numeric[int(np.isnan(values[first]).argmax())]]
-    count = "a row is" if missing.sum() == 1 else f"{missing.sum()} rows are"
-    return replace(found, notes=(f"{count} left out, without a value: the first is row {at[first]}, column '{name}'",))
+    found = said(_trajectories(path, columns, np.nan_to_num(values[order]), lengths))
+    return without(found, torch.from_numpy(missing[order]), f"row {at[first]}, column '{name}'")
 
 
 def _check_enough(path: Path, columns: Columns, at: Sequence[int], values: np.ndarray, group: list[int]) -> None:

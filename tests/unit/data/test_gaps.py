@@ -1,10 +1,12 @@
 """A gap longer than all that was recorded begins another trajectory; shorter ones do not."""
 
 import numpy as np
+import pytest
 import torch
 
 from herglotz.data import Trajectories, as_trajectories, load
 from herglotz.data.gaps import CROSSED, parted
+from herglotz.errors import InputError
 
 
 def recorded(*spans):
@@ -53,3 +55,24 @@ def test_files_and_arrays_are_cut_as_they_are_read(tmp_path):
     assert as_trajectories(x, time=t).lengths == (41, 41)
     assert as_trajectories(data).lengths == (41, 41)
     assert as_trajectories({"t": t, "x": x}).lengths == (41, 41)
+
+
+def test_missing_samples_of_arrays_are_left_out_and_said(capsys):
+    # fails if NaN in an array is an error, shifts the times of what follows, or goes without a word
+    x = np.sin(np.arange(12.0))
+    x[[0, 5, 6]] = np.nan
+    data = as_trajectories(x, h=0.5, inputs=np.arange(12.0))
+    assert data.t.tolist() == [0.5, 1, 1.5, 2, 3.5, 4, 4.5, 5, 5.5]
+    assert data.q[:, 0].tolist() == x[~np.isnan(x)].tolist()
+    assert data.u is not None
+    assert data.u[3] == (4 + 5 + 6) / 3
+    said = "array: 3 rows are left out, without a value: the first is sample 0\n"
+    assert capsys.readouterr().err == said
+    assert as_trajectories([x, x], h=0.5, inputs=None).notes == data.notes
+    assert capsys.readouterr().err == said + said  # each recording once
+    assert as_trajectories(data).notes == data.notes
+    assert capsys.readouterr().err == ""  # it has been said
+    with pytest.raises(InputError, match="array: 2 of its 12 samples have a value, 3 are needed"):
+        as_trajectories(np.where(np.arange(12) < 2, 1.0, np.nan), h=1)
+    with pytest.raises(InputError, match="sample 3, is inf"):
+        as_trajectories(np.where(np.arange(12) == 3, np.inf, np.sin(np.arange(12.0))), h=1)
