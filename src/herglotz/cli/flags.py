@@ -17,7 +17,7 @@ Progress = Literal[False, "lines", "iterations"] | None  # what `herglotz.traini
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """Add DATA, --out and --resume, --config, and how the data are read: --angles, --train-fraction."""
     parser.usage = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
-    parser.add_argument("data", metavar="DATA", type=existing, help="file with time and positions")
+    parser.add_argument("data", metavar="DATA", type=existing, help="file with time and positions, or a folder of them")
     parser.add_argument("--out", required=True, type=Path, metavar="RUN", help="folder for the result; made if missing")
     parser.add_argument("--resume", action="store_true", help="go on after an interruption, with the same flags")
     add_data_settings(parser)

@@ -36,9 +36,13 @@ def read_csv(
     group: str | None = None,  # column that numbers the trajectories; left out: trajectory or trial
     angles: Names | None = None,  # coordinates that are angles; left out: those in rad; () for none
 ) -> Trajectories:
-    """Read trajectories from a csv file (UTF-8, commas, a decimal point).
+    """Read trajectories from a csv file (UTF-8).
 
-    The header's cells are `name`, `name[unit]` or `name (unit)`. `t`, `time`, `timestamp` or `datetime` is the time;
+    Columns are separated by commas, semicolons, tabs or spaces; where it is not a comma, decimals may have one. A row in
+    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
+
+    The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
+    behind #, as `numpy.savetxt` writes it. `t`, `time`, `timestamp` or `datetime` is the time;
     `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`,
     `force`, `F`, `torque`, `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs;
     velocities and accelerations (`v`, `vx`, `velocity`, `*_dot`, `ax`, columns in m/s, rad/s², ...) and counters
