@@ -38,7 +38,7 @@ def read_csv(
 ) -> Trajectories:
     """Read trajectories from a csv file (UTF-8).
 
-    Columns are separated by commas, semicolons, tabs or spaces; where it is not a comma, decimals may have one. A row in
+    Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
     which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
 
     The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
