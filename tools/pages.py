@@ -2,7 +2,8 @@
 
 A cell begins with `# %%`; one with `# %% [markdown]` holds text behind `# `. What a cell prints stands below its code,
 and so does the value of its last line; a figure becomes a PNG beside the page, in docs/tutorials/, and the path of a
-GIF this animation. `make docs` offers each page as a notebook (`notebook`), with what was shown.
+GIF this animation. `make docs` offers each page as a notebook (`notebook`), with what was shown; `--notebooks FOLDER`
+writes these files alone, and runs nothing.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import ast
 import base64
 import contextlib
 import io
+import json
 import os
 import re
 import sys
@@ -111,8 +113,20 @@ def parts_of(written: str) -> list[tuple[str, str]]:
     return found
 
 
+def write_notebooks(folder: Path) -> None:
+    """Write every executed page as a notebook into a folder; made if missing."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for path in sorted(PAGES.glob("*.md")):
+        cells = notebook(path.read_text(encoding="utf-8"), PAGES)
+        (folder / f"{path.stem}.ipynb").write_text(json.dumps(cells, indent=1), encoding="utf-8")
+        print(folder / f"{path.stem}.ipynb")
+
+
 def main(chosen: list[str]) -> None:
     """Write the pages of these scripts, or of all; each runs in an empty folder."""
+    if chosen[:1] == ["--notebooks"] and len(chosen) == 2:
+        write_notebooks(Path(chosen[1]))
+        return
     PAGES.mkdir(parents=True, exist_ok=True)
     for name in chosen or sorted(path.stem for path in EXAMPLES.glob("*.py")):
         with tempfile.TemporaryDirectory() as folder:

@@ -3,6 +3,7 @@
 import ast
 import base64
 import importlib
+import json
 import re
 import sys
 import tomllib
@@ -13,7 +14,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
 sys.path.insert(0, str(ROOT))
-from tools.pages import cells, notebook, page, parts_of  # noqa: E402
+from tools.pages import cells, main, notebook, page, parts_of  # noqa: E402
 from tools.readme import elsewhere  # noqa: E402
 
 
@@ -68,6 +69,24 @@ def test_a_tutorial_is_offered_as_a_notebook(path):
     for output in outputs:
         for kind, body in output.get("data", {}).items():
             assert base64.b64decode(body)[:4] in {"image/png": [b"\x89PNG"], "image/gif": [b"GIF8"]}[kind]
+
+
+def test_notebooks_are_written_without_the_site(tmp_path, capsys):
+    # fails if a clone without mkdocs has no notebooks, or a cell lacks what the format 4.5 asks for
+    main(["--notebooks", str(tmp_path / "notebooks")])
+    written = sorted((tmp_path / "notebooks").iterdir())
+    assert [path.stem for path in written] == [path.stem for path in EXAMPLES]
+    assert capsys.readouterr().out.splitlines() == [str(path) for path in written]
+    for path in written:
+        made = json.loads(path.read_text(encoding="utf-8"))
+        assert (made["nbformat"], made["nbformat_minor"], made["metadata"]["kernelspec"]["name"]) == (4, 5, "python3")
+        for cell in made["cells"]:
+            extra = {"outputs", "execution_count"} if cell["cell_type"] == "code" else set()
+            assert set(cell) == {"cell_type", "id", "metadata", "source"} | extra
+            assert re.fullmatch(r"[\w-]{1,64}", cell["id"])
+            for output in cell.get("outputs", ()):
+                kind = output["output_type"]
+                assert set(output) == {"output_type"} | {"stream": {"name", "text"}}.get(kind, {"data", "metadata"})
 
 
 @pytest.mark.slow

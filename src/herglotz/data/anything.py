@@ -76,11 +76,7 @@ def as_trajectories(
         return measured(_of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like}), sensor_zeros)
     else:
         found = _array(data, h, time, names)
-    known = data.notes if isinstance(data, Trajectories) else ()
-    found = _marked(measured(found, sensor_zeros, sensor_scales), angles)
-    for note in found.notes[len(known) :]:
-        print(f"{found.source or 'trajectories'}: {note}", file=sys.stderr)
-    return found
+    return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 
 
 def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -168,6 +164,13 @@ def _marked(data: Trajectories, angles: Any) -> Trajectories:
     if angles is not None:
         data = data.with_angles((data.names if angles else ()) if isinstance(angles, bool) else angles)
     return parted(data).unwrapped()
+
+
+def _noted(found: Trajectories, data: Any) -> Trajectories:
+    """The same; notes that were not of the data already are printed."""
+    for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
+        print(f"{found.source or 'trajectories'}: {note}", file=sys.stderr)
+    return found
 
 
 def _shown(data: Trajectories) -> Trajectories:

@@ -195,17 +195,18 @@ def _parse(cells: Sequence[str], where: str) -> tuple[tuple[str, ...], tuple[str
             raise InputError(f"{where}, column {i + 1}: {quote(cell)} is not a header cell; write name or name[unit]")
         found.append(of)
     often = Counter(name for name, _ in found)
-    # Of `x (raw)` and `x (filtered)` the brackets hold no unit, and `x_deg` beside `x_rad` has its whole name.
-    found = [
-        (cell.strip(), "" if cell.endswith(")") else of[1]) if often[of[0]] > 1 and not cell.endswith("]") else of
-        for cell, of in zip(cells, found, strict=True)
-    ]
+    found = [_whole(cell, of[1]) if often[of[0]] > 1 else of for cell, of in zip(cells, found, strict=True)]
     names, units = tuple(name for name, _ in found), tuple(unit for _, unit in found)
     for name, count in Counter(names).items():
         refuse({f"{where}: the column {quote(name)} comes twice; rename or delete one": count > 1})
     if all(is_number(name) for name in names):
         raise InputError(f"{where}: the header is missing (only numbers there); add a first line such as t[s],q[rad]")
     return names, units
+
+
+def _whole(cell: str, unit: str) -> tuple[str, str]:
+    """Name and unit of one of several cells of one name: brackets of `x (raw)` hold no unit, and `x_deg` is a name."""
+    return (cell.strip(), "" if cell.endswith(")") else unit) if not cell.endswith("]") else (cell.split("[")[0], unit)
 
 
 def name_and_unit(cell: str) -> tuple[str, str] | None:
