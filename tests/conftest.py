@@ -6,6 +6,7 @@ decided by the seed and the data. An assertion on a trained quantity that holds 
 is found so on one machine (`make test-anywhere`).
 """
 
+import functools
 import gc
 import os
 import sys
@@ -42,11 +43,14 @@ def pytest_configure():
     if seed is None:
         return
     from herglotz import cli, training  # noqa: F401  their modules hold names of `fit`
+    from herglotz.data import Trajectories
 
     fit = training.fit
 
+    @functools.wraps(fit)
     def fit_shaken(data, *arguments, **options):
-        return fit(shaken(data, int(seed)), *arguments, **options)
+        known = isinstance(data, Trajectories)  # arrays and frames become one inside
+        return fit(shaken(data, int(seed)) if known else data, *arguments, **options)
 
     for name, module in list(sys.modules.items()):
         if name.startswith("herglotz") and getattr(module, "fit", None) is fit:

@@ -7,6 +7,7 @@ compiler's runtime and no other package of this project: install it into an envi
 
 from __future__ import annotations
 
+import importlib
 import io
 import json
 import os
@@ -16,11 +17,12 @@ import zipfile
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
-import atheris  # pyright: ignore[reportMissingImports]
 import numpy as np
 import torch  # noqa: F401  loaded before what is instrumented
 
+atheris: Any = importlib.import_module("atheris")  # of an environment of its own, which no checker knows
 with atheris.instrument_imports(include=["herglotz"]):
     from herglotz.data.csv_format import read_csv
     from herglotz.data.npz_format import trajectories_of
@@ -60,7 +62,7 @@ def metadata(content: bytes) -> None:
         check_entries(Metadata, json.loads(content), "file", "write it again")
 
 
-def member(array: object) -> bytes:
+def member(array: Any) -> bytes:
     """An array as a file of numpy."""
     buffer = io.BytesIO()
     np.save(buffer, array)
