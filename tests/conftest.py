@@ -23,7 +23,7 @@ SHAKEN = set()  # digests of what was disturbed
 
 
 def shaken(data, seed):
-    """The data with every recorded number disturbed by `RELATIVE`; the same data are disturbed in the same way, once."""
+    """The data with every recorded number disturbed by `RELATIVE`; the same data in the same way, and once."""
     if data.digest() in SHAKEN:  # those of a run, which is fitted again
         return data
     make = torch.Generator().manual_seed(seed + int(data.digest()[:8], 16))
