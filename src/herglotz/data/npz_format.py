@@ -152,7 +152,9 @@ def _labels(path: Path, metadata: np.ndarray | None) -> dict:
         return {}
     labels: Any = None
     with suppress(ValueError, RecursionError):
-        labels = json.loads(str(metadata))
+        # numpy's own str takes any number for a character, and Python itself fails on one beyond Unicode.
+        order = "be" if metadata.dtype.byteorder == ">" else "le"
+        labels = json.loads(metadata.tobytes().decode(f"utf-32-{order}").rstrip("\0"))
     check_entries(Metadata, labels, f"{path}: 'metadata' (a JSON object)", "write it again or drop it")
     known = {name: labels[name] for name in LABELS if name in labels}
     return {**known, "columns": tuple(map(tuple, known.get("columns", [])))}

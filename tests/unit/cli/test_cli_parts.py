@@ -1,6 +1,7 @@
 """Small parts of every command: tables, signals, what is said of a fault of the package's own."""
 
 import signal
+from argparse import Namespace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +12,8 @@ import torch
 from herglotz.cli import SIGNALS, _internal, _orderly, rollout
 from herglotz.cli.common import exit_code, print_table, warn_of_misfit
 from herglotz.cli.tune import _whole
+from herglotz.data import driving
+from herglotz.data.holds import Arrival
 from herglotz.errors import InputError
 
 
@@ -71,6 +74,18 @@ def test_steps_beyond_those_of_the_fit_are_told(step, said, capsys):  # fails if
     source = SimpleNamespace(h_range=(0.1, 0.2), time_unit="s")
     rollout._warn(source, step * torch.arange(4, dtype=torch.float64), None, [])  # type: ignore[arg-type]
     assert ("fitted to, 0.1 to 0.2 s" in " ".join(capsys.readouterr().err.split())) is said
+
+
+@pytest.mark.parametrize("arrival", [Arrival("first", 0.2, 0.1), None])
+def test_inputs_of_a_recording_arrive_as_those_of_the_fit(arrival, monkeypatch):
+    # fails if a rollout drops the delay and the lag of the fit, or a file that names none is not driven
+    asked = []
+    monkeypatch.setattr(driving, "input_recording", lambda *given: asked.append(given) or SimpleNamespace(t=[0.0]))
+    monkeypatch.setattr(driving, "driven", lambda *_: "driven")
+    source = SimpleNamespace(arrival=arrival, time_unit="s", columns=())
+    arguments = Namespace(steps=3, inputs=Path("u.csv"), u=None, h=0.1, q0=None, t0=None, trajectory=0)
+    assert rollout._driven(arguments, source, 0.0) == "driven"  # pyright: ignore[reportArgumentType]
+    assert asked == [(Path("u.csv"), 0, "s", arrival or Arrival(), ())]
 
 
 def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothing of its coordinates is not stepped

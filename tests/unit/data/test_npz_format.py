@@ -60,6 +60,7 @@ def test_arrays_alone_are_enough(tmp_path):  # fails if metadata or lengths are 
         ({"t": T3, "q": Q3, "lengths": np.array([4])}, r"d.npz: lengths add up to 4 but t has 3 samples"),
         ({"t": T3, "q": Q3, "metadata": np.array("{")}, "must hold named entries"),
         ({"t": T3, "q": Q3, "metadata": np.array("[]")}, "must hold named entries"),
+        ({"t": T3, "q": Q3, "metadata": np.array([0x110000], "<u4").view("<U1")}, "must hold named entries"),
         (
             {"t": T3, "q": Q3, "metadata": np.array('{"names": "q"}')},
             r"'metadata'.*: names must be list.str., got 'q' .*drop it",
@@ -101,6 +102,9 @@ def test_truncated(tmp_path):  # fails if a cut download raises BadZipFile
 def test_unknown_labels_are_ignored(tmp_path):  # fails if a newer file with more metadata is refused
     data = read(tmp_path, t=T3, q=Q3, metadata=np.array(json.dumps({"names": ["z"], "camera": "red"})))
     assert data.names == ("z",)
+    # fails if the order of bytes, or the zeros that numpy fills a text up with, are not looked at
+    swapped = np.array('{"names": ["größe"]}', dtype=">U40")
+    assert read(tmp_path, t=T3, q=Q3, metadata=swapped).names == ("größe",)
 
 
 def _archive() -> bytes:

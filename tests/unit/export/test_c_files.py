@@ -8,7 +8,8 @@ from typing import Any
 
 import pytest
 
-from herglotz.export import export_c
+from herglotz.errors import InputError
+from herglotz.export import export_c, trusted
 from herglotz.export.c_header import RUNTIME
 from herglotz.models import ContactLagrangian, ModelConfig
 
@@ -48,6 +49,16 @@ def built(tmp_path, code, *flags):
     (tmp_path / "use.c").write_text(code)
     command = [CC, "-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Werror", *flags, "use.c"]
     return subprocess.run([*command, "-o", "use", "-lm"], cwd=tmp_path, capture_output=True, text=True, check=False)
+
+
+def test_another_process_of_the_same_user_knows_what_was_written(monkeypatch, tmp_path):
+    # fails if the record of written files is lost with the process, or what stands in it is never looked up
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    trusted.remember(b"mine")
+    monkeypatch.setattr(trusted, "_here", set())  # as in another process
+    trusted.check_trusted(b"mine", "a.h", trust_code=False)
+    with pytest.raises(InputError, match=r"a\.h: opening it runs code that it holds"):
+        trusted.check_trusted(b"other", "a.h", trust_code=False)
 
 
 def test_two_headers_live_in_one_program(tmp_path):

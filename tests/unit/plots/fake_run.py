@@ -10,10 +10,11 @@ from herglotz.training import FitConfig, Plan, Run
 from herglotz.training.recorded_range import box_of
 
 TERMS = "cos(q1) explains the data to 0.01"
+START = {"stiffness": (1.0,), "tilt": (0.0,), "rate": (0.2,)}
 PLAN = Plan(
-    "linear", "trajectory", "none", 2, ("cos(q1)",), "", 0.0, 0.0, (), 1, {"alike": True}, {}, False, False, 0.01,
-    True, 1, (2e-4, 6e-4, 2e-3, 6e-3), (),
-    {"level": TERMS, "objective": "the data are noisy", "features": TERMS, "outliers": ""},
+    "linear", "trajectory", "none", 2, ("cos(q1)",), "", 0.0, 0.0, (), 1, {"alike": True}, START, False, False, 0.01,
+    True, 1, (2e-4, 6e-4, 2e-3, 6e-3),
+    reasons={"level": TERMS, "objective": "the data are noisy", "features": TERMS, "outliers": ""},
 )  # fmt: skip
 
 

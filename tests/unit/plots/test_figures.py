@@ -17,6 +17,7 @@ import torch
 from fake_run import TERMS, fake_run
 from matplotlib.figure import Figure
 from matplotlib.image import imread
+from matplotlib.text import Text
 from PIL import Image
 
 from herglotz.errors import InputError
@@ -37,6 +38,7 @@ from herglotz.plots import (
     save_figures,
 )
 from herglotz.plots.motion import plot_prediction, trajectory_title
+from herglotz.plots.phase import _background
 from herglotz.stepping import State
 from herglotz.training import Bands, Run
 
@@ -187,6 +189,8 @@ def test_the_title_is_the_error_of_the_unseen_part():  # fails if training sampl
     assert title(plot_trajectory(run)) == f"Extrapolation RMS {rms:.3g} rad over the unseen third"
     assert "nothing was held out" in title(plot_trajectory(fake_run(fraction=1.0, steps=20)))
     assert "unseen 20 %" in title(plot_trajectory(fake_run(fraction=0.8, steps=49)))
+    for seen, words in ((3 / 4, "quarter"), (1 / 2, "half"), (1 / 3, "two thirds"), (1 / 4, "three quarters")):
+        assert trajectory_title(fake_run(fraction=seen, steps=11)).endswith(f"over the unseen {words}")
 
 
 def test_a_free_run_that_fails_is_drawn_and_named():  # fails if NaN in a prediction breaks or beautifies the figure
@@ -207,6 +211,17 @@ def test_one_trajectory_can_be_chosen():  # fails if the index is ignored or not
     np.testing.assert_array_equal(drawn, run.data[2].q[:, 0])
     with pytest.raises(InputError, match="there is no trajectory 3; choose one from 0 to 2"):
         plot_trajectory(run, 3)
+
+
+def test_the_first_of_several_motions_says_what_is_what():  # fails if captions stand elsewhere, or in every panel
+    figure = plot_trajectory(run_of("many"))
+    said = [any("data" in text.get_text() for text in ax.findobj(Text)) for ax in figure.axes[::2]]
+    assert said == [True, False, False, False]
+
+
+def test_lines_of_the_flow_last_as_long_as_the_longest_motion():  # fails if they end after a sample
+    run = run_of("plane")
+    assert _background(run, (-1.0, 1.0), (-1.0, 1.0)).shape == (1, 31, 2, 2)
 
 
 def test_residuals_are_data_minus_model():  # fails if the lower panel shows something else

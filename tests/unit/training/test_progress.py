@@ -95,10 +95,15 @@ def test_the_log_for_tensorboard(monkeypatch, tmp_path):
 def test_a_fit_removes_what_a_killed_one_left(monkeypatch, tmp_path, first):
     # fails if it stays for ever, or another process of torchrun, which holds no lock, takes what the first one writes
     module = sys.modules["herglotz.training.fit"]
-    monkeypatch.setattr(module, "_fit", lambda *_: None)
     monkeypatch.setattr(module, "is_first", lambda: first)
+
+    def begun(*_):
+        raise InterruptedError
+
+    monkeypatch.setattr(module, "_fit", begun)
     names = [".checkpoint.pt.abcdefgh.tmp", ".model.pt.abcdefgh.tmp", ".history.csv.abcdefgh.tmp", ".mine.abcdefgh.tmp"]
     for name in names:
         (tmp_path / name).touch()
-    module.fit([0.0, 1.0, 0.0, -1.0], h=1.0, out=tmp_path)
+    with pytest.raises(InterruptedError):
+        module.fit([0.0, 1.0, 0.0, -1.0], h=1.0, out=tmp_path)
     assert sorted(x.name for x in tmp_path.iterdir()) == (names[-1:] if first else sorted(names))
