@@ -16,6 +16,7 @@ from herglotz.models.capabilities import Capabilities
 from herglotz.models.config import ModelConfig
 from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import kinetic_term
+from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.friction import CoupledFriction, Friction
 from herglotz.models.jet import Jet, variable
 from herglotz.models.mass import PositionKinetic
@@ -25,15 +26,24 @@ from herglotz.models.term import TERMS, Term, with_force
 from herglotz.models.terms import AffineDamping, Correction, Kinetic, LinearDamping, Potential
 
 
-def numbers_of(model: nn.Module) -> list[str]:
-    """Every number that a model learns, in the order of its parameters: `damping.rate`, `friction.viscous[1]`."""
-    sizes = [(name, parameter.numel()) for name, parameter in model.named_parameters()]
-    return [name if size == 1 else f"{name}[{i}]" for name, size in sizes for i in range(size)]
+def numbers_of(model: ContactLagrangian) -> dict[str, tuple[str, int]]:
+    """Parameter and entry of every number that a model learns, by its name: `damping.rate`, `friction.viscous[1]`.
 
-
-def entry_of(number: str) -> int:
-    """Which entry of its parameter a number is: 1 of `friction.viscous[1]`."""
-    return int(number.partition("[")[2].removesuffix("]") or 0)
+    They stand in the order of the parameters. The baseline's springs and tilts have one name at both orders of the
+    rule: at order 4 they are the first features, −k and b of an angle and k/2 and b of a length.
+    """
+    own, n = baseline_is_named(model.config), model.config.dof
+    found = {}
+    for parameter, value in model.named_parameters():
+        for i in range(value.numel()):
+            name, at, size = parameter, i, value.numel()
+            if own and parameter == "potential.features.sum.coefficient":
+                if i < 2 * n:
+                    name, at, size = ("potential.tilt" if i % 2 else "potential.stiffness"), i // 2, n
+                else:
+                    at, size = i - 2 * n, size - 2 * n
+            found[name if size == 1 else f"{name}[{at}]"] = parameter, i
+    return found
 
 
 @dataclass(frozen=True)
@@ -90,7 +100,8 @@ class ContactLagrangian(nn.Module):
         for name in absent:
             if name not in known:
                 raise InputError(f"absent: the model has no number '{name}'; its numbers are {', '.join(known)}")
-            self.get_parameter(name.partition("[")[0]).data.view(-1)[entry_of(name)] = 0.0
+            parameter, i = known[name]
+            self.get_parameter(parameter).data.view(-1)[i] = 0.0
 
     @property
     def named_terms(self) -> list[Term]:

@@ -107,7 +107,7 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
         substeps=c.substeps, hold=seen.arrival.hold, delay=seen.arrival.late[0], lag=seen.arrival.late[1],
         forces={"coulomb": c.coulomb, "sticking": bool(c.sticking), "coupled": c.coupled, "diagonal": c.diagonal,
                 "alike": c.alike},
-        absent=c.absent,
+        absent=c.absent, every=seen.found.every if named and seen.found is not None else 1,
         start={**own, **base.start},
         outliers=seen.outliers, continues_probe=continues, sigma=sigma, fitted_before=named, restarts=restarts,
         departures=c.departures, zeros=seen.zeros,
@@ -127,6 +127,7 @@ def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: boo
     as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
     return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
         "level": _level_reason(seen, user_settings),
+        "every": "more samples tell no more than these: residuals are no noise, and their steps are short enough",
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
         **seen.why_arrival,
         "zeros": seen.apart or "no recording was found to differ from the others",

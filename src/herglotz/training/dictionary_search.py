@@ -15,12 +15,11 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import coarse, precision
+from herglotz.data.roughness import AT_THE_NOISE, coarse, precision
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
@@ -35,9 +34,7 @@ from herglotz.training.named_terms import (
     chains,
     offered,
     own_terms,
-    places,
     settings_of,
-    shapes_of_dry,
     started,
     values_of,
 )
@@ -45,9 +42,8 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.pruning import joining
 from herglotz.training.stages import Stages
-from herglotz.training.subsets import likelier, price_of
+from herglotz.training.subsets import likelier, missing, price_of
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
@@ -163,12 +159,24 @@ class DictionarySearch:
     def _from_sparse(self, sparse: Trajectories, every: int) -> Found | None:
         """What every m-th sample asks for, fitted to all of them."""
         base = replace(self.base, max_step=every * self.base.max_step, model_step=every * self.base.model_step)
-        found = DictionarySearch(sparse, base, self.config, outliers=self.freedom is not None).run()
+        search = DictionarySearch(sparse, base, self.config, outliers=self.freedom is not None)
+        found = search.run()
         if found is None:
             return None
+        if search.tells_all(found, every):
+            kept = max(1, every // found.config.substeps)
+            base = replace(found.base, max_step=self.base.max_step, model_step=self.base.model_step)
+            return replace(found, every=kept, base=base, config=replace(found.config, substeps=1))
         self.order = found.config.order
         dense = self._refit(found, found.terms, max(1, found.config.substeps // every), every)
         return None if dense is None else self._longer(dense)
+
+    def tells_all(self, found: Found, every: int) -> bool:
+        """Whether so many times more samples tell no more: a force is missing, and their short steps change little."""
+        noise = self.precision if math.isfinite(self.precision) else 0.0
+        if not found.coloured or found.rms <= max(AT_THE_NOISE * noise, self.floor) or found.config.substeps > every:
+            return False
+        return found.changed_by(self._problem(found, found.terms, every)[1]) <= FINER * found.rms
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
@@ -261,23 +269,9 @@ class DictionarySearch:
 
     def _missing(self, found: Found) -> str | None:
         """The term whose absence costs most, where that is more than it may; None where none does."""
-        names = [name for name in self.all.names if name not in found.terms.names]
-        if not names or found.rms <= self.floor:
+        if set(self.all.names) <= set(found.terms.names) or found.rms <= self.floor:
             return None  # rounding may be lowered by any term
-        _, problem = self._problem(found, self.all, found.config.substeps)
-        theta = problem.parameters.get()
-        at = places(problem.parameters, self.all)
-        x = problem.pack(theta, found.fit.path.x[:, 0, : problem.d])
-        cost, A, b = problem.normal_equations(x)
-        if not math.isfinite(float(cost)):
-            return None
-        others = torch.tensor([i for name in names for i in at[name]])
-        absent = torch.zeros(len(x), dtype=torch.bool)
-        absent[others] = True
-        if DRY in names:  # what shapes a force of 0 has no effect yet
-            absent[shapes_of_dry(problem.parameters)] = True
-        best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(self.data.q.numel()))
-        return None if best is None else next(name for name in names if int(others[best]) in at[name])
+        return missing(found, self._problem(found, self.all, found.config.substeps)[1], self.all)
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""

@@ -118,14 +118,15 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
         (P, P) of the numbers that were fitted (`herglotz.training.laplace`), for standard deviations.
     """
     spread, terms = covariance, []
-    at = {name: k for k, name in enumerate(ParameterVector(run.model).numbers)}
+    at = {entry: k for k, entry in enumerate(ParameterVector(run.model).entries)}
     for left, what, unit, parts in _parts(run):
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
         deviation = None
         if spread is not None:
             w = spread.new_zeros(len(spread))
             for name, i, by in parts:
-                w[[k for k in (at.get(name), at.get(f"{name}[{i}]")) if k is not None]] += by
+                if (name, i) in at:
+                    w[at[name, i]] += by
             deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))

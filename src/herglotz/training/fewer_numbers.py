@@ -14,7 +14,7 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.training.found_terms import Found
-from herglotz.training.named_terms import STILL, NamedTerms
+from herglotz.training.named_terms import NamedTerms
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import prune
 
@@ -44,8 +44,7 @@ class FewerNumbers:
         if self.data.dof == 1 or not found.terms.springs:
             return found
         parameters, worth = found.fit.problem.parameters, math.log(self.data.q.numel())
-        baseline = [f"{STILL}[{i}]" for i in range(2 * self.data.dof)] if found.config.order == 4 else []
-        free = [i for i, name in enumerate(parameters.numbers) if name.startswith(OWN) or name in baseline]
+        free = [i for i, name in enumerate(parameters.numbers) if name.startswith(OWN)]
         x, A = found.information(self.floor)
         kept = prune(A, x, torch.tensor(free, dtype=torch.long), worth)[0].tolist()
         absent = tuple(parameters.numbers[i] for i in free if i not in kept)

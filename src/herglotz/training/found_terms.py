@@ -38,6 +38,7 @@ class Found:
     fit: TrajectoryFit
     whole: bool  # every trajectory is one segment, and followed
     spread: float  # of q, RMS
+    every: int = 1  # how many samples of the data are one of the fit's
 
     @property
     def rms(self) -> float:

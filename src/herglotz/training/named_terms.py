@@ -267,9 +267,8 @@ def shapes_of_dry(parameters: ParameterVector) -> Tensor:
 
 def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    names, still = [x for x in terms.features if "v" not in x], parameters.index(STILL).tolist()
-    own = still[len(still) - len(names) :]  # the baseline's come first, where they are features
-    at = dict(zip(names, ([i] for i in own), strict=True))
+    still = parameters.index(STILL).tolist()
+    at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
     at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
     at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)
     if terms.dry:

@@ -24,6 +24,7 @@ class ParameterVector:
         self.names = list(named)
         self.shapes = [p.shape for p in named.values()]
         self.numbers = [name for name in every if name not in model.config.absent]  # (P,) by name
+        self.entries = [every[name] for name in self.numbers]  # parameter and entry of each
         self.whole = None if len(self.numbers) == len(every) else torch.tensor([name in self.numbers for name in every])
 
     def get(self) -> Tensor:

@@ -40,6 +40,7 @@ class Plan:
     fitted_before: bool  # starting values and sigma are those of an earlier fit of the same model
     restarts: int  # random initialisations of the one-step fit
     departures: tuple[float, ...]  # strengths of the prior that held-out blocks choose from
+    every: int = 1  # how many recorded samples are one that whole trajectories are fitted to
     absent: tuple[str, ...] = ()  # numbers of the model that are 0 and not learned
     zeros: tuple[float, ...] = ()  # of the sensors, B · n numbers, where recordings differ in them; empty: 0
     reasons: dict[str, str] = field(default_factory=dict)
@@ -78,6 +79,7 @@ class Plan:
             "zeros": not self.zeros,
             "drag": not self.drag,
             "absent": not self.absent,
+            "every": self.every == 1,
             "substeps": self.substeps == 1,
             "continues_probe": not self.continues_probe,
             "fitted_before": not self.fitted_before,
@@ -129,6 +131,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "substeps": "model steps in a recorded step",
     "forces": "masses and friction",
     "absent": "numbers that are 0",
+    "every": "recorded samples for each that is fitted",
     "outliers": "outliers expected",
     "continues_probe": "starts from the fit that measured the noise",
     "sigma": "noise assumed",

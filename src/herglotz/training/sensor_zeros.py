@@ -31,13 +31,12 @@ from herglotz.data.smoothing import local_polynomials, smoothed
 from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import DragFeature, parse_drag
-from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.features import Product, parse
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import Look, look
-from herglotz.training.named_terms import STILL, NamedTerms, places
+from herglotz.training.named_terms import NamedTerms, places
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import ResidualProblem
@@ -228,10 +227,7 @@ def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
     at = places(parameters, NamedTerms(config.features, config.drag))
     turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
     turned += [name for name in config.drag if _pushes_on(parse_drag(name, angles))]
-    tilts = [f"potential.tilt[{i}]" for i in range(len(angles))]
-    if baseline_is_named(model.config):
-        tilts = [f"{STILL}[{i}]" for i in range(1, 2 * len(angles), 2)]
-    tilt = [i for i, name in enumerate(parameters.numbers) if name in tilts]
+    tilt = parameters.index("potential.tilt").tolist()
     return torch.tensor([*tilt, *(i for name in turned for i in at[name])], dtype=torch.long)
 
 

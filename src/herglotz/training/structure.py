@@ -50,7 +50,7 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
-TOLD = ("reason", "sigma", "doubt", "apart")  # of `Structure`, as a checkpoint has it
+TOLD = ("reason", "sigma", "doubt", "apart", "every")  # of `Structure`, as a checkpoint has it
 KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
 COUPLING = "coupling.viscous"
 
@@ -64,6 +64,7 @@ class Structure(NamedTuple):
     sigma: float | None = None  # misfit of whole trajectories, where these were fitted
     doubt: bool = False  # another model may fit better: held-out free runs decide
     apart: bool = False  # sensors whose zeros differ between recordings would lower the misfit
+    every: int = 1  # how many recorded samples are one that is fitted
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
@@ -124,7 +125,7 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
-    return Structure(found.config, found.base, words, found.rms, doubt, found.apart)
+    return Structure(found.config, found.base, words, found.rms, doubt, found.apart, found.every)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
@@ -254,24 +255,23 @@ def _short_fit(
     data: Trajectories, base: Baseline, config: FitConfig, max_step: float
 ) -> tuple[Baseline, tuple[str, ...], float]:
     """Starting values, the features that stay and the one-step error of a short fit of order 4."""
-    model, n = build_model(base, config, "potential"), data.dof
+    model = build_model(base, config, "potential")
     prior = prior_of(model, base, None)
-    most = ROWS * prior.start.numel() // n
+    most = ROWS * prior.start.numel() // data.dof
     problem = ResidualProblem(model, data, max_step=max_step, sigma=1e-6 * max(base.scale), prior=prior, most=most)
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    still = problem.parameters.index(POTENTIAL)[2 * n :]
+    still = problem.parameters.index(POTENTIAL)
     moving = problem.parameters.index(KINETIC) if KINETIC in problem.parameters.names else still[:0]
     features = [name for name in config.features if "v" not in name] + _moving(config.features)
     named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.cat([still, moving]), math.log(r.numel()))
-    values = {name: tuple(x[problem.parameters.index(name)].tolist()) for name in problem.parameters.names}
-    own = values[POTENTIAL][: 2 * n]  # −k, b of each angle; k/2, b of the others
-    turn = [-1.0 if angle else 2.0 for angle in data.angles]
-    values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
-    values["potential.tilt"] = own[1::2]
+    names = (*problem.parameters.names, "potential.stiffness", "potential.tilt")
+    values = {name: tuple(x[problem.parameters.index(name)].tolist()) for name in names}
+    turn = [-1.0 if angle else 2.0 for angle in data.angles]  # −k of each angle, k/2 of the others
+    values["potential.stiffness"] = tuple(k * by for k, by in zip(values["potential.stiffness"], turn, strict=True))
     stay = set(kept.tolist())
     for name, where in ((KINETIC, moving), (POTENTIAL, still)):
         values[name] = tuple(float(x[i]) for i in where.tolist() if i in stay)

@@ -18,6 +18,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.found_terms import Found
 from herglotz.training.named_terms import DRY, NamedTerms, places, shapes_of_dry, values_of
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.pruning import joining
 
 TRIED = 3  # subsets that are proposed: the quadratic model orders them, and fits decide
 
@@ -28,6 +29,26 @@ def price_of(size: int, of: int, worth: float) -> float:
     The extended criterion of Chen & Chen (2008): of many subsets some lower the cost much by chance.
     """
     return size * worth / 2 + math.log(math.comb(of, size))
+
+
+def missing(found: Found, problem: ShootingProblem, every: NamedTerms) -> str | None:
+    """The term of `every` whose absence from `found` costs most, where that is more than it may; None where none does.
+
+    The problem stands at the fit, its absent terms at 0.
+    """
+    names = [name for name in every.names if name not in found.terms.names]
+    at = places(problem.parameters, every)
+    x = problem.pack(problem.parameters.get(), found.fit.path.x[:, 0, : problem.d])
+    cost, A, b = problem.normal_equations(x)
+    if not bool(cost.isfinite()):
+        return None
+    others = torch.tensor([i for name in names for i in at[name]])
+    absent = torch.zeros(len(x), dtype=torch.bool)
+    absent[others] = True
+    if DRY in names:  # what shapes a force of 0 has no effect yet
+        absent[shapes_of_dry(problem.parameters)] = True
+    best = joining(A, b, (~absent).nonzero()[:, 0], others, math.log(problem.data.q.numel()))
+    return None if best is None else next(name for name in names if int(others[best]) in at[name])
 
 
 class Better(NamedTuple):

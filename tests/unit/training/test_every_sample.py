@@ -1,0 +1,82 @@
+"""Fits to every m-th sample, where more tell no more."""
+
+import math
+from dataclasses import replace
+from types import SimpleNamespace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories, simulate
+from herglotz.scenes import scene
+from herglotz.training import FitConfig, fit
+from herglotz.training.baseline import estimate_baseline
+from herglotz.training.dictionary_search import FINER, DictionarySearch
+from herglotz.training.named_terms import NamedTerms
+from herglotz.training.plan import Plan
+
+
+def kinked(samples=1800, h=0.02):
+    """x″ = −x − 0.8 sgn x − 0.05 x′, one force of which no dictionary has: exact positions, semi-implicit Euler."""
+    part, x, v, out = 20, 1.3, 0.0, []
+    for _ in range(samples):
+        out.append(x)
+        for _ in range(part):
+            v += h / part * (-x - 0.8 * math.copysign(1.0, x) - 0.05 * v)
+            x += h / part * v
+    return Trajectories.of(
+        h * torch.arange(samples, dtype=torch.float64), torch.tensor(out, dtype=torch.float64)[:, None]
+    )
+
+
+def test_a_force_that_is_missing_is_not_met_by_more_samples():
+    # fails if all samples are fitted: seconds, for the same misfit
+    data = kinked()
+    found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
+    assert found is not None
+    assert found.every >= 3
+    assert found.fit.problem.data.samples < data.samples / 2
+    assert found.config.substeps == 1
+    assert found.base.model_step < 2 * data.typical_step
+
+
+@pytest.fixture(scope="module")
+def plan():
+    """The plan of a fit to all samples of a noisy oscillation, and its data."""
+    made = simulate(scene("damped_oscillator"), trajectories=2, steps=300, h=0.05, noise=1e-3, seed=0)
+    run = fit(made, FitConfig(train_fraction=1.0), progress=False)
+    return made, run, Plan.from_dict(run.metrics["plan"])
+
+
+def test_every_fourth_sample_gives_a_motion_through_all(plan):
+    # fails if samples between have no states or those of another motion, or if steps between fitted samples are long
+    data, whole, of = plan
+    run = fit(data, FitConfig(train_fraction=1.0), plan=replace(of, every=4, order=4), progress=False)
+    assert of.every == 1
+    assert run.h == pytest.approx(0.05)
+    assert run.metrics["train_rms"] == pytest.approx(whole.metrics["train_rms"], rel=0.05)
+    assert float((run.states.q - whole.states.q).square().mean().sqrt()) < 1e-3  # a quarter of the samples: half of σ
+    assert not torch.equal(run.states.q, whole.states.q)
+
+
+def test_recordings_keep_three_samples(plan):
+    # fails if a plan that was made of a longer recording leaves two samples of a trajectory
+    data, _, of = plan
+    run = fit(data, FitConfig(train_fraction=1.0), plan=replace(of, every=200), progress=False)
+    assert run.metrics["follows_data"]
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [({}, True), ({"coloured": False}, False), ({"rms": 1.4}, False), ({"step": 1.1 * FINER}, False)],
+)
+def test_when_more_samples_tell_no_more(change, says):
+    # fails if noise is not averaged over all samples, or steps that are too long for these are kept
+    values = {"coloured": True, "rms": 2.0, "step": 0.9 * FINER} | change
+    found = SimpleNamespace(
+        coloured=values["coloured"], rms=values["rms"], config=SimpleNamespace(substeps=1), terms=NamedTerms(),
+        changed_by=lambda _problem: values["step"] * values["rms"],
+    )  # fmt: skip
+    search = object.__new__(DictionarySearch)
+    search.precision, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
+    assert search.tells_all(found, 6) is says  # type: ignore[arg-type]
