@@ -176,7 +176,7 @@ def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[B
     """Say on stderr where the motion or its steps are beyond the data of the fit."""
     from herglotz.training.recorded_range import other_steps
 
-    if left is not None:
+    if left is not None and (far or not source.limits or "s" in source.states):  # a hair beyond q or p is no news
         each = "".join(f"; {one.words(source.time_unit)}" for one in far)
         _note(
             f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted "

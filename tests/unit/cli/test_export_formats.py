@@ -111,6 +111,10 @@ def test_a_file_says_where_it_was_not_fitted(tiny_run, tmp_path, capsys):
     for source in (out, str(tiny_run)):
         assert main(["rollout", source, *motion, "--q0", "0.1", "--p0", "30"]) == 0
         assert "from step 0 on, the motion leaves the range of states" in " ".join(capsys.readouterr().err.split())
+        box = load_run(tiny_run).box
+        hair = box["q_high"][0] + 0.005 * (box["q_high"][0] - box["q_low"][0])  # half of what is told
+        assert main(["rollout", source, *motion, "--q0", repr(hair), "--p0", "0"]) == 0
+        assert "leaves the range" not in capsys.readouterr().err
 
 
 def test_the_prefix_of_a_header(tiny_run, tmp_path, capsys):
