@@ -13,7 +13,7 @@ from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
 # A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
-SUFFIX = re.compile(r"(?!p_|u_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
+SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
 ROLES = {
     "time": re.compile(r"t|time|timestamp|datetime"),
     "trajectory": re.compile(r"trajectory|trial|run"),

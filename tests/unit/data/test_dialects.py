@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.data import load, read_csv
+from herglotz.data import Trajectories, load, read_csv, save
 from herglotz.data.extra_formats import Table
 from herglotz.data.table import from_frame
 from herglotz.errors import InputError
@@ -139,6 +139,14 @@ def test_names_with_units_at_their_end_stay_apart(tmp_path):
     assert ("gyro", "left aside", "deg/s") in data.columns
     path = written(tmp_path, "t,angle_deg\n0,1\n1,2\n2,3\n")
     assert read_csv(path, coordinates="angle_deg").names == read_csv(path, coordinates="angle").names == ("angle",)
+
+
+def test_names_that_look_like_units_are_written_and_read(tmp_path):
+    # fails if the momentum of x_deg comes back as that of x
+    x = torch.arange(6.0, dtype=torch.float64).reshape(3, 2)
+    data = Trajectories.of([0, 1, 2], x, p=x, names=("x_deg", "t_ms"))
+    save(tmp_path / "a.csv", data)
+    assert load(tmp_path / "a.csv").digest() == data.digest()
 
 
 def test_a_folder_of_recordings(tmp_path, capsys):
