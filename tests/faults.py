@@ -232,8 +232,8 @@ def full() -> None:
 
 
 def small_files(make: random.Random, _: Path) -> None:
-    """No file may grow beyond a size: a write ends in the middle."""
-    size = make.randrange(10, 9000)
+    """No file may grow beyond a size: a write ends in the middle, of a checkpoint, not of what is said (500 bytes)."""
+    size = make.randrange(1000, 9000)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
 
 
