@@ -27,6 +27,7 @@ from benchmarks.peers.rollouts import rk4
 from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
 from herglotz.data import simulate
 from herglotz.export.c_wrapper import FLAGS, compiler
+from herglotz.scenes.rigid_body import FreeBody
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt
 from herglotz.tune.cost import Timed as Timing
@@ -79,7 +80,7 @@ class Native:
         fast: bool = True,
         constants: Mapping[str, float] | None = None,
     ):
-        self.dof = dof
+        self.dof, self.flops = dof, FLOPS[name] if weights is None else weights.flops  # of one evaluation
         system = SYSTEMS[name] if weights is None else NETWORK
         defines = {"SYSTEM": system, "DOF": dof, "real": REAL[dtype], "FAST_SINE": int(fast), **_constants()}
         defines |= {k: repr(v) for k, v in (constants or {}).items()}
@@ -256,7 +257,7 @@ def classical(case: Case) -> list[Timed]:
     setup, name = case.setup, case.setup.name
     v = setup.scene.velocity(*case.start)
     if name == "rigid_body":
-        v = body_velocity(case.start.q, v)
+        v = FreeBody(1.0, 1.0, 1.0, 0.0).body_velocity(case.start.q, v)
     y = torch.cat([case.start.q, v], -1)
     found = []
     for dtype in ("float64", "float32"):
@@ -265,7 +266,7 @@ def classical(case: Case) -> list[Timed]:
             for x in _settings(method, dtype):
                 label = _label(method, x, setup, dtype)
                 point = {"kind": f"{method}, true equations", "setting": label, "dtype": dtype}
-                found.append(_classic(point, library, case, y, method, x, FLOPS[name]))
+                found.append(_classic(point, library, case, y, method, x))
     return found
 
 
@@ -285,7 +286,7 @@ def _label(method: str, x: float, setup: Setup, dtype: str) -> str:
     return f"{method}, {size}, {dtype}"
 
 
-def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x: float, flops: float) -> Timed:
+def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x: float) -> Timed:
     """One setting; where an input is held, a segment is one step of the data, and x counts for a quarter of T."""
     setup, u = case.setup, case.setup.inputs()
     segments = CHECKS if u is None else len(u)
@@ -293,7 +294,7 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
         x = max(1, round(x * CHECKS / segments))
     q, count = library.motions(y, setup.T, segments, method, x, u)
     each = count / len(y) / setup.T
-    more = {"evaluations_per_time": each, "flops_per_time": each * flops, "artefact": "C"}
+    more = {"evaluations_per_time": each, "flops_per_time": each * library.flops, "artefact": "C"}
     errors = judged(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
     return Timed({**point, **errors, **more}, library.timing(y, setup.T, segments, method, x, u), setup.T)
 
@@ -315,15 +316,9 @@ def neural(case: Case) -> list[Timed]:
                 for x in _settings(method, dtype)[:7]:
                     label = f"{width} × {layers}, {_label(method, x, setup, dtype)}"
                     point = {"kind": f"neural ODE, {method}", "setting": label, "dtype": dtype}
-                    found.append(_classic(point, library, case, y, method, x, weights.flops))
+                    found.append(_classic(point, library, case, y, method, x))
     case.seconds["neural ODE"] = time.process_time() - began
     return found
-
-
-def body_velocity(q: Tensor, v: Tensor) -> Tensor:
-    """The angular velocity in the body, from roll, pitch, yaw and their rates."""
-    (sr, sp, _), (cr, cp, _), (roll, pitch, yaw) = q.sin().unbind(-1), q.cos().unbind(-1), v.unbind(-1)
-    return torch.stack([roll - yaw * sp, pitch * cr + yaw * cp * sr, yaw * cp * cr - pitch * sr], -1)
 
 
 def equation(case: Case) -> list[Timed]:
@@ -343,7 +338,7 @@ def equation(case: Case) -> list[Timed]:
                 words = {"RK4": "RK4", "DOP853 fixed": "DOP853, equal steps"}[method]
                 label = f"{words}, h {setup.T / CHECKS / x:.3g}, C {dtype}"
                 point = {"kind": "learned equation", "setting": label, "dtype": dtype, "h": setup.T / CHECKS / x}
-                found.append(_classic(point, library, case, y, method, x, FLOPS[setup.name]))
+                found.append(_classic(point, library, case, y, method, x))
     return found
 
 

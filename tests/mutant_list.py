@@ -248,7 +248,7 @@ MUTANTS = [
     ("verify/draw.py", 'if isinstance(error, InputError):', 'if False:'),
     ("verify/draw.py", '(2 * torch.rand(samples, generator=make, dtype=torch.float64) - 1)', '0 * torch.rand(samples, generator=make, dtype=torch.float64)'),
     ("verify/explicit_time.py", '+ known.h * torch.arange(steps)', '+ 0.0 * torch.arange(steps)'),
-    ("verify/explicit_time.py", 'time_defect(family, State', 'time_defect(TimeDependent(family.L_d), State'),
+    ("verify/explicit_time.py", 'time_defect(family, start', 'time_defect(TimeDependent(family.L_d), start'),
     ("verify/explicit_time.py", 'p1 = momentum_plus(partials(before.L_d,', 'p1 = momentum_plus(partials(after.L_d,'),
     ("verify/explicit_time.py", 'P = partials(after.L_d,', 'P = partials(before.L_d,'),
     ("verify/explicit_time.py", 'check(members[k], replace', 'check(members[0], replace'),

@@ -140,9 +140,8 @@ def _agreement(target: Any, arguments: argparse.Namespace) -> dict[str, Any]:
     from herglotz.training import load_run
 
     found = load_run(arguments.against)
-    q, p, s = (x.to(target.dtype) for x in found.states)
-    fine = (q.isfinite().all(-1) & p.isfinite().all(-1) & s.isfinite()).nonzero()[:, 0]
-    states = State(q[fine], p[fine], s[fine])
+    states = State(*(x.to(target.dtype) for x in found.states))
+    states = State(*(x[states.finite] for x in states))
     result = compare(target, found.stepper, h=arguments.h, states=states, seed=arguments.seed)
     bound = AGREEMENT[target.metadata["dtype"]]
     close = all(result[name] <= bound for name in "qpsc")

@@ -78,28 +78,25 @@ def _fall_back(eager: Stepper, reason: str) -> Stepper:
 
 
 def compile_c(
-    source: PathLike | ContactLagrangian,
+    model: ContactLagrangian,
     *,
     h: float = 1.0,
     box: Mapping[str, Sequence[float]] | None = None,
     units: Sequence[str] = (),
     dtype: str | None = None,
     tolerance: float | None = None,
-    trust_code: bool = False,
 ) -> ExportedStepper:
-    """Compile a header that `export_c` wrote, or a model directly, and load it.
+    """Compile a model's C and load it; `load_c` does so with a header.
 
     The library is kept in ~/.cache/herglotz/c (or $XDG_CACHE_HOME) by the hash of its source, the compiler and the
     processor. The compiler is $CC, or cc, gcc or clang from the PATH.
 
     Parameters
     ----------
-    source
-        A header, or a model.
+    model
+        Not changed.
     h, box, units, dtype, tolerance
-        As in `export_c`, for a model only; dtype defaults to the model's.
-    trust_code
-        As in `load_c`, for a header only.
+        As in `export_c`; dtype defaults to the model's.
 
     Returns
     -------
@@ -109,13 +106,11 @@ def compile_c(
     Raises
     ------
     InputError
-        If there is no compiler, or the source is not usable.
+        If there is no compiler, or an argument is not usable.
     """
-    if not isinstance(source, ContactLagrangian):
-        return load_c(source, trust_code=trust_code)
-    dtype = dtype or str(next(source.parameters()).dtype).removeprefix("torch.")
-    entries = describe(source, h, box, units, MAX_ITERATIONS, {"h_range": None})
-    entries = described(source, entries, "model", dtype, tolerance)
-    kept = copy.deepcopy(source)  # the model may be trained on
+    dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
+    entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None})
+    entries = described(model, entries, "model", dtype, tolerance)
+    kept = copy.deepcopy(model)  # the model may be trained on
     header = c_source(kept, entries, "stepper.h", derivatives=False)
     return compiled(header, "compiled model", lambda: c_source(kept, entries, "stepper.h"))

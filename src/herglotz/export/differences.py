@@ -37,13 +37,14 @@ class DifferencedStepper:
         found = self.stepper.step(_split(x.detach()), h)
         if not (torch.is_grad_enabled() and x.requires_grad):
             return found
-        y = _Differenced.apply(x, self, h)
+        y = _Differenced.apply(x, self.stepper, h)
         return Step(_split(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
 
-    def values(self, x: Tensor, h: float) -> Tensor:
-        """The map on (..., 2n+1) points."""
-        q1, p1, s1 = self.stepper.step(_split(x), h).state
-        return torch.cat([q1, p1, s1[..., None]], -1)
+
+def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor:
+    """A step map on points (q, p, s) in one row, (..., 2n+1); NaN where a step fails."""
+    q1, p1, s1 = step(_split(x), h).state
+    return torch.cat([q1, p1, s1[..., None]], -1)
 
 
 def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor) -> Tensor:
@@ -57,10 +58,10 @@ def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor
 
 class _Differenced(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, owner: DifferencedStepper, h: float) -> Tensor:  # pyright: ignore
+    def forward(ctx: Any, x: Tensor, stepper: Any, h: float) -> Tensor:  # pyright: ignore
         offset = OFFSET[x.dtype] * (1 + x.detach().abs())
-        ctx.save_for_backward(central_differences(lambda y: owner.values(y, h), x.detach(), offset))
-        return owner.values(x.detach(), h)
+        ctx.save_for_backward(central_differences(lambda y: stepped(stepper.step, y, h), x.detach(), offset))
+        return stepped(stepper.step, x.detach(), h)
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:

@@ -13,9 +13,11 @@ from torch import Tensor, nn
 
 from herglotz.export.trace import Graph, example_batch, traced
 from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
 from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
+from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
 
 HELD = 2  # tensors that set-valued friction adds to an iteration: K and w/K
@@ -26,15 +28,15 @@ HELD = 2  # tensors that set-valued friction adds to an iteration: K and w/K
 class Terms:
     """The step equation at (q0, p0, s0, h): by terms where `model_equation` knows the model, else by jets."""
 
-    def __init__(self, model: ContactLagrangian, q: Tensor, p: Tensor, s: Tensor, h: Tensor, more: tuple[Tensor, ...]):
+    def __init__(self, model: ContactLagrangian, state: State, h: Tensor, more: tuple[Tensor, ...]):
         maker = model_equation(model, fold=False)
-        here, u = (more[:2], more[2:]) if maker is not None else ((), more)
+        here, inputs = (more[:2], more[2:]) if maker is not None else ((), more)
+        u = inputs[0] if inputs else None
         self.equation: StepOfModel | PartialsEquation
         if maker is None:
-            L_d: Any = model.at(*u) if u else model
-            self.equation = PartialsEquation(L_d, q, p, s, h, 1, increments=True)
+            self.equation = PartialsEquation(driven_by(model, u), *state, h, 1, increments=True)
         else:
-            self.equation = maker.at(q, p, s, h, u[0] if u else None, True, Field(*here))
+            self.equation = maker.at(state, h, u, True, Field(*here))
 
     def __call__(self, x: Tensor, second: bool) -> Point:
         """F, and J if `second`, at Δ = x."""
@@ -62,7 +64,7 @@ class StepEquation(nn.Module):
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """−J⁻¹F (B, n), |J⁻¹cp0| and |F| (B,), p1 (B, n), L, c (B,), then J (B, n, n)."""
         split = len(more) - self.held
-        form = terms = Terms(self.model, q, p, s, h, more[:split])
+        form = terms = Terms(self.model, State(q, p, s), h, more[:split])
         if self.held:
             assert isinstance(terms.equation, PartialsEquation)
             form = StickSlip(terms.equation, *more[split:])
@@ -82,7 +84,7 @@ class FirstOrder(nn.Module):
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
         """F, p1 (B, n), L, c (B,)."""
-        terms = Terms(self.model, q, p, s, h, more)
+        terms = Terms(self.model, State(q, p, s), h, more)
         point = terms(delta, False)
         return tuple(dense(x) for x in (point.F, *terms.gained(delta, point)[:3]))
 
@@ -96,7 +98,7 @@ class StepJacobian(nn.Module):
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> Tensor:
         """d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m), at the solution Δ."""
-        return dense(step_jacobian(step_functions(self.model), q, p, s, h, delta, u[0] if u else None))
+        return dense(step_jacobian(step_functions(self.model), State(q, p, s), h, delta, u[0] if u else None))
 
 
 class FieldAt(nn.Module):
@@ -124,11 +126,14 @@ class Equations:
         return cls(copy.deepcopy(model).eval().requires_grad_(False))
 
     @cached_property
-    def field(self) -> Graph | None:
-        """`FieldAt`, where steps hand the potential on."""
-        if not self.model.capabilities.by_terms:
-            return None
+    def potential(self) -> Graph:
+        """`FieldAt`."""
         return traced(FieldAt(self.model), example(self.model, 0.1)[:1])
+
+    @property
+    def field(self) -> Graph | None:
+        """The potential, where steps hand it on."""
+        return self.potential if self.model.capabilities.by_terms else None
 
     @cached_property
     def slopes(self) -> Graph:
@@ -164,16 +169,9 @@ def input_count(model: ContactLagrangian) -> int:
     return int(getattr(model.config, "inputs", 0) or 0)
 
 
-def inverse(J: Tensor) -> Tensor:
-    """J⁻¹ by Gauss and Jordan without row exchanges: a few whole-matrix operations for each of the n pivots."""
-    n = J.shape[-1]
-    eye = torch.eye(n, dtype=J.dtype, device=J.device)
-    for k in range(n):
-        column = J[..., k]
-        cleared = J * (1 - eye[k]) + eye[k][:, None] * eye[k]  # column k becomes that of the unit matrix
-        row = cleared[..., k, :] / column[..., k : k + 1]
-        J = cleared - (column - eye[k])[..., :, None] * row[..., None, :]
-    return J
+def inverse(matrix: Tensor) -> Tensor:
+    """The inverse of matrices (..., n, n)."""
+    return eliminate(matrix, torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device).expand_as(matrix))
 
 
 def length(x: Tensor) -> Tensor:

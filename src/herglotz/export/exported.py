@@ -11,7 +11,6 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.export.box import Box, s_matters
-from herglotz.export.inputs import check_inputs, check_range, spread_h
 from herglotz.stepping import Linearised, OneStepMethod, State, Step, step_sizes
 from herglotz.stepping.events import Watch
 from herglotz.stepping.rollout import Plan, Track, without_lost_factors
@@ -159,11 +158,7 @@ class ExportedStepper(OneStepMethod):
         h_all = step_sizes(self._checked_h(h), steps)
         steps = h_all.shape[-1]
         Plan(steps, every)
-        h_all = (
-            h_all.expand(*batch, steps)
-            if h_all.ndim == 1
-            else spread_h(h_all, start.s[..., None].expand(*batch, steps))
-        )
+        h_all = spread_h(h_all, (*batch, steps))
         flat = (x.reshape(-1, *x.shape[len(batch) :]) for x in (*start, h_all, *self._inputs(inputs, (*batch, steps))))
         with torch.no_grad():
             track = self._with_box(without_lost_factors(self.loop(*flat)))
@@ -217,7 +212,7 @@ class ExportedStepper(OneStepMethod):
     def _flat(self, state: State, h: Tensor | float, u: Tensor | None) -> tuple[Tensor, ...]:
         """(B, n), (B, n), (B,), (B,)[, (B, m)]."""
         q, p, s = state
-        h = spread_h(self._checked_h(h), s)
+        h = spread_h(self._checked_h(h), s.shape)
         more = (x.reshape(s.numel(), -1) for x in self._inputs(u, s.shape))
         return q.reshape(-1, self.dof), p.reshape(-1, self.dof), s.reshape(-1), h.reshape(-1), *more
 
@@ -230,6 +225,40 @@ class ExportedStepper(OneStepMethod):
                 u = u.expand(*shape, u.shape[-1])
         check_inputs(u, self.inputs, shape, self.dtype)
         return (u,)
+
+
+def check_range(h: Tensor, span: Sequence[float] | None) -> None:
+    """Refuse a step outside the range that the file records, if it records one."""
+    if span is None:
+        return
+    slack = 4 * torch.finfo(h.dtype).eps
+    if float(h.min()) < span[0] * (1 - slack) or float(h.max()) > span[1] * (1 + slack):
+        found = " … ".join(dict.fromkeys(f"{float(x):g}" for x in (h.min(), h.max())))
+        raise InputError(
+            f"h must lie in [{span[0]:g}, {span[1]:g}], where the model was fitted; got {found}. "
+            "Export it with another --h-range (h_range in Python) to step elsewhere"
+        )
+
+
+def spread_h(h: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The step h, of every sample of a batch of that shape.
+
+    Raises
+    ------
+    InputError
+        If it is neither a scalar nor of that shape.
+    """
+    if h.ndim > len(shape) or not all(a in (1, b) for a, b in zip(h.shape[::-1], shape[::-1], strict=False)):
+        raise InputError(f"h must be a scalar or match the batch {tuple(shape)}, got shape {tuple(h.shape)}")
+    return h.expand(shape)
+
+
+def check_inputs(u: Tensor, count: int, shape: tuple[int, ...], dtype: torch.dtype) -> None:
+    """Refuse inputs u that the model does not take: shape (*shape, m), of the file's dtype."""
+    if count == 0:
+        raise InputError("the model takes no inputs; leave u out")
+    if u.shape != (*shape, count) or u.dtype != dtype:
+        raise InputError(f"u needs {count} number(s) a step in {dtype}, got {tuple(u.shape)} in {u.dtype}")
 
 
 def scanned(program: Program) -> Loop:

@@ -24,6 +24,7 @@ from herglotz.export.equation import Terms, dense, example, inverse, length
 from herglotz.export.newton import CARRIED, CONVERGED, NewtonIteration, Values, first_carry, status_of
 from herglotz.export.trace import traced
 from herglotz.models import ContactLagrangian
+from herglotz.stepping import State
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.partials_equation import PartialsEquation
@@ -89,7 +90,7 @@ class BeginSticking(nn.Module):
 
     def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, *u: Tensor) -> Values:
         """From the state, h (B,) and the inputs."""
-        equation = Terms(self.model, q, p, s, h, u).equation
+        equation = Terms(self.model, State(q, p, s), h, u).equation
         assert isinstance(equation, PartialsEquation)
         start, *held = at_rest(equation)
         return *first_carry(start), *(dense(x) for x in held)
@@ -113,8 +114,8 @@ class Finish(nn.Module):
 
     def _explicit(self, h: Tensor, state: Values, here: Values, lost: Values, u: Values) -> Values:
         """`herglotz.stepping.explicit`; NaN where h is no step or c = e^{−γh} rounds to 0."""
-        q, p, s = state
-        move = Leapfrog(self.model, inverse)(q, p, s, h, Field(*here), u[0] if u else None)
+        q, _, s = state
+        move = Leapfrog(self.model, inverse)(State(*state), h, Field(*here), u[0] if u else None)
         good = (h > 0) & torch.isfinite(h) & (move.c != 0)
         q1, *lost_q = _added(q, torch.where(good[:, None], move.delta, torch.nan), lost[:1])
         s1, *lost_s = _added(s, move.L, lost[1:])

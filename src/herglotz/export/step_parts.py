@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from herglotz.export.equation import Equations, FieldAt, example, field_like
+from herglotz.export.equation import example, field_like
 from herglotz.export.trace import Graph, traced
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.models import ContactLagrangian
@@ -18,12 +18,13 @@ from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.terms import Potential
+from herglotz.stepping import State
 from herglotz.stepping.equation import PartialsEquation, Point, model_equation
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field
+from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip, at_rest
 
-Start = tuple[Tensor, Tensor, Tensor, Tensor]  # q0, p0, s0, h
 Ends = tuple[Field, Field]  # the potential at q0 and q1
 Parts = tuple[Tensor, ...]  # what `StepParts` gives
 
@@ -34,12 +35,6 @@ def step_parts(model: ContactLagrangian, explicit: bool) -> Graph:
     V, slope = field_like(q)
     more = (V, slope, 0.1 * p, 0.2 * p, V + 1, slope + 1)
     return traced(StepParts(model, explicit), (q, p, s, h, *more, *u))
-
-
-def potential(equations: Equations) -> Graph | None:
-    """V and V′ of a model that has a potential, traced."""
-    model = equations.model
-    return traced(FieldAt(model), example(model, 0.1)[:1]) if model.config.baseline else None
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:
@@ -106,68 +101,57 @@ class StepParts(nn.Module):
             form = self._by_terms
         if self.model.capabilities.sticking:
             form = self._by_sticking
-        guess, F, J, dp, L, E, *bound = form((q, p, s, h), ends, delta, x, u)
+        guess, F, J, dp, L, E, *bound = form(State(q, p, s), h, ends, delta, x, u[0] if u else None)
         return *(y.clone() for y in (guess, F, J, dp, L)), E.expand(s.shape).clone(), *bound
 
-    def _explicit(self, start: Start, ends: Ends, delta: Tensor, _: Tensor, u: tuple[Tensor, ...]) -> Parts:
-        h = start[3]
+    def _explicit(self, state: State, h: Tensor, ends: Ends, delta: Tensor, _: Tensor, u: Tensor | None) -> Parts:
         frog = Leapfrog(self.model, field=lambda _: ends[1])
-        move = frog(*start, ends[0], u[0] if u else None, True)
+        move = frog(state, h, ends[0], u, True)
         assert move.dp is not None
         maker = model_equation(self.model, fold=False)
         assert maker is not None
-        F = maker.at(*start, u[0] if u else None, True, ends[0])(delta, False).F  # for FL⁺, not for the step
+        F = maker.at(state, h, u, True, ends[0])(delta, False).F  # for FL⁺, not for the step
         J = F[..., None] * torch.zeros_like(F)[..., None, :]
         return move.delta, F, J, move.dp, move.L, frog.constants(h).c_minus_1
 
-    def _by_terms(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
+    def _by_terms(self, state: State, h: Tensor, ends: Ends, delta: Tensor, x: Tensor, u: Tensor | None) -> Parts:
         maker = model_equation(self.model, fold=False)
         assert maker is not None
         maker.field = lambda _: ends[1]  # pyright: ignore[reportAttributeAccessIssue]
-        form = maker.at(*start, u[0] if u else None, True, ends[0])
+        form = maker.at(state, h, u, True, ends[0])
         point = form(delta, True)
         v, mv, N, damping, force = form.at(x, point).rest
         if self.model.friction is not None:  # dry friction near rest is steep: it is taken at the exact velocity
-            force = self.model.friction.value_and_slope(v, u[0] if u else None)[0]
+            force = self.model.friction.value_and_slope(v, u)[0]
         end = form.end(x, Point(point.F, point.J, (v, mv, N, damping, force)))
         E = form.constants.c_minus_1 if damping is None else damping[1]
         dp = end.dp
         if dp is None:  # F is not quite 0: what x adds to p1 is what it takes from F
-            dp = (form.end(delta, point).p1 + point.F) - start[1]
+            dp = (form.end(delta, point).p1 + point.F) - state.p
         assert point.J is not None
         return form.leap(), point.F, point.J, dp, end.L, E
 
-    def _by_jets(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
+    def _by_jets(self, state: State, h: Tensor, ends: Ends, delta: Tensor, x: Tensor, u: Tensor | None) -> Parts:
         with self._given(ends):
-            form = self._in_increments(start, u)
+            form = PartialsEquation(driven_by(self.model, u), *state, h, 1, increments=True)
             point = form(delta, True)
         end = form.end(delta, point)
-        dp = (end.p1 + point.F) - start[1]  # as F is not quite 0
+        dp = (end.p1 + point.F) - state.p  # as F is not quite 0
         assert point.J is not None
-        return (
-            self._leap(start[0], start[1], start[3], ends[0]),
-            point.F,
-            point.J,
-            dp,
-            end.L + (end.p1 * (x - delta)).sum(-1),
-            point.rest.D3,
-        )
+        guess = self._leap(state, h, ends[0])
+        return guess, point.F, point.J, dp, end.L + (end.p1 * (x - delta)).sum(-1), point.rest.D3
 
-    def _by_sticking(self, start: Start, ends: Ends, delta: Tensor, x: Tensor, u: tuple[Tensor, ...]) -> Parts:
+    def _by_sticking(self, state: State, h: Tensor, ends: Ends, delta: Tensor, x: Tensor, u: Tensor | None) -> Parts:
         with self._given(ends):
-            equation = self._in_increments(start, u)
+            equation = PartialsEquation(driven_by(self.model, u), *state, h, 1, increments=True)
             guess, stiffness, bound = at_rest(equation)
             form = StickSlip(equation, stiffness, bound)
             point = form(delta, True)
-        end, moved = form.end(delta, point), soft_threshold(x, bound) - soft_threshold(delta, bound)
+        end, moved = equation.end(delta, point), soft_threshold(x, bound) - soft_threshold(delta, bound)
         left = point.F - torch.where(form.slides(delta), 0.0, stiffness * (x - delta))  # −J (Δ(x) − Δ)
         assert point.J is not None
         L = end.L + (end.p1 * moved).sum(-1)
-        return guess, point.F, point.J, (end.p1 + left) - start[1], L, point.rest.D3, bound.clone()
-
-    def _in_increments(self, start: Start, u: tuple[Tensor, ...]) -> PartialsEquation:
-        L_d: Any = self.model.at(*u) if u else self.model
-        return PartialsEquation(L_d, *start, 1, True)
+        return guess, point.F, point.J, (end.p1 + left) - state.p, L, point.rest.D3, bound.clone()
 
     @contextmanager
     def _given(self, ends: Ends) -> Iterator[None]:
@@ -179,14 +163,14 @@ class StepParts(nn.Module):
         finally:
             self.model.potential = potential
 
-    def _leap(self, q: Tensor, p: Tensor, h: Tensor, here: Field) -> Tensor:
+    def _leap(self, state: State, h: Tensor, here: Field) -> Tensor:
         """The step with the mass at q = 0 and no network of (q̄, v): a guess."""
         model = self.model
         if not model.config.baseline:
-            return torch.zeros_like(q)
+            return torch.zeros_like(state.q)
         kinetic: Any = model.kinetic
         kinetic = kinetic.base if isinstance(kinetic, FeatureKinetic) else kinetic
         mass = (kinetic.constant if isinstance(kinetic, PositionKinetic) else kinetic).mass()
         root = torch.ones_like(h) if model.damping is None else (-model.damping.rate * h / 2).exp()
-        push = p - (h / 2)[..., None] * here.slope
+        push = state.p - (h / 2)[..., None] * here.slope
         return (push @ torch.linalg.inv_ex(mass)[0]) * (h * root)[..., None]

@@ -5,6 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from matplotlib.figure import Figure
+
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.plots.animation import save_animation
@@ -62,11 +64,7 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
     if getattr(source, "name", "") == "parachute":
         drawn["parachute_map"] = plot_printed_map(printed_map()[1])
         drawn["parachute_fall"] = plot_fall(physical_fall()[1])
-    folder = _made(folder)
-    files = [folder / f"{name}.{form}" for name in drawn]
-    for file, figure in zip(files, drawn.values(), strict=True):
-        save_figure(figure, file)
-    return files
+    return _saved(drawn, folder, form)
 
 
 def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
@@ -83,20 +81,20 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
         If the folder cannot be made or written to.
     """
     held = {name: plot for name, plot in FIGURES.items() if name != "plan" or "plan" in run.metrics}
-    drawn = {f"{name}.{form}": plot(run) for name, plot in held.items()}
-    folder = _made(folder)
-    for name, figure in drawn.items():
-        save_figure(figure, folder / name)
-    return [folder / name for name in drawn]
+    return _saved({name: plot(run) for name, plot in held.items()}, folder, form)
 
 
-def _made(folder: PathLike) -> Path:
+def _saved(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
+    """Write figures by their names into `folder`, which is made if it is missing."""
     folder = Path(folder)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
-    return folder
+    files = [folder / f"{name}.{form}" for name in drawn]
+    for file, figure in zip(files, drawn.values(), strict=True):
+        save_figure(figure, file)
+    return files
 
 
 __all__ = [

@@ -57,11 +57,7 @@ def spread_fan(source: Any, size: int, h: float | None = None) -> Fan:
         return Fan(known.L_d, known.states, known.h)
     states = source.states
     rows = torch.linspace(0, len(states.s) - 1, min(size, len(states.s))).round().long()
-    start = State(states.q[rows].detach(), states.p[rows].detach(), states.s[rows].detach())
-    finite = torch.isfinite(start.q).all(-1) & torch.isfinite(start.p).all(-1) & torch.isfinite(start.s)
-    start = State(start.q[finite], start.p[finite], start.s[finite])
-    if not len(start.s):
-        raise InputError("the run has no finite state to start from; fit it again")
+    start = _sound(State(*(x[rows] for x in states)))
     return Fan(source.model, start, source.h if h is None else h, momentum_unit(source))
 
 
@@ -74,17 +70,21 @@ def point_fan(source: Any, size: int, h: float | None = None) -> Fan:
         whole = Fan(source.model, source.states, source.h if h is None else h, momentum_unit(source))
     else:
         whole = spread_fan(source, 64, h)
-    states = whole.start
-    finite = torch.isfinite(states.p).all(-1) & torch.isfinite(states.q).all(-1) & torch.isfinite(states.s)
-    if not bool(finite.any()):
-        raise InputError("the run has no finite state to start from; fit it again")
-    q, p, s = (x[finite].detach() for x in states)
+    q, p, s = _sound(whole.start)
     row = int((q - q.median(0).values).abs().sum(-1).argmax()) if len(s) < 3 else len(s) // 3
     reach = (p - p.median(0).values).abs().quantile(0.9, dim=0)
     steps = torch.linspace(-1.0, 1.0, size, dtype=p.dtype, device=p.device)
     momenta = p.median(0).values + steps[:, None] * reach.clamp_min(1e-6)
     start = State(q[row].expand(size, -1).clone(), momenta, s[row].expand(size).clone())
     return replace(whole, start=start)
+
+
+def _sound(states: State) -> State:
+    """The states whose numbers are finite."""
+    finite = states.finite
+    if not bool(finite.any()):
+        raise InputError("the run has no finite state to start from; fit it again")
+    return State(*(x[finite].detach() for x in states))
 
 
 def _is_run(source: Any) -> bool:

@@ -220,11 +220,7 @@ def _open(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
 
 def _verification(run: Run) -> tuple[Block, ...]:
     report = verify(run)
-    rows = tuple(
-        (c.statement, f"{c.value:.3g}", f"{'≤' if c.relation == '<=' else c.relation} {c.bound:.3g}",
-         "ok" if c.passed else "FAIL")
-        for c in report.checks
-    )  # fmt: skip
+    rows = tuple((check.statement, *check.verdict) for check in report.checks)
     text = "Identities hold for every discrete contact Lagrangian: they prove the stepper. The last rows judge the fit."
     return (
         f"{'Verified' if report.passed else 'NOT verified'}. {text}",

@@ -24,6 +24,7 @@ from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
+from herglotz.stepping.state import State
 
 __all__ = ["End", "ModelEquation", "PartialsEquation", "Point", "StepEquation", "StepOfModel", "model_equation"]
 
@@ -89,18 +90,9 @@ class ModelEquation:
         self._constants: _Constants | None = None
         self._key: tuple[Tensor, torch.Size] | None = None
 
-    def at(
-        self,
-        q0: Tensor,
-        p0: Tensor,
-        s0: Tensor,
-        h: Tensor,
-        u: Tensor | None,
-        increments: bool,
-        here: Field | None = None,
-    ) -> StepOfModel:
+    def at(self, state: State, h: Tensor, u: Tensor | None, increments: bool, here: Field | None = None) -> StepOfModel:
         """The equation of one step; `here` is the potential at q0 where it is known."""
-        return StepOfModel(self, q0, p0, s0, self._at(h, q0), u, increments, here)
+        return StepOfModel(self, state, self._at(h, state.q), u, increments, here)
 
     def _at(self, h: Tensor, q0: Tensor) -> _Constants:
         """The constants of a step h, kept between steps that pass the same tensor."""
@@ -132,16 +124,14 @@ class StepOfModel:
     def __init__(
         self,
         maker: ModelEquation,
-        q0: Tensor,
-        p0: Tensor,
-        s0: Tensor,
+        state: State,
         constants: _Constants,
         u: Tensor | None,
         increments: bool,
         here: Field | None,
     ):
-        self.maker, self.q0, self.p0, self.s0, self.u = maker, q0, p0, s0, u
-        self.constants, self.increments = constants, increments
+        self.q0, self.p0, self.s0 = q0, p0, s0 = state
+        self.maker, self.constants, self.u, self.increments = maker, constants, u, increments
         self.here = maker.field(q0) if here is None else here
         self.there: Field | None = None  # the potential at q1, after `end`
         a = torch.addcmul(p0, constants.half, self.here.slope, value=-1)  # p0 − h/2 V0′

@@ -24,7 +24,7 @@ from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.state import Status
+from herglotz.stepping.state import State, Status
 
 
 class Move(NamedTuple):
@@ -75,16 +75,10 @@ class Leapfrog:
         self._regular: bool | None = None
 
     def __call__(
-        self,
-        q0: Tensor,
-        p0: Tensor,
-        s0: Tensor,
-        h: Tensor,
-        here: Field | None = None,
-        u: Tensor | None = None,
-        increments: bool = False,
+        self, state: State, h: Tensor, here: Field | None = None, u: Tensor | None = None, increments: bool = False
     ) -> Move:
         """One step; `here` is the field at q0, where the step before has left it; `increments` asks for p1 − p0."""
+        q0, p0, s0 = state
         k = self.constants(h)
         V0, slope0 = self.field(q0) if here is None else here
         w = self._applied(u)

@@ -46,7 +46,7 @@ def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None
     delta = step.state.q.detach() - q
     slopes = forward_slopes if isinstance(L_d, ContactLagrangian) else backward_slopes
     with torch.no_grad():
-        J = step_jacobian(step_functions(L_d), q, p, s, h, delta, u, slopes)
+        J = step_jacobian(step_functions(L_d), State(q, p, s), h, delta, u, slopes)
     size = 2 * q.shape[-1] + 1
     return Linearised(step, J[..., :size], J[..., size], None if u is None else J[..., size + 1 :])
 
@@ -59,7 +59,7 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
     ) -> tuple[Tensor, Tensor, Tensor]:
         maker = model_equation(L_d, fold=False)
         if maker is not None:
-            form = maker.at(q, p, s, h, u, True)
+            form = maker.at(State(q, p, s), h, u, True)
             x = delta
         else:
             increments = hasattr(L_d, "partials_increment")
@@ -76,15 +76,14 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
 
 def step_jacobian(
     functions: StepFunctions,
-    q: Tensor,  # (..., n)
-    p: Tensor,  # (..., n)
-    s: Tensor,  # (...)
+    state: State,  # (..., n), (..., n), (...)
     h: Tensor,  # (...)
     delta: Tensor,  # (..., n) the solution of F = 0
     u: Tensor | None,  # (..., m)
     slopes: Slopes | None = None,  # how to differentiate; default `forward_slopes`
 ) -> Tensor:
     """d(q, p, s)′ / d(q, p, s, h, u) at a solved step, (..., 2n+1, 2n+2+m): a pure function of tensors."""
+    q, p, s = state
     n = q.shape[-1]
     sizes = [n, n, 1, 1, *(() if u is None else (u.shape[-1],)), n]
     point = torch.cat([q, p, s[..., None], h[..., None], *(() if u is None else (u,)), delta], -1)

@@ -75,7 +75,7 @@ def solve_step(
     if increments and not isinstance(L_d, Increments):
         raise InputError("this L_d has no partials_increment; leave increments=False, or use a model or a rule with it")
     equation = PartialsEquation(L_d, q0, p0, s0, h, order, increments)
-    found = find_root(equation, q0, guess, tol, max_iterations, order, increments)
+    found = find_root(equation, guess, tol, max_iterations, order)
     P = found.point.rest
     status, _ = status_of(found, End(P.D2, P.L, P.c))
     if increments:
@@ -83,20 +83,18 @@ def solve_step(
     return Solution(found.x, P, status, found.residual, found.iterations)
 
 
-def find_root(
-    equation: StepEquation, q0: Tensor, guess: Tensor, tol: float, max_iterations: int, order: int, increments: bool
-) -> Found:
+def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations: int, order: int) -> Found:
     """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
+    sizes = _Sizes(equation)
     if sticks(equation):
         assert isinstance(equation, PartialsEquation)
         start, *held = at_rest(equation)
         sticky = StickSlip(equation, *held)
-        found = newton(sticky, start, Rules(tol, max_iterations), _Sizes(sticky, q0, increments).tensors)
+        found = newton(sticky, start, Rules(tol, max_iterations), sizes.tensors)
         x = sticky.unknown(found.x)
         return found._replace(x=x, point=equation(x, order == 2), mixed=False)
-    x = guess - q0 if increments else guess
+    x = guess - equation.q0 if equation.increments else guess
     rules = Rules(tol, max_iterations, keep=order == 1)
-    sizes = _Sizes(equation, q0, increments)
     if x.shape[:-1].numel() == 1:
         return newton_one(equation, x, rules, sizes.numbers)
     found = newton(equation, x, rules, sizes.tensors)
@@ -108,13 +106,11 @@ class _Sizes:
     """The size that steps are compared with: of the positions or, in increments, of the increment; and of rounding."""
 
     equation: StepEquation
-    q0: Tensor
-    increments: bool
 
     def tensors(self, x: Tensor, point: Point, left: Tensor) -> tuple[Tensor, Tensor]:
         """(...) each; see `herglotz.mechanics.newton`."""
-        own = self.increments
-        size = largest(x) + largest(solve(point.J, self.equation.push(point))) if own else largest(self.q0)
+        own = self.equation.increments
+        size = largest(x) + largest(solve(point.J, self.equation.push(point))) if own else largest(self.equation.q0)
         scale = torch.maximum(size, torch.maximum(largest(x), left))
         limits = torch.finfo(scale.dtype)
         scale = torch.nan_to_num(scale, nan=1.0, posinf=1.0).clamp(min=_least(limits))
@@ -123,10 +119,10 @@ class _Sizes:
     def numbers(self, x: Tensor, point: Point, left: float) -> tuple[float, float]:
         """The same of one sample."""
         size = norm(x.flatten().tolist())
-        if self.increments:
+        if self.equation.increments:
             other = newton_step(point.J, self.equation.push(point))[1] + size
         else:
-            other = norm(self.q0.flatten().tolist())
+            other = norm(self.equation.q0.flatten().tolist())
         limits = torch.finfo(x.dtype)
         scale = max(size, other, left, _least(limits)) if isfinite(size + other + left) else 1.0
         return scale, ROUNDING * limits.eps * max(scale, self.equation.typical_increment().item())

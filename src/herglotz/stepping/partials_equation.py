@@ -30,6 +30,9 @@ class End(NamedTuple):
 class StepEquation(Protocol):
     """The step equation in the unknown x: q1 or, in increments, Δ = q1 − q0."""
 
+    q0: Tensor  # (..., n)
+    increments: bool
+
     def __call__(self, x: Tensor, second: bool) -> Point:
         """F, and J if `second`."""
         ...

@@ -49,18 +49,17 @@ class SingleStep:
     def _explicit(
         self, frog: Leapfrog, state: State, h: Tensor, u: Tensor | None, low: State | None
     ) -> tuple[Step, State | None]:
-        q0, p0, s0 = state
-        increments = self._in_increments(q0, h)
-        move = frog(q0, p0, s0, h, self._field if self._at is q0 else None, u, increments)
+        increments = self._in_increments(state.q, h)
+        move = frog(state, h, self._field if self._at is state.q else None, u, increments)
         if move.dp is not None:
             new, low = _compensated(state, State(move.delta, move.dp, move.L), low)
         else:
-            new, low = State(move.q1, move.p1, s0 + move.L), None
+            new, low = State(move.q1, move.p1, state.s + move.L), None
         with torch.no_grad():
             status = explicit_status(*new, move.c, frog.regular(h))
         good = status is None
-        if self._fine is None or self._fine[1].shape != s0.shape:
-            zero = torch.zeros_like(s0)
+        if self._fine is None or self._fine[1].shape != state.s.shape:
+            zero = torch.zeros_like(state.s)
             self._fine = zero.to(torch.uint8), zero
         step = _report(new, move.c, self._fine[0] if status is None else status, self._fine[1], 1, good)
         self._at, self._field = step.state.q, move.there
@@ -77,7 +76,7 @@ class SingleStep:
         order = 2 if torch.is_grad_enabled() else 1
         with torch.no_grad():
             equation = self._equation(L_d, state, h, u, increments, order)
-            found = find_root(equation, q0, guess, tol, self.max_iterations, order, increments)
+            found = find_root(equation, guess, tol, self.max_iterations, order)
             end = equation.end(found.x, found.point)
             status, good = status_of(found, end)
             if isinstance(equation, PartialsEquation):  # the terms of a model have no pole in h
@@ -117,7 +116,7 @@ class SingleStep:
             self._tried, self._terms = True, model_equation(self.L_d)
         if self._terms is None:
             return PartialsEquation(L_d, *state, h, order, increments)
-        return self._terms.at(*state, h, u, increments, self._field if self._at is state.q else None)
+        return self._terms.at(state, h, u, increments, self._field if self._at is state.q else None)
 
 
 def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:

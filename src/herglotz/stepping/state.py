@@ -47,6 +47,11 @@ class State(NamedTuple):
     p: Tensor  # (..., n) momentum
     s: Tensor  # (...) action variable
 
+    @property
+    def finite(self) -> Tensor:
+        """(...) whether all numbers of a sample are finite."""
+        return torch.isfinite(self.q).all(-1) & torch.isfinite(self.p).all(-1) & torch.isfinite(self.s)
+
 
 @dataclass(frozen=True)
 class Step:

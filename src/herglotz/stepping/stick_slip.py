@@ -25,7 +25,7 @@ from torch import Tensor
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.mechanics.newton import Point
 from herglotz.models import capabilities
-from herglotz.stepping.partials_equation import End, PartialsEquation
+from herglotz.stepping.partials_equation import PartialsEquation
 
 SWEEPS = 8  # of Gauss–Seidel: they find which coordinates stick, Newton's iteration finds by how much the others move
 
@@ -87,18 +87,6 @@ class StickSlip:
             return Point(G, None, P)
         J = torch.where(slides[..., None, :], unheld_jacobian(P, self.equation.p0), 0.0)
         return Point(G, J - torch.diag_embed(torch.where(slides, 0.0, self.stiffness)), P)
-
-    def push(self, point: Point) -> Tensor:
-        """See `Equation`."""
-        return self.equation.push(point)
-
-    def end(self, x: Tensor, point: Point) -> End:
-        """See `Equation`."""
-        return self.equation.end(x, point)
-
-    def typical_increment(self) -> Tensor:
-        """See `Equation`."""
-        return self.equation.typical_increment()
 
 
 def sticks(equation: object) -> bool:

@@ -9,8 +9,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.export.differences import WEIGHTS, central_differences
-from herglotz.stepping import State
+from herglotz.export.differences import WEIGHTS, central_differences, stepped
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, rounded, worst
 from herglotz.verify.subject import Subject
@@ -61,20 +60,12 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
 
 def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> tuple[Tensor, Tensor]:
     """The largest error of a sample, (B), over the largest entry of its row; and where differences exist, (B)."""
-    found = central_differences(lambda y: _ends(subject, y), x, offset * spread)
+    with torch.no_grad():
+        found = central_differences(lambda y: stepped(subject.step, y, subject.h), x, offset * spread)
     sound = found.isfinite().all(-1).all(-1)
     scaled, error = D.abs() * spread, (D - found).abs() * spread
     error = error / scaled.amax((0, -1))[:, None] if len(scaled) else error
     return error.flatten(1).amax(-1), sound
-
-
-def _ends(subject: Subject, x: Tensor) -> Tensor:
-    """The map on points (N, 2n+1); NaN where a step fails, as every step has it."""
-    n = x.shape[-1] // 2
-    with torch.no_grad():
-        step = subject.step(State(x[:, :n], x[:, n : 2 * n], x[:, 2 * n]), subject.h)
-    q, p, s = step.state
-    return torch.cat([q, p, s[:, None]], -1)
 
 
 def _spread(x: Tensor) -> Tensor:

@@ -26,10 +26,10 @@ def in_time(known: Subject, family: TimeDependent, steps: int, strict: float, bo
     times = torch.as_tensor(family.t0, dtype=known.states.s.dtype) + known.h * torch.arange(steps).to(known.states.s)
     members = [replace(known, L_d=family.at(t.reshape(1))) for t in times]
     w = _rollout(family, known, times)
-    q0, p0, s0 = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
+    start = w.starts
     t = times.expand_as(w.c)[w.ok]
-    by_t, by_h = time_defect(family, State(q0, p0, s0), t, known.h)
-    E = torch.stack(energies(family.L_d, q0, w.q[:, 1:][w.ok], s0, t, known.h)).abs()
+    by_t, by_h = time_defect(family, start, t, known.h)
+    E = torch.stack(energies(family.L_d, start.q, w.ends.q, start.s, t, known.h)).abs()
     time = worst(torch.stack([by_t, by_h]).abs() / E.sum(0).clamp_min(torch.finfo(E.dtype).tiny))
     fan = _fan(family, known, w)
     checks = [convergence(w), positive_factor(w), contact(w, strict), volume(w, bound)]

@@ -36,9 +36,9 @@ def hamiltonians_exist(subject: Subject, w: SampledRollout) -> tuple[bool, bool]
     """
     if subject.L_d is None or not bool(w.ok.any()):
         return True, True
-    q0, q1, s0 = w.q[:, :-1][w.ok], w.q[:, 1:][w.ok], w.s[:, :-1][w.ok]
+    q0, _, s0 = w.starts
     with torch.no_grad():
-        P = partials(subject.L_d, q0, q1, s0, subject.h, 2)
+        P = partials(subject.L_d, q0, w.ends.q, s0, subject.h, 2)
         M = mixed_hessian(P)
         margins = (scaled_margin(X, M, P.D11, P.D22) for X in (P.D22, left_hessian(P)))
     right, left = (bool((margin > MARGIN).any()) for margin in margins)
@@ -78,8 +78,7 @@ def left_formalism(subject: Subject, w: SampledRollout, bound: float) -> Check:
     fold of H⁻, where det D1D1L⁻ = 0, are left out.
     """
     assert subject.L_d is not None
-    q0, p0, s0 = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
-    q1, p1, s1 = (x[:, 1:][w.ok] for x in (w.q, w.p, w.s))
+    (q0, p0, s0), (q1, p1, s1) = w.starts, w.ends
     with torch.no_grad():
         P = partials(subject.L_d, q0, q1, s0, subject.h, 2)
         keep = scaled_margin(left_hessian(P), mixed_hessian(P), P.D11, P.D22) > MARGIN

@@ -34,6 +34,16 @@ class SampledRollout:
         return (self.status == Status.CONVERGED) & finite
 
     @property
+    def starts(self) -> State:
+        """The states before the steps that are ok."""
+        return State(*(x[:, :-1][self.ok] for x in (self.q, self.p, self.s)))
+
+    @property
+    def ends(self) -> State:
+        """The states after them."""
+        return State(*(x[:, 1:][self.ok] for x in (self.q, self.p, self.s)))
+
+    @property
     def steps(self) -> int:
         """Number of steps K."""
         return self.c.shape[-1]
@@ -82,7 +92,7 @@ def rounded(bound: float, w: SampledRollout) -> float:
         return bound
     n, D = w.q.shape[-1], w.derivative[w.ok]
     slope = torch.linalg.inv_ex(D[:, :n, n : 2 * n])[0] * w.c[w.ok][:, None, None]
-    p = w.p[:, :-1][w.ok].abs().max()
+    p = w.starts.p.abs().max()
     size = torch.finfo(w.q.dtype).eps * w.q.abs().max() * slope.abs().max() / torch.where(p > 0, p, 1.0)
     return max(bound, min(ROUNDINGS * float(size), BLIND)) if bool(torch.isfinite(size)) else bound
 
@@ -110,7 +120,7 @@ def contact(w: SampledRollout, bound: float, force: Forces | None = None) -> Che
 
     Without forces this is the contact property. `force` holds the forces at the steps that are ok.
     """
-    p0, p1 = w.p[:, :-1][w.ok], w.p[:, 1:][w.ok]
+    p0, p1 = w.starts.p, w.ends.p
     D, c = w.derivative[w.ok], w.c[w.ok]
     defect, claim = contact_defect(D, p0, p1, c), "contact map: DΦ̃ᵀη(x1) = c η(x0)"
     if force is not None:

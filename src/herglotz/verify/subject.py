@@ -171,9 +171,9 @@ def _scene_states(scene: Scene, samples: int, make: torch.Generator) -> State:
 def _run_states(run: Run, samples: int, make: torch.Generator) -> State:
     """Draw fitted states of a run without repetition; states that are not finite are skipped."""
     dtype = next(run.model.parameters()).dtype
-    q, p, s = (x.detach().to(dtype) for x in run.states)
-    finite = (torch.isfinite(q).all(-1) & torch.isfinite(p).all(-1) & torch.isfinite(s)).nonzero()[:, 0]
+    states = State(*(x.detach().to(dtype) for x in run.states))
+    finite = states.finite.nonzero()[:, 0]
     if not len(finite):
         raise InputError("the run holds no finite state; its fit has diverged, fit again")
     index = finite[torch.randperm(len(finite), generator=make)[:samples]]
-    return State(q[index], p[index], s[index])
+    return State(*(x[index] for x in states))

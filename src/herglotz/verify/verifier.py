@@ -183,9 +183,9 @@ def _forces(known: Subject, w: SampledRollout) -> Forces | None:
     """
     if known.L_d is None:
         return None
-    q0, q1, p0, s0 = (*(w.q[:, k : w.steps + k][w.ok] for k in (0, 1)), w.p[:, :-1][w.ok], w.s[:, :-1][w.ok])
+    q0, p0, s0 = w.starts
     with torch.no_grad():
-        P = partials(known.L_d, q0, q1, s0, known.h)
+        P = partials(known.L_d, q0, w.ends.q, s0, known.h)
         force = P.force
         if force is None or force.held is None:
             return force
@@ -196,9 +196,8 @@ def _forces(known: Subject, w: SampledRollout) -> Forces | None:
 def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:
     """Check that every step equals the closed-form flow, relative to the largest q, p and s."""
     assert known.scene is not None
-    q, p, s = (x[:, :-1][w.ok] for x in (w.q, w.p, w.s))
     with torch.no_grad():
-        flow = known.scene.flow(q, p, s, known.h)
-    pairs = zip((w.q, w.p, w.s), flow, strict=True)
-    value = max(worst((x[:, 1:][w.ok] - y).abs()) / float(x.abs().max()) for x, y in pairs)
+        flow = known.scene.flow(*w.starts, known.h)
+    sizes = (float(x.abs().max()) for x in (w.q, w.p, w.s))
+    value = max(worst((x - y).abs()) / size for x, y, size in zip(w.ends, flow, sizes, strict=True))
     return Check.at_most("exact_flow", "exact L_d: a step is the closed-form flow", value, bound)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.export import ExportedStepper, compile_c, export_c, weights_digest
+from herglotz.export import ExportedStepper, compile_c, export_c, load_c, weights_digest
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Status, Stepper
 
@@ -370,14 +370,14 @@ def test_a_file_that_is_not_ours(tmp_path):
     # fails if any text is taken for a header
     (tmp_path / "other.h").write_text("#define X 1\n")
     with pytest.raises(InputError, match="does not end with its sha256"):
-        compile_c(tmp_path / "other.h")
+        load_c(tmp_path / "other.h")
 
 
 @needs_compiler
 def test_wrong_states_are_refused(tmp_path):
     # fails if a wrong dtype or shape reaches C, where it would read other memory
     path = export_c(damped(2, "linear"), tmp_path / "stepper.h", h=0.1)
-    compiled = compile_c(path)
+    compiled = load_c(path)
     assert isinstance(compiled, ExportedStepper)
     q, p, s = states_of(2, 3)
     for state, h, message in (

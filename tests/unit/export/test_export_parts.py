@@ -10,7 +10,7 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import export_run
 from herglotz.export.compare import draw
-from herglotz.export.inputs import check_range
+from herglotz.export.exported import check_range
 from herglotz.export.load import read_header
 from herglotz.export.lower.interpret import MATHEMATICS
 from herglotz.export.newton import FLOOR, NewtonIteration, first_carry

@@ -100,7 +100,7 @@ def test_the_change_of_momentum(config):
     frog = leapfrog(model)
     assert frog is not None
     u = torch.ones(5, 1, dtype=torch.float64) if config.inputs else None
-    move = frog(*start, torch.tensor(0.1, dtype=torch.float64), u=u, increments=True)
+    move = frog(start, torch.tensor(0.1, dtype=torch.float64), u=u, increments=True)
     torch.testing.assert_close(move.dp, move.p1 - start.p, rtol=0, atol=1e-14)
 
 

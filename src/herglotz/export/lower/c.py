@@ -21,7 +21,7 @@ import numpy as np
 from herglotz.export.equation import Equations, input_count
 from herglotz.export.lower.interpret import interpret
 from herglotz.export.lower.program import NAME, Program, Ref, literal
-from herglotz.export.step_parts import potential, step_parts
+from herglotz.export.step_parts import step_parts
 
 PREPARE, BEGIN, EVALUATE, GAINS = range(4)
 Outputs = Mapping[str, Any]  # the place written to → its number, or the list of its numbers
@@ -186,8 +186,9 @@ def model_source(step: StepInC, equations: Equations, derivatives: bool) -> Emit
     """The emitted parts of a header, with constants as `R(0.5)`."""
     program = Program(tables=step.program.tables)
     q = program.given("q", step.n)
-    graph = potential(equations)
-    V, slope = (np.full(n, 0.0, object) for n in (1, step.n)) if graph is None else interpret(program, graph, [q])
+    V, slope = (np.full(n, 0.0, object) for n in (1, step.n))
+    if equations.model.config.baseline:
+        V, slope = interpret(program, equations.potential, [q])
     outputs = {"V->value": V.ravel()[0], "V->slope": list(slope.ravel())}
     head = "\n/* V(q) and V'(q). */\nstatic inline void FN_potential(const REAL q[hz_N], FN_potential_t *V)"
     push = "  REAL push[hz_N]; /* G (u - u0) */\n" if step.m else ""

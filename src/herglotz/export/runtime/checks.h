@@ -53,7 +53,6 @@ static inline int hz_inputs_finite(const hz_real *u) {
   return good;
 }
 #define hz_BAD_U(u) ((u) && !hz_inputs_finite(u))
-#define hz_U_OF_STEP(u, k) ((u) ? (u) + (k) * hz_M : 0)
 #else
 #define hz_TAKES_U
 #define hz_WITH_U(argument)

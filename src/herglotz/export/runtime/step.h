@@ -7,7 +7,7 @@
 typedef struct {
   FN_problem P;
   REAL low_q[hz_N], low_p[hz_N], low_s, low_sigma;
-#if !hz_EXPLICIT
+#if hz_CONTINUES
   REAL move[3][hz_N];
   hz_real miss[2][FN_WIDTH];
   int known[FN_WIDTH];
@@ -21,7 +21,7 @@ static inline void FN_track_start(const FN_state *state, FN_track *track) {
   track->P.h = zero;
   for (i = 0; i < hz_N; i++) track->low_q[i] = track->low_p[i] = zero;
   track->low_s = track->low_sigma = zero;
-#if !hz_EXPLICIT
+#if hz_CONTINUES
   for (i = 0; i < hz_N; i++) track->move[0][i] = track->move[1][i] = track->move[2][i] = zero;
   for (i = 0; i < FN_WIDTH; i++) {
     track->known[i] = 0;
@@ -191,6 +191,7 @@ static inline void FN_solve(const FN_problem *P, FN_terms *t, int status[FN_WIDT
   }
 }
 
+#if hz_CONTINUES
 /* The solution from the better of two guesses: t->move arrives as the step without what couples q1, and the other is
    the cubic through the last four positions. */
 static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[FN_WIDTH], hz_real residual[FN_WIDTH]) {
@@ -200,7 +201,7 @@ static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[
     guess[0][i] = t->move[i];
     guess[1][i] = hz_R(3.0) * (track->move[0][i] - track->move[1][i]) + track->move[2][i];
     for (w = 0; w < FN_WIDTH; w++)
-      if (!hz_STICKING && track->known[w] >= 3 && track->miss[1][w] < track->miss[0][w])
+      if (track->known[w] >= 3 && track->miss[1][w] < track->miss[0][w])
         FN_LANE(t->move[i], w) = FN_LANE(guess[1][i], w);
   }
   FN_solve(&track->P, t, status, residual);
@@ -215,6 +216,7 @@ static inline void FN_solve_from_guess(FN_track *track, FN_terms *t, int status[
   FN_length(guess[1], track->miss[1]);
   for (w = 0; w < FN_WIDTH; w++) track->known[w] = status[w] ? 0 : track->known[w] + (track->known[w] < 3);
 }
+#endif
 #endif
 
 /* The move of what Newton has solved for: the move itself or, where dry friction can hold a coordinate, a number z of
@@ -270,7 +272,7 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
     if (h[w] != FN_LANE(P->h, w)) {
       FN_LANE(P->h, w) = h[w];
       changed = 1;
-#if !hz_EXPLICIT
+#if hz_CONTINUES
       track->known[w] = 0;
 #endif
     }
@@ -292,9 +294,12 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
   FN_begin(P, t.move);
 #if hz_EXPLICIT
   for (i = 0; i < hz_N; i++) x[i] = t.move[i];
-#else
+#elif hz_CONTINUES
   FN_solve_from_guess(track, &t, failed, residual);
   for (i = 0; i < hz_N; i++) x[i] = track->move[0][i];
+#else
+  FN_solve(P, &t, failed, residual);
+  for (i = 0; i < hz_N; i++) x[i] = t.move[i] + t.rest[i];
 #endif
   for (i = 0; i < hz_N; i++) {
     low[i] = track->low_q[i];
@@ -325,7 +330,7 @@ static inline void FN_take(FN_state *state, FN_track *track, const hz_real h[FN_
     one.s = FN_LANE(P->s0, w);
     one.sigma = FN_LANE(sigma, w);
     FN_LANE(track->low_s, w) = FN_LANE(track->low_sigma, w) = hz_R(0.0);
-#if !hz_EXPLICIT
+#if hz_CONTINUES
     track->known[w] = 0;
 #endif
     if (FN_WIDTH == 1) status[w] = failed[w];

@@ -4,6 +4,10 @@
 #define hz_RESTRICT restrict
 #endif
 
+/* Whether the last moves, continued, are a guess. Where dry friction can hold a coordinate the equation at rest says
+   more, and an explicit step needs none. */
+#define hz_CONTINUES (!hz_EXPLICIT && !hz_STICKING)
+
 #if hz_SINGLE
 #define hz_sin sinf
 #define hz_cos cosf
