@@ -163,20 +163,25 @@ class DictionarySearch:
         found = search.run()
         if found is None:
             return None
-        if search.tells_all(found, every):
-            kept = max(1, every // found.config.substeps)
+        if (kept := search.kept_of(found, every)) > 1:
             base = replace(found.base, max_step=self.base.max_step, model_step=self.base.model_step)
             return replace(found, every=kept, base=base, config=replace(found.config, substeps=1))
         self.order = found.config.order
         dense = self._refit(found, found.terms, max(1, found.config.substeps // every), every)
         return None if dense is None else self._longer(dense)
 
-    def tells_all(self, found: Found, every: int) -> bool:
-        """Whether so many times more samples tell no more: a force is missing, and their short steps change little."""
+    def kept_of(self, found: Found, every: int) -> int:
+        """How many of so many times more samples are one that tells enough; 1: all of them are to be fitted.
+
+        More tell nothing where a force is missing. The model steps between those that are kept may change the motion by
+        as little as those of a search: halved ones err by a quarter, for friction is of order 2.
+        """
         noise = self.precision if math.isfinite(self.precision) else 0.0
-        if not found.coloured or found.rms <= max(AT_THE_NOISE * noise, self.floor) or found.config.substeps > every:
-            return False
-        return found.changed_by(self._problem(found, found.terms, every)[1]) <= FINER * found.rms
+        if not found.coloured or found.rms <= max(AT_THE_NOISE * noise, self.floor):
+            return 1
+        change = found.changed_by(self._problem(found, found.terms, every)[1]) / (FINER * found.rms)
+        halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
+        return max(1, every // (found.config.substeps * 2**halvings))
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
