@@ -32,6 +32,7 @@ from herglotz.training.named_terms import (
     candidates,
     central,
     chains,
+    loads,
     offered,
     own_terms,
     settings_of,
@@ -91,7 +92,7 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
-        found = self._braking(found)
+        found = self._braking(found) if found.pushes else found
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         self.all = replace(self.all, apart=found.terms.apart)
         for _ in range(ADDED):
@@ -192,9 +193,9 @@ class DictionarySearch:
         return self.all.only(tuple(own)), {**values, **features}
 
     def _braking(self, found: Found) -> Found:
-        """Without dry friction that pushes: it makes up for another force."""
-        less = self._refit(found, replace(found.terms, dry=False)) if found.pushes else None
-        return less or found
+        """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
+        self.all = self.all.joined(NamedTerms((), loads(self.data, one_way=True)))
+        return self._refit(found, replace(found.terms, dry=False)) or found
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, unless smooth friction is worth its widths and its excess."""
