@@ -75,6 +75,7 @@ class DictionarySearch:
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
+        self.noise = self.precision if math.isfinite(self.precision) else 0.0  # what is gained below it is noise
         self.finest = min(FINEST, STEPS // data.samples)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
@@ -177,8 +178,8 @@ class DictionarySearch:
         More tell nothing where a force is missing. The model steps between those that are kept may change the motion by
         as little as those of a search: halved ones err by a quarter, for friction is of order 2.
         """
-        noise = self.precision if math.isfinite(self.precision) else 0.0
-        if not found.coloured or found.rms <= max(AT_THE_NOISE * noise, self.floor):
+        known = found.rms <= max(AT_THE_NOISE * self.noise, self.floor)
+        if not found.coloured or known or self.config.find_zeros:  # zeros are small, and every sample tells of them
             return 1
         change = found.changed_by(self._problem(found, found.terms, every)[1]) / (FINER * found.rms)
         halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
@@ -203,8 +204,7 @@ class DictionarySearch:
             return found
         count, plain = self.data.q.numel(), self._sticking(found, 0.0)
         worth = self.data.dof * math.log(count) / 2  # of one number for each coordinate
-        noise = self.precision if math.isfinite(self.precision) else 0.0  # what smooth friction gains below it is noise
-        if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > noise):
+        if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > self.noise):
             return found
         held = self._sticking(plain, max(plain.values[DRY]) * EXCESS_START)
         shaped = 0.0 if held is None else gain(plain.rms, held.rms, count, self.floor)

@@ -77,6 +77,7 @@ def test_recordings_keep_three_samples(plan):
         ({"step": 4.1 * FINER}, 3),
         ({"step": math.inf}, 1),
         ({"substeps": 4}, 3),
+        ({"zeros": True}, 1),
     ],
 )
 def test_how_many_samples_tell_enough(change, says):
@@ -88,5 +89,6 @@ def test_how_many_samples_tell_enough(change, says):
         changed_by=lambda _problem: values["step"] * values["rms"],
     )  # fmt: skip
     search = object.__new__(DictionarySearch)
-    search.precision, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
+    search.config = FitConfig(find_zeros=values.get("zeros", False))
+    search.noise, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
     assert search.kept_of(found, 12) == says  # type: ignore[arg-type]
