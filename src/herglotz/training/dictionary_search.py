@@ -32,6 +32,7 @@ from herglotz.training.named_terms import (
     candidates,
     central,
     chains,
+    loads,
     offered,
     own_terms,
     settings_of,
@@ -74,6 +75,7 @@ class DictionarySearch:
         self.spread = float(((data.q - data.q.mean(0)) / data.balance).square().mean().sqrt())
         self.floor = ROUNDING * EXACT[config.dtype] * max(base.scale)
         self.precision = precision(data)
+        self.noise = self.precision if math.isfinite(self.precision) else 0.0  # what is gained below it is noise
         self.finest = min(FINEST, STEPS // data.samples)
         self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
@@ -91,7 +93,7 @@ class DictionarySearch:
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
         if found is None:
             return None
-        found = self._braking(found)
+        found = self._braking(found) if found.pushes else found
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         self.all = replace(self.all, apart=found.terms.apart)
         for _ in range(ADDED):
@@ -163,20 +165,25 @@ class DictionarySearch:
         found = search.run()
         if found is None:
             return None
-        if search.tells_all(found, every):
-            kept = max(1, every // found.config.substeps)
+        if (kept := search.kept_of(found, every)) > 1:
             base = replace(found.base, max_step=self.base.max_step, model_step=self.base.model_step)
             return replace(found, every=kept, base=base, config=replace(found.config, substeps=1))
         self.order = found.config.order
         dense = self._refit(found, found.terms, max(1, found.config.substeps // every), every)
         return None if dense is None else self._longer(dense)
 
-    def tells_all(self, found: Found, every: int) -> bool:
-        """Whether so many times more samples tell no more: a force is missing, and their short steps change little."""
-        noise = self.precision if math.isfinite(self.precision) else 0.0
-        if not found.coloured or found.rms <= max(AT_THE_NOISE * noise, self.floor) or found.config.substeps > every:
-            return False
-        return found.changed_by(self._problem(found, found.terms, every)[1]) <= FINER * found.rms
+    def kept_of(self, found: Found, every: int) -> int:
+        """How many of so many times more samples are one that tells enough; 1: all of them are to be fitted.
+
+        More tell nothing where a force is missing. The model steps between those that are kept may change the motion by
+        as little as those of a search: halved ones err by a quarter, for friction is of order 2.
+        """
+        known = found.rms <= max(AT_THE_NOISE * self.noise, self.floor)
+        if not found.coloured or known or self.config.find_zeros:  # zeros are small, and every sample tells of them
+            return 1
+        change = found.changed_by(self._problem(found, found.terms, every)[1]) / (FINER * found.rms)
+        halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
+        return max(1, every // (found.config.substeps * 2**halvings))
 
     def _bare(self) -> tuple[NamedTerms, dict]:
         """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
@@ -187,9 +194,9 @@ class DictionarySearch:
         return self.all.only(tuple(own)), {**values, **features}
 
     def _braking(self, found: Found) -> Found:
-        """Without dry friction that pushes: it makes up for another force."""
-        less = self._refit(found, replace(found.terms, dry=False)) if found.pushes else None
-        return less or found
+        """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
+        self.all = self.all.joined(NamedTerms((), loads(self.data, one_way=True)))
+        return self._refit(found, replace(found.terms, dry=False)) or found
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, unless smooth friction is worth its widths and its excess."""
@@ -197,8 +204,7 @@ class DictionarySearch:
             return found
         count, plain = self.data.q.numel(), self._sticking(found, 0.0)
         worth = self.data.dof * math.log(count) / 2  # of one number for each coordinate
-        noise = self.precision if math.isfinite(self.precision) else 0.0  # what smooth friction gains below it is noise
-        if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > noise):
+        if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > self.noise):
             return found
         held = self._sticking(plain, max(plain.values[DRY]) * EXCESS_START)
         shaped = 0.0 if held is None else gain(plain.rms, held.rms, count, self.floor)

@@ -20,6 +20,7 @@ from herglotz.training.parameter_vector import ParameterVector
 
 HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
 WAVES = 3  # highest harmonic of one angle
+BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
 NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
 DRY = "friction.coulomb"
@@ -81,11 +82,27 @@ def _frictions(data: Trajectories) -> list[str]:
     """Friction beside the viscous and the dry one: dampers between lengths, for those between joints are `coupled`."""
     drag = []
     for i, angle in enumerate(data.angles, 1):
-        drag += [f"|v{i}| v{i}", f"load {i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
+        drag += [f"|v{i}| v{i}"] if angle else [f"|v{i}| v{i}", f"q{i} v{i}", f"q{i}^2 v{i}"]
+    drag += loads(data, one_way=False)
     if not any(data.angles):
         drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(data.dof), 2)]
         drag += [AIR] if data.dof > 1 and len(set(data.units)) == 1 else []
     return drag
+
+
+def loads(data: Trajectories, *, one_way: bool) -> tuple[str, ...]:
+    """Constant forces, which no potential has, on the angles that only turn one way, or on the others."""
+    return tuple(f"load {i + 1}" for i, angle in enumerate(data.angles) if angle and turns_one_way(data, i) == one_way)
+
+
+def turns_one_way(data: Trajectories, i: int) -> bool:
+    """Whether an angle never turns back for a fiftieth of a recording: dry friction is then a constant force, too."""
+    signs = []
+    for one in data:
+        lag = max(1, one.samples // BACK)
+        signs.append((one.q[lag:, i] - one.q[:-lag, i]).sign())
+    seen = torch.cat(signs)
+    return bool((seen == seen[0]).all()) and float(seen[0]) != 0
 
 
 def _unmoved(data: Trajectories, moved: Sequence[tuple[float, ...]]) -> NamedTerms:

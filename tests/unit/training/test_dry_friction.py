@@ -59,7 +59,7 @@ def test_the_plan_says_why(settings, expected):
 def test_friction_that_holds_is_kept_where_smooth_friction_is_not_worth_its_widths(plain, excess, kept):
     # fails if smooth friction, or Stribeck's excess, stays for what its numbers take of the noise
     search: Any = object.__new__(DictionarySearch)
-    search.data, search.floor, search.precision = SimpleNamespace(q=torch.zeros(100, 1), dof=1), 0.0, 0.0
+    search.data, search.floor, search.noise = SimpleNamespace(q=torch.zeros(100, 1), dof=1), 0.0, 0.0
     search.config, search._longer = SimpleNamespace(sticking=None), lambda found: found
 
     def make(rms, values):

@@ -68,15 +68,27 @@ def test_recordings_keep_three_samples(plan):
 
 @pytest.mark.parametrize(
     ("change", "says"),
-    [({}, True), ({"coloured": False}, False), ({"rms": 1.4}, False), ({"step": 1.1 * FINER}, False)],
+    [
+        ({}, 12),
+        ({"coloured": False}, 1),
+        ({"rms": 1.4}, 1),
+        ({"step": 1.1 * FINER}, 6),
+        ({"step": 3.9 * FINER}, 6),
+        ({"step": 4.1 * FINER}, 3),
+        ({"step": math.inf}, 1),
+        ({"substeps": 4}, 3),
+        ({"zeros": True}, 1),
+    ],
 )
-def test_when_more_samples_tell_no_more(change, says):
-    # fails if noise is not averaged over all samples, or steps that are too long for these are kept
-    values = {"coloured": True, "rms": 2.0, "step": 0.9 * FINER} | change
+def test_how_many_samples_tell_enough(change, says):
+    # fails if noise is not averaged over all samples, or steps that are too long for these are kept: 12 in a step
+    values = {"coloured": True, "rms": 2.0, "step": 0.9 * FINER, "substeps": 1} | change
     found = SimpleNamespace(
-        coloured=values["coloured"], rms=values["rms"], config=SimpleNamespace(substeps=1), terms=NamedTerms(),
+        coloured=values["coloured"], rms=values["rms"], terms=NamedTerms(),
+        config=SimpleNamespace(substeps=values["substeps"]),
         changed_by=lambda _problem: values["step"] * values["rms"],
     )  # fmt: skip
     search = object.__new__(DictionarySearch)
-    search.precision, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
-    assert search.tells_all(found, 6) is says  # type: ignore[arg-type]
+    search.config = FitConfig(find_zeros=values.get("zeros", False))
+    search.noise, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
+    assert search.kept_of(found, 12) == says  # type: ignore[arg-type]
