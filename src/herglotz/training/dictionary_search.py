@@ -51,6 +51,7 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
+SPARSE = FINER / 4  # of it that the longer steps of a sparse fit may change: free runs are longer than segments
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
@@ -175,13 +176,12 @@ class DictionarySearch:
     def kept_of(self, found: Found, every: int) -> int:
         """How many of so many times more samples are one that tells enough; 1: all of them are to be fitted.
 
-        More tell nothing where a force is missing. The model steps between those that are kept may change the motion by
-        as little as those of a search: halved ones err by a quarter, for friction is of order 2.
+        More tell nothing where a force is missing. Halved steps change the motion by a quarter: friction is of order 2.
         """
         known = found.rms <= max(AT_THE_NOISE * self.noise, self.floor)
         if not found.coloured or known or self.config.find_zeros:  # zeros are small, and every sample tells of them
             return 1
-        change = found.changed_by(self._problem(found, found.terms, every)[1]) / (FINER * found.rms)
+        change = found.changed_by(self._problem(found, found.terms, every)[1]) / (SPARSE * found.rms)
         halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
         return max(1, every // (found.config.substeps * 2**halvings))
 
