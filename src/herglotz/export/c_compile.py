@@ -108,6 +108,8 @@ def compile_c(
     InputError
         If there is no compiler, or an argument is not usable.
     """
+    if not isinstance(model, ContactLagrangian):
+        raise InputError(f"compile_c takes a model, got {type(model).__name__}; load_c opens a header")
     dtype = dtype or str(next(model.parameters()).dtype).removeprefix("torch.")
     entries = describe(model, h, box, units, MAX_ITERATIONS, {"h_range": None})
     entries = described(model, entries, "model", dtype, tolerance)
