@@ -9,6 +9,7 @@ from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.trajectories import Trajectories
+from herglotz.errors import refuse
 
 CROSSED = 1000  # typical steps: a gap of so many is crossed in any recording, as that costs little
 
@@ -42,9 +43,12 @@ def parted(data: Trajectories) -> Trajectories:
     counts = ends.diff(prepend=ends.new_zeros(1))
     whole = counts >= MIN_SAMPLES
     rows = torch.arange(data.samples, device=data.t.device)[torch.repeat_interleave(whole, counts)]
-    longest = float(steps.h.max())
+    longest = f"gaps of up to {float(steps.h.max()):.4g}{'' if data.time_unit == '1' else f' {data.time_unit}'}"
+    where = f"{data.source or 'trajectories'}: {longest} leave no part"
+    refuse({f"{where} of {MIN_SAMPLES} samples; record without such gaps, or leave the samples beside them out":
+            not bool(whole.any())})  # fmt: skip
     kept = tuple(counts[whole].tolist())
     left = f"; {len(whole) - len(kept)} too short, left out" if len(kept) < len(whole) else ""
     count = f"{len(kept)} trajector{'y' if len(kept) == 1 else 'ies'}"
-    note = f"cut into {count} at gaps of up to {longest:.4g} {data.time_unit}{left}"
+    note = f"cut into {count} at {longest}{left}"
     return replace(data.rows(rows, kept), notes=(*data.notes, note))

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from herglotz.data.checks import check_alike
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_format import read_table, write_csv
 from herglotz.data.extra_formats import read_hdf5, read_mat, read_parquet
@@ -102,7 +103,7 @@ def load(
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns)
     files = _files(path := Path(path))
-    found = Trajectories.cat([in_radians_and_seconds(_read(file, wanted)) for file in files])
+    found = _joined(files, [in_radians_and_seconds(_read(file, wanted)) for file in files])
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
@@ -160,6 +161,21 @@ def _files(path: Path) -> list[Path]:
     if not found:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
     return found
+
+
+def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
+    """One set of all; a note that not every file has begins with the name of its file, and so does what differs."""
+    for file, one in zip(files[1:], sets[1:], strict=True):
+        try:
+            check_alike([sets[0], one])
+        except InputError as error:
+            raise InputError(f"{file} beside {files[0].name}: {error}") from None
+    shared = set(sets[0].notes).intersection(*(one.notes for one in sets))
+    named = (
+        replace(one, notes=tuple(note if note in shared else f"{file.name}: {note}" for note in one.notes))
+        for file, one in zip(files, sets, strict=True)
+    )
+    return Trajectories.cat(named)
 
 
 def _read(path: Path, wanted: Wanted) -> Trajectories:

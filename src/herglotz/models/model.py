@@ -99,7 +99,8 @@ class ContactLagrangian(nn.Module):
         known = numbers_of(self)
         for name in absent:
             if name not in known:
-                raise InputError(f"absent: the model has no number '{name}'; its numbers are {', '.join(known)}")
+                own = ", ".join(other for other in known if ".network." not in other)  # weights are hundreds
+                raise InputError(f"absent: the model has no number '{name}'; its numbers are {own}")
             parameter, i = known[name]
             self.get_parameter(parameter).data.view(-1)[i] = 0.0
 

@@ -48,13 +48,15 @@ def rounded(value: float, std: float) -> str:
 
 
 def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
-    """Every entry of the physical parameters, those of a coordinate with its name."""
-    std, found = posterior.standard_deviations(), []
+    """Every entry of the physical parameters that was learned, those of a coordinate with its name."""
+    std, found, learned = posterior.standard_deviations(), [], posterior.problem.parameters.entries
     for name, parameter in run.model.named_parameters():
         if not (name.startswith(PHYSICAL) and parameter.numel()):
             continue
         values = parameter.detach().reshape(-1).double()
         for i, (value, spread) in enumerate(zip(values.tolist(), std[name].reshape(-1).tolist(), strict=True)):
+            if (name, i) not in learned:
+                continue
             words = WORDS.get(name, name)
             words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
             whose = f" of {run.data.names[i]}" if values.numel() == run.data.dof > 1 else ""

@@ -104,7 +104,8 @@ class Stages:
             stored = _read(checkpoint)
             if stored["key"] != key:
                 raise InputError(
-                    f"{checkpoint}: belongs to other data or settings; leave out --resume or choose another folder"
+                    f"{checkpoint}: belongs to other data or settings, or to another version of herglotz; leave out "
+                    "--resume or choose another folder"
                 )
             self.done, self.kept = stored["stages"], stored["kept"]
 

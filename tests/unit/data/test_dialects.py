@@ -163,8 +163,17 @@ def test_a_folder_of_recordings(tmp_path, capsys):
     assert (lines[0], len(lines)) == ("lab:", 6)
     assert "  2 recordings: a.tsv, b.csv" in lines
     (folder / "c.csv").write_text("t,y\n0,1\n1,2\n2,3\n")
-    with pytest.raises(InputError, match="sets with different names cannot be joined"):
+    with pytest.raises(InputError, match=r"c\.csv beside a\.tsv: sets with different names cannot be joined"):
         load(folder)
+
+
+def test_notes_on_the_files_of_a_folder_name_the_file(tmp_path):
+    # fails if rows that are left out of one file read as those of any, or a note of two files stands once for both
+    rows = "0;1\n1;\n2;3\n3;4\n"
+    for name, text in (("a.csv", rows), ("b.csv", rows), ("c.csv", rows.replace("1;\n", "1;2\n"))):
+        (tmp_path / name).write_text("t;x\n" + text)
+    left_out = "a row is left out, without a value: the first is row 3, column 'x'"
+    assert load(tmp_path).notes[1:] == ("columns are separated by ';'", f"a.csv: {left_out}", f"b.csv: {left_out}")
 
 
 def test_folders_without_recordings(tmp_path):  # fails if an empty folder, or that of a run, ends in a traceback

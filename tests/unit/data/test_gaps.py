@@ -1,5 +1,7 @@
 """A gap longer than all that was recorded begins another trajectory; shorter ones do not."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -21,6 +23,7 @@ def test_a_night_between_samples_begins_another_recording():
     assert data.lengths == (41, 31, 21)
     assert data.t[41] == 90_000
     assert data.notes == ("cut into 3 trajectories at gaps of up to 1.1e+05 s",)
+    assert parted(replace(data, lengths=(93,), time_unit="1", notes=())).notes[0].endswith("gaps of up to 1.1e+05")
 
 
 def test_gaps_that_can_be_crossed_stay():
@@ -76,3 +79,9 @@ def test_missing_samples_of_arrays_are_left_out_and_said(capsys):
         as_trajectories(np.where(np.arange(12) < 2, 1.0, np.nan), h=1)
     with pytest.raises(InputError, match="sample 3, is inf"):
         as_trajectories(np.where(np.arange(12) == 3, np.inf, np.sin(np.arange(12.0))), h=1)
+
+
+def test_gaps_that_leave_no_part_are_named():
+    # fails if the message is that of an empty set: it named neither the gap nor what to do
+    with pytest.raises(InputError, match=r"gaps of up to 4999 .*leave no part of 3 samples; record without such gaps"):
+        as_trajectories(np.sin(np.arange(3.0)), time=[0.0, 1.0, 5000.0])

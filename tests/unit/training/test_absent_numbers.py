@@ -1,5 +1,6 @@
 """Numbers of a model that are 0 and no unknowns of a fit."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -13,6 +14,7 @@ from herglotz.training.equation import equation_of
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.quantities import quantities
 
 ABSENT = ("potential.stiffness[0]", "friction.viscous[1]")
 
@@ -93,3 +95,24 @@ def test_numbers_that_say_nothing_are_left_out(value, absent):
     kept = FewerNumbers(data, 0.0, 2, refit, lambda *_: (None, None))._absent(start)  # type: ignore[arg-type]
     assert tried == [("friction.viscous[0]",)] * absent
     assert kept.terms.absent == ("friction.viscous[0]",) * absent
+
+
+def test_the_message_on_a_misspelt_number_names_no_weights():
+    # fails if the hundreds of weights of a network stand between the user and the numbers that have names
+    config = replace(two_bodies(()).config, potential_width=16)
+    with pytest.raises(InputError, match=r"its numbers are .*stiffness\[1\]") as caught:
+        ContactLagrangian(replace(config, absent=("tilt",)))
+    assert "weights" not in str(caught.value)
+
+
+def test_numbers_that_were_not_learned_have_no_uncertainty():
+    # fails if `herglotz trust` reports a spring that was left out as one that is known to be 0 ± 0
+    model = two_bodies()
+    vector = ParameterVector(model)
+    spread = {name: torch.ones_like(p) for name, p in model.named_parameters()}
+    posterior = SimpleNamespace(problem=SimpleNamespace(parameters=vector), standard_deviations=lambda: spread)
+    data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
+    found = quantities(posterior, SimpleNamespace(model=model, data=data))  # pyright: ignore
+    assert [x.words for x in found if x.name == "potential.stiffness"] == ["the stiffness k of the potential of b"]
+    assert [x.words for x in found if x.name == "friction.viscous"] == ["viscous friction of a"]
+    assert all(x.std == 1.0 for x in found)

@@ -488,7 +488,7 @@ def test_resume_goes_on_where_it_was_interrupted(tmp_path):
     assert calls[0] is None  # "three" was begun
     assert calls[1] is not None  # "two" went on from what the search remembered
     assert [h["stage"] for h in again.history] == sorted(h["stage"] for h in again.history)
-    with pytest.raises(InputError, match="belongs to other data or settings; leave out --resume"):
+    with pytest.raises(InputError, match="belongs to other data or settings, or to another version of herglotz; leave"):
         Stages(False, checkpoint, "other", resume=True)
 
 
