@@ -77,7 +77,8 @@ fuzz: .venv/installed
 	$(ENV) PYTHONPATH=. $(PY) tests/fuzz.py
 
 # Strike a fit 900 times: killed, ended, without disk, memory or permission, its workers killed or stopped; counts of what
-# was made good. Ten minutes of processor time, and as long again of waiting; a slice is in the slow tests.
+# was made good. About ten minutes of processor time, and as long again of waiting, by 108 strikes; a slice is in the
+# slow tests.
 faults: .venv/installed
 	$(ENV) PYTHONPATH=. $(PY) tests/faults.py
 
