@@ -48,14 +48,16 @@ class FewerNumbers:
         x, A = found.information(self.floor)
         kept = prune(A, x, torch.tensor(free, dtype=torch.long), worth)[0].tolist()
         absent = tuple(parameters.numbers[i] for i in free if i not in kept)
-        return self._simplified(found, replace(found.terms, absent=absent)) if absent else found
+        more = replace(found.terms, absent=(*found.terms.absent, *absent))
+        return self._simplified(found, more) if absent else found
 
     def _one_rate(self, found: Found) -> Found:
         """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""
         terms = found.terms
         if self.data.dof == 1 or terms.drag or terms.dry or found.config.level != "forced" or self.data.u is not None:
             return found
-        return self._simplified(found, replace(terms, one_rate=True))
+        absent = tuple(name for name in terms.absent if name.startswith("potential."))  # of frictions none is left
+        return self._simplified(found, replace(terms, one_rate=True, absent=absent))
 
     def _undragged(self, found: Found) -> Found:
         """Without drag that joined while smooth friction stood for what holds the joints now, one by one."""
@@ -69,7 +71,8 @@ class FewerNumbers:
             return found
         if found.cost_without(SHARED, self.floor) > 4**self.order * self.data.q.numel():
             return found  # a fit would only take its time
-        return self._simplified(found, replace(found.terms, apart=True))
+        absent = tuple(name for name in found.terms.absent if not name.startswith(SHARED))
+        return self._simplified(found, replace(found.terms, apart=True, absent=absent))
 
     def _simplified(self, found: Found, terms: NamedTerms) -> Found:
         """With these terms, of fewer parameters, where they are as likely, or as good and residuals are no noise."""

@@ -116,3 +116,25 @@ def test_numbers_that_were_not_learned_have_no_uncertainty():
     assert [x.words for x in found if x.name == "potential.stiffness"] == ["the stiffness k of the potential of b"]
     assert [x.words for x in found if x.name == "friction.viscous"] == ["viscous friction of a"]
     assert all(x.std == 1.0 for x in found)
+
+
+def test_a_model_of_a_part_is_tried_with_fewer_numbers_again():
+    # fails if a search of all data, which begins with the absent numbers of a part, asks a simpler model for numbers
+    # that it has not (the whole fit ended so), keeps its rate at 0, or revives numbers that were absent before
+    before = ("potential.tilt[0]", "damping.rate", "friction.viscous[1]", "coupling.viscous")
+    vector = ParameterVector(two_bodies(()))
+    x = torch.full((len(vector.numbers),), 10.0, dtype=torch.float64)
+    x[vector.numbers.index("potential.tilt[1]")] = 0.0
+    config = SimpleNamespace(order=2, substeps=1, level="forced", sticking=False)
+    fit = SimpleNamespace(theta=x, problem=SimpleNamespace(parameters=vector))
+    start = OneNumber(
+        x=x, fit=fit, config=config, terms=NamedTerms(("q1 v2",), absent=before), rms=1.0, coloured=False,
+        cost_without=lambda _names, _floor: 0.0,
+    )  # fmt: skip
+    tried = []
+    data = SimpleNamespace(q=torch.zeros(250, 2), dof=2, angles=(True, True), u=None)
+    every = FewerNumbers(data, 0.0, 2, lambda _of, terms: tried.append(terms), lambda *_: (None, None))  # type: ignore[arg-type]
+    assert every.of(start) is start  # type: ignore[arg-type]
+    assert [(terms.apart, terms.one_rate, terms.absent) for terms in tried] == [
+        (True, False, before[:3]), (False, True, before[:1]), (False, False, (*before, "potential.tilt[1]")),
+    ]  # fmt: skip
