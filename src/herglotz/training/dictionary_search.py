@@ -35,6 +35,7 @@ from herglotz.training.named_terms import (
     loads,
     offered,
     own_terms,
+    same_as_friction,
     settings_of,
     started,
     values_of,
@@ -51,7 +52,6 @@ from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 PART = 2000  # samples that a search begins with, where there are more than twice as many
 ADDED = 6  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
-SPARSE = FINER / 4  # of it that the longer steps of a sparse fit may change: free runs are longer than segments
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
@@ -92,17 +92,16 @@ class DictionarySearch:
         if found is None:
             part = self.data.liveliest(PART)
             found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
-        if found is None:
-            return None
+            if found is None:
+                return None
         found = self._braking(found) if found.pushes else found
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         self.all = replace(self.all, apart=found.terms.apart)
         for _ in range(ADDED):
-            if (name := self._missing(found)) is None:
-                break
-            more = self._refit(found, self.all.only((*found.terms.names, name)))
+            name = self._missing(found)
+            more = None if name is None else self._refit(found, self.all.only((*found.terms.names, name)))
             if name == DRY and more is not None and more.pushes:
-                self.all = replace(self.all, dry=False)
+                self.all = replace(self.all.joined(NamedTerms((), loads(self.data, one_way=True))), dry=False)
                 continue
             if more is None or not found.joined_by(more, self.floor):
                 break
@@ -176,12 +175,13 @@ class DictionarySearch:
     def kept_of(self, found: Found, every: int) -> int:
         """How many of so many times more samples are one that tells enough; 1: all of them are to be fitted.
 
-        More tell nothing where a force is missing. Halved steps change the motion by a quarter: friction is of order 2.
+        More tell nothing where a force is missing. Halved steps err by a quarter, for friction is of order 2; they may
+        change the motion by a quarter of what a search allows, for free runs are longer than its segments.
         """
         known = found.rms <= max(AT_THE_NOISE * self.noise, self.floor)
         if not found.coloured or known or self.config.find_zeros:  # zeros are small, and every sample tells of them
             return 1
-        change = found.changed_by(self._problem(found, found.terms, every)[1]) / (SPARSE * found.rms)
+        change = 4 * found.changed_by(self._problem(found, found.terms, every)[1]) / (FINER * found.rms)
         halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
         return max(1, every // (found.config.substeps * 2**halvings))
 
@@ -195,8 +195,9 @@ class DictionarySearch:
 
     def _braking(self, found: Found) -> Found:
         """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
-        self.all = self.all.joined(NamedTerms((), loads(self.data, one_way=True)))
-        return self._refit(found, replace(found.terms, dry=False)) or found
+        same = same_as_friction(self.data, found.values[DRY])
+        terms = replace(found.terms.joined(NamedTerms((), tuple(same))), dry=False)
+        return self._refit(replace(found, values=found.values | same), terms) or found
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, unless smooth friction is worth its widths and its excess."""
@@ -243,8 +244,7 @@ class DictionarySearch:
         if found.whole:
             return found
         stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
-        done = found.fit.problem.grid.length
-        stages.lengths = [0, *(length for length in stages.lengths if length > done)]
+        stages.lengths = [0, *(length for length in stages.lengths if length > found.fit.problem.grid.length)]
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
     def _problem(

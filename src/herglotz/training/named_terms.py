@@ -95,6 +95,13 @@ def loads(data: Trajectories, *, one_way: bool) -> tuple[str, ...]:
     return tuple(f"load {i + 1}" for i, angle in enumerate(data.angles) if angle and turns_one_way(data, i) == one_way)
 
 
+def same_as_friction(data: Trajectories, friction: Sequence[float]) -> dict[str, float]:
+    """The loads that dry friction of these sizes is on angles that only turn one way: each pushes where it is < 0."""
+    ways = (data.q[data.lengths[0] - 1] - data.q[0]).sign().tolist()
+    same = {f"load {i + 1}": friction[i] * way for i, way in enumerate(ways)}
+    return {name: same[name] for name in loads(data, one_way=True)}
+
+
 def turns_one_way(data: Trajectories, i: int) -> bool:
     """Whether an angle never turns back for a fiftieth of a recording: dry friction is then a constant force, too."""
     signs = []

@@ -11,7 +11,7 @@ from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.dictionary_search import SPARSE, DictionarySearch
+from herglotz.training.dictionary_search import FINER, DictionarySearch
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.plan import Plan
 
@@ -72,9 +72,9 @@ def test_recordings_keep_three_samples(plan):
         ({}, 12),
         ({"coloured": False}, 1),
         ({"rms": 1.4}, 1),
-        ({"step": 1.1 * SPARSE}, 6),
-        ({"step": 3.9 * SPARSE}, 6),
-        ({"step": 4.1 * SPARSE}, 3),
+        ({"step": 1.1}, 6),
+        ({"step": 3.9}, 6),
+        ({"step": 4.1}, 3),
         ({"step": math.inf}, 1),
         ({"substeps": 4}, 3),
         ({"zeros": True}, 1),
@@ -82,11 +82,11 @@ def test_recordings_keep_three_samples(plan):
 )
 def test_how_many_samples_tell_enough(change, says):
     # fails if noise is not averaged over all samples, or steps that are too long for these are kept: 12 in a step
-    values = {"coloured": True, "rms": 2.0, "step": 0.9 * SPARSE, "substeps": 1} | change
+    values = {"coloured": True, "rms": 2.0, "step": 0.9, "substeps": 1} | change
     found = SimpleNamespace(
         coloured=values["coloured"], rms=values["rms"], terms=NamedTerms(),
         config=SimpleNamespace(substeps=values["substeps"]),
-        changed_by=lambda _problem: values["step"] * values["rms"],
+        changed_by=lambda _problem: values["step"] * FINER / 4 * values["rms"],
     )  # fmt: skip
     search = object.__new__(DictionarySearch)
     search.config = FitConfig(find_zeros=values.get("zeros", False))

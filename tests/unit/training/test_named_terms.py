@@ -452,8 +452,10 @@ def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(monkeypatch):
     data = Trajectories.of(torch.arange(60.0, dtype=torch.float64), torch.arange(60.0, dtype=torch.float64)[:, None],
                            angles=(True,))  # fmt: skip
     search = object.__new__(DictionarySearch)
-    search.data, search.all = data, NamedTerms((), (), True)
-    monkeypatch.setattr(search, "_refit", lambda _found, terms: SimpleNamespace(terms=terms), raising=False)
-    left = search._braking(SimpleNamespace(terms=NamedTerms((), (), True)))  # type: ignore[arg-type]
-    assert search.all.drag == ("load 1",)
+    search.data = data
+    monkeypatch.setattr(search, "_refit", lambda found, terms: SimpleNamespace(terms=terms, of=found), raising=False)
+    start = Found(NamedTerms((), (), True), FitConfig(), {"friction.coulomb": (-3.0,)}, None, None, True, 1.0)  # type: ignore[arg-type]
+    left: Any = search._braking(start)
+    assert left.terms.drag == ("load 1",)
+    assert left.of.values["load 1"] == -3.0  # the force −(−3) sgn θ′ on a joint whose angle grows
     assert not left.terms.dry
