@@ -5,7 +5,7 @@ Writes results/measured.json and .md, and coverage.png. Settings are the default
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
 run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20,
 air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90,
-motor_axis 45, duffing_circuit 50, two_joints 450; two_motors was not run by this command yet. `cpu_seconds` in the
+motor_axis 45, duffing_circuit 50, two_joints 125; two_motors was not run by this command yet. `cpu_seconds` in the
 table says what it took.
 """
 
