@@ -28,6 +28,7 @@ from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
+    loads,
     places,
     settings_of,
     shapes_of_dry,
@@ -186,7 +187,8 @@ def _with_absent_terms(
     if not plain or c.level not in ("linear", "forced") or told or data.dof > MOST:
         return model, task.base, {}
     every, own = candidates(data, c.translations), NamedTerms(c.features, c.drag, c.coulomb)
-    every = replace(every, one_rate=every.one_rate and c.level == "linear")
+    pushed = NamedTerms((), tuple(name for name in loads(data, one_way=True) if name in own.drag))
+    every = replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
     if not set(own.names) <= set(every.names):
         return model, task.base, {}
     values = values_of(parameters, parameters.get(), c, data.angles)

@@ -23,14 +23,15 @@ class ParameterVector:
         named, every = dict(model.named_parameters()), numbers_of(model)
         self.names = list(named)
         self.shapes = [p.shape for p in named.values()]
-        self.numbers = [name for name in every if name not in model.config.absent]  # (P,) by name
+        absent = set(model.config.absent)
+        self.numbers = [name for name in every if name not in absent]  # (P,) by name
         self.entries = [every[name] for name in self.numbers]  # parameter and entry of each
-        self.whole = None if len(self.numbers) == len(every) else torch.tensor([name in self.numbers for name in every])
+        self.learned = torch.tensor([name not in absent for name in every]) if absent else None  # (N,)
 
     def get(self) -> Tensor:
         """The current parameters as one vector (P,)."""
         theta = nn.utils.parameters_to_vector(self.model.parameters()).detach().clone()
-        return theta if self.whole is None else theta[self.whole.to(theta.device)]
+        return theta if self.learned is None else theta[self.learned.to(theta.device)]
 
     def set(self, theta: Tensor) -> None:
         """Write a vector back into the model."""
@@ -43,10 +44,10 @@ class ParameterVector:
 
     def _with_absent(self, theta: Tensor) -> Tensor:
         """The numbers of all parameters, (N,)."""
-        if self.whole is None:
+        if self.learned is None:
             return theta
-        at = self.whole.nonzero()[:, 0].to(theta.device)
-        return theta.new_zeros(len(self.whole)).index_copy(0, at, theta)
+        at = self.learned.nonzero()[:, 0].to(theta.device)
+        return theta.new_zeros(len(self.learned)).index_copy(0, at, theta)
 
     def partials(
         self, theta: Tensor, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, order: int, u: Tensor | None = None

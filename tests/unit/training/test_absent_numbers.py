@@ -10,11 +10,16 @@ from torch.func import jacrev
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
+from herglotz.training import FitConfig
+from herglotz.training.baseline import estimate_baseline
 from herglotz.training.equation import equation_of
 from herglotz.training.fewer_numbers import FewerNumbers
-from herglotz.training.named_terms import NamedTerms
+from herglotz.training.foresight import _with_absent_terms
+from herglotz.training.named_terms import NamedTerms, settings_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.quantities import quantities
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task, build_model
 
 ABSENT = ("potential.stiffness[0]", "friction.viscous[1]")
 
@@ -138,3 +143,39 @@ def test_a_model_of_a_part_is_tried_with_fewer_numbers_again():
     assert [(terms.apart, terms.one_rate, terms.absent) for terms in tried] == [
         (True, False, before[:3]), (False, True, before[:1]), (False, False, (*before, "potential.tilt[1]")),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_a_number_has_one_name_at_both_orders(order):
+    # fails if a tilt of order 4, the second feature of its coordinate, is taken for the spring, the first one
+    settings = {"angles": (True, False), "scale": (1.0, 1.0), "speed": (1.0, 1.0), "potential_width": 0}
+    config = ModelConfig(**settings, stiffness=(4.0, 5.0), tilt=(6.0, 7.0), order=order, absent=("potential.tilt[0]",))
+    model, q = ContactLagrangian(config), torch.tensor([0.0, 0.0], dtype=torch.float64)
+    slope = model.potential(q, 1).gradient  # k sin 0 + b cos 0, and k 0 + b
+    assert slope.tolist() == [0.0, 7.0]
+
+
+def test_absent_numbers_are_among_the_terms_too_small_to_be_seen():
+    # fails if the verdict is told nothing of a spring that data say little about
+    t = torch.arange(0.0, 20.0, 0.1, dtype=torch.float64)
+    data = Trajectories.of(t, torch.stack([t.sin(), (1.3 * t).cos()], 1))
+    _, _, hidden = without_and_with(data, NamedTerms(absent=("potential.tilt[0]",)))
+    assert len(hidden["potential.tilt[0]"]) == 1
+
+
+def test_what_pushes_one_way_leaves_friction_to_be_seen():
+    # fails if the load, no candidate of a joint that turns one way, ends all search for terms that are too small
+    t = torch.arange(0.0, 20.0, 0.1, dtype=torch.float64)
+    data = Trajectories.of(t, (3 * t + 0.1 * t.sin())[:, None], angles=(True,))
+    model, _, hidden = without_and_with(data, NamedTerms(("cos(q1)", "sin(q1)"), ("load 1",)))
+    assert "friction.coulomb" in hidden
+    assert "load 1" not in hidden
+    assert "load 1" in model.config.drag
+
+
+def without_and_with(data, terms):
+    """A model of these terms alone, then with all that it lacks."""
+    config = settings_of(terms, data, FitConfig(), 2, 1)
+    base = estimate_baseline(data)
+    model = build_model(base, config, "none")
+    return _with_absent_terms(Task(data, base, config, Stages(False, None, "", resume=False)), model)

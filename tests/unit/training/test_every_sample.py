@@ -11,9 +11,13 @@ from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.choose import choose
 from herglotz.training.dictionary_search import FINER, DictionarySearch
+from herglotz.training.look import look
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.plan import Plan
+from herglotz.training.stages import Stages
+from herglotz.training.task import Task
 
 
 def kinked(samples=1800, h=0.02):
@@ -92,3 +96,20 @@ def test_how_many_samples_tell_enough(change, says):
     search.config = FitConfig(find_zeros=values.get("zeros", False))
     search.noise, search.floor, search._problem = 1.0, 1e-9, lambda *_: (None, None)  # type: ignore[assignment]
     assert search.kept_of(found, 12) == says  # type: ignore[arg-type]
+
+
+def test_model_steps_are_as_long_as_those_between_samples_that_stay():
+    # fails if they are cut into recorded ones again, which takes as long as all samples do
+    data = kinked(60)
+    task = Task(data, estimate_baseline(data), FitConfig(), Stages(False, None, "", resume=False))
+    sparse = task.thinned(4)
+    assert sparse.data.samples == 15
+    assert (sparse.base.max_step, sparse.base.model_step) == (4 * task.base.max_step, 4 * task.base.model_step)
+
+
+def test_the_plan_takes_what_the_search_kept():
+    # fails if the last fit takes all samples again
+    made = simulate(scene("damped_oscillator"), trajectories=1, steps=60, h=0.1, noise=1e-3, seed=0)
+    seen = look(made, FitConfig(), Stages(False, None, "", resume=False))
+    assert seen.found is not None
+    assert choose(replace(seen, found=seen.found._replace(every=3)), FitConfig()).every == 3

@@ -447,15 +447,42 @@ def test_a_load_and_dry_friction_are_one_force_where_a_joint_never_turns_back(ba
     assert turns_one_way(Trajectories.of(t, q, angles=(True,)), 0) is (back == 0)
 
 
-def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(monkeypatch):
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(way, monkeypatch):
     # fails if such a joint is left without a constant force once its friction has turned out to push
-    data = Trajectories.of(torch.arange(60.0, dtype=torch.float64), torch.arange(60.0, dtype=torch.float64)[:, None],
-                           angles=(True,))  # fmt: skip
+    t = torch.arange(60.0, dtype=torch.float64)
+    data = Trajectories.of(t, way * t[:, None], angles=(True,))
     search = object.__new__(DictionarySearch)
     search.data = data
     monkeypatch.setattr(search, "_refit", lambda found, terms: SimpleNamespace(terms=terms, of=found), raising=False)
     start = Found(NamedTerms((), (), True), FitConfig(), {"friction.coulomb": (-3.0,)}, None, None, True, 1.0)  # type: ignore[arg-type]
     left: Any = search._braking(start)
     assert left.terms.drag == ("load 1",)
-    assert left.of.values["load 1"] == -3.0  # the force −(−3) sgn θ′ on a joint whose angle grows
+    assert left.of.values["load 1"] == -3.0 * way  # the force −(−3) sgn θ′
     assert not left.terms.dry
+
+
+def test_a_load_is_asked_for_once_friction_that_joins_a_one_way_joint_pushes(monkeypatch):
+    # fails if such a joint has neither constant force any more
+    t = torch.arange(60.0, dtype=torch.float64)
+    search: Any = object.__new__(DictionarySearch)
+    search.data, search.floor, search.all = (
+        Trajectories.of(t, t[:, None], angles=(True,)),
+        0.0,
+        NamedTerms((), (), True),
+    )
+    start: Any = SimpleNamespace(terms=NamedTerms(), pushes=False, coloured=False, rms=1.0)
+    asked, names = iter(["friction.coulomb", None]), []
+
+    def missing(_found):
+        names.append(search.all.names)
+        return next(asked)
+
+    search._begun, search._missing = lambda: start, missing
+    search._refit = lambda _found, terms: SimpleNamespace(terms=terms, pushes=True)
+    for last in ("_pruned", "_likeliest", "_last_terms"):
+        setattr(search, last, lambda found: found)
+    search._problem, search.order = None, 2
+    monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
+    assert search.run() is start
+    assert names == [("friction.coulomb",), ("load 1",)]
