@@ -50,8 +50,9 @@ from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 PART = 2000  # samples that a search begins with, where there are more than twice as many
-ADDED = 6  # terms that may join one after the other
+ADDED = 12  # terms that may join one after the other
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
+BETTER = 0.8  # of the misfit at which shorter steps were in vain: other terms ask for them again
 FINEST = 16  # model steps in a recorded one
 STEPS = 40_000  # model steps of all trajectories together
 MISLED = 1.5  # times the precision: a linear start that leaves so much may be worse than one without its terms
@@ -78,7 +79,7 @@ class DictionarySearch:
         self.precision = precision(data)
         self.noise = self.precision if math.isfinite(self.precision) else 0.0  # what is gained below it is noise
         self.finest = min(FINEST, STEPS // data.samples)
-        self.in_vain = 0, 0.0  # model steps in a recorded one, and the misfit, that halved steps did not lower
+        self.in_vain = (0, None), 0.0  # model steps in a recorded one, sticking, and the misfit that stayed
         plain = data.u is None or data.dof == 1  # joints with motors: inputs and dry friction jump, and steps cost more
         self.coarse = coarse(data)
         self.order = 4 if plain and (self.coarse or self.precision < SMOOTH * self.spread) else 2
@@ -116,11 +117,9 @@ class DictionarySearch:
         start = smoothed(self.data, local)
         found, simpler = self._first(start, local)
         for simple in simpler:
-            if found is None or found.coloured:
-                break  # of residuals that are no noise likelihoods tell nothing
             other = self._grown(simple.terms, simple.values, 1, start)
             other = None if other is None else self._finer(self._held(other))
-            if other is not None and other.as_likely(found, self.floor):
+            if other is not None and (found is None or other.instead_of(found, self.floor)):
                 return other
         return found
 
@@ -134,7 +133,7 @@ class DictionarySearch:
         found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
         if bare is None and self._misled(found):
             bare = self._grown(*self._bare(), 1, start)
-        if bare is not None and (found is None or (bare.whole, -bare.rms) > (found.whole, -found.rms)):
+        if bare is not None and (found is None or (bare.whole >= found.whole and bare.rms < found.rms)):
             found, linear = bare, []
         return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[1:])
 
@@ -204,6 +203,7 @@ class DictionarySearch:
         if not found.terms.dry or found.pushes or found.config.sticking or self.config.sticking is False:
             return found
         count, plain = self.data.q.numel(), self._sticking(found, 0.0)
+        plain = plain and self._finer(plain)  # where a joint turns back its steps are of order 1
         worth = self.data.dof * math.log(count) / 2  # of one number for each coordinate
         if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > self.noise):
             return found
@@ -336,7 +336,7 @@ class DictionarySearch:
             lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
             other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
             if other is None:
-                self.in_vain = m, found.rms
+                self.in_vain = (m, found.config.sticking), found.rms
                 break  # the terms make up for the longer steps
             found = self._longer(other)
         return found
@@ -344,7 +344,7 @@ class DictionarySearch:
     def _too_long(self, found: Found) -> bool:
         """Whether halved steps, which there may be, change the motion by as much as the data miss it."""
         m = found.config.substeps
-        vain = m == self.in_vain[0] and found.rms > self.in_vain[1] / 2
+        vain = self.in_vain[0] == (m, found.config.sticking) and found.rms > BETTER * self.in_vain[1]
         if vain or 2 * m > self.finest or found.rms <= FINE * self.floor:
             return False
         return found.changed_by(self._problem(found, found.terms, 2 * m)[1]) > max(FINER * found.rms, FINE * self.floor)

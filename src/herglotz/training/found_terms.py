@@ -107,6 +107,13 @@ class Found:
         """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""
         return self.rms <= 2**0.5 * max(other.rms, floor) and not self.beaten_by(other, floor)
 
+    def instead_of(self, other: Found, floor: float) -> bool:
+        """Whether these terms, which are fewer, take the place of the other ones.
+
+        Of residuals that are no noise likelihoods tell nothing.
+        """
+        return self.whole and self.as_good(other, floor) if other.coloured else self.as_likely(other, floor)
+
     def as_likely(self, other: Found, floor: float) -> bool:
         """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
         count, fewer = self.fit.problem.data.q.numel(), len(other.terms.names) - len(self.terms.names)

@@ -55,6 +55,11 @@ class TrajectoryFit:
         """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
         return scale_of(self.misfit) if self.problem.freedom else float(self.misfit.square().mean().sqrt())
 
+    def loses(self, plain: TrajectoryFit) -> bool:
+        """Whether it has lost data that least squares follow: what lies far from both alone is an outlier."""
+        own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (self, plain))
+        return own > NOT_THE_NOISE * its
+
     def states(self) -> Tensor:
         """The fitted trajectory at the samples, (N, 2n+1)."""
         grid, x = self.problem.grid, self.path.x.flatten(0, 1)
@@ -287,15 +292,17 @@ def _without_prior(task: Task, model: ContactLagrangian, sigma: float, *, known:
     def chosen(last: TrajectoryFit) -> Chosen[TrajectoryFit]:
         return Chosen(last, departure, {departure: last.held_out_errors()})
 
+    plain = None
     if known and task.config.robust != "on":
-        last = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
-        if last is not None and (task.config.robust == "off" or not heavy_tailed(last.misfit)):
-            return chosen(last)
+        plain = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
+        if plain is not None and (task.config.robust == "off" or not heavy_tailed(plain.misfit)):
+            return chosen(plain)
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
-        return None
+        return None if plain is None else chosen(plain)
     first = stages.robust_or_not(first, known=known)
-    return chosen(stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma))
+    last = stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma)
+    return chosen(last if plain is None or not last.loses(plain) else plain)
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:

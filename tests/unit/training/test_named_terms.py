@@ -427,7 +427,7 @@ def test_shorter_steps_may_cost_what_one_number_is_worth(finer, most, substeps):
     # steps than a search has time for
     search: Any = object.__new__(DictionarySearch)
     search.floor, search.finest, search.data = 0.0, most, SimpleNamespace(q=torch.zeros(60, 1))
-    at = lambda m, rms: SimpleNamespace(rms=rms, terms=(), config=SimpleNamespace(substeps=m))  # noqa: E731
+    at = lambda m, rms: SimpleNamespace(rms=rms, terms=(), config=SimpleNamespace(substeps=m, sticking=None))  # noqa: E731
     search._refit = lambda *steps: at(steps[-1], finer[steps[-1]])
     search._longer = lambda found: found
     search._too_long = lambda found: found.config.substeps == 1 and not hasattr(search, "in_vain")
