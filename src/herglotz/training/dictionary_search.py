@@ -130,17 +130,17 @@ class DictionarySearch:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
         families = (self.all, *(replace(self.all.only(x.names), apart=x.apart) for x in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
-        found = self._grown(linear[0].terms, linear[0].values, 1, start) if linear else None
+        grown = ((self._grown(x.terms, x.values, 1, start), at) for at, x in enumerate(linear, 1))
+        found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
             bare = self._grown(*self._bare(), 1, start)
         if bare is not None and (found is None or (bare.whole >= found.whole and bare.rms < found.rms)):
             found, linear = bare, []
-        return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[1:])
+        return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[at:])
 
     def _misled(self, found: Found | None) -> bool:
         """Whether the linear problem gave no model, or one coordinate's that misses far more than the noise."""
-        alone = self.data.dof == 1
-        return found is None or (alone and found.coloured and found.rms > MISLED * self.precision)
+        return found is None or (self.data.dof == 1 and found.coloured and found.rms > MISLED * self.precision)
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""

@@ -22,6 +22,7 @@ from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
 SPRINGS = ("potential.stiffness", "potential.tilt")
+SINGULAR, SMALLER = 0.1, 20  # least eigenvalue of a mass matrix of unit diagonal; tenths taken off until it is larger
 ENOUGH = 5  # residuals for each coefficient: fewer leave its smallest singular value to noise
 
 
@@ -107,10 +108,25 @@ class LinearTerms:
             return None
         terms, left, alone = self._pruned(of, columns, x, r)
         for x in (fit.solve(left), alone):
-            start = fit.start(x)
+            start = fit.start(self._regular(x))
             if start is not None:
                 return LinearStart(terms, self._named(start), float(fit.errors(x).square().mean().sqrt()))
         return None
+
+    def _regular(self, x: Tensor) -> Tensor:
+        """With masses that turn with angles made smaller until no mass matrix of the data is nearly singular.
+
+        Smoothing may leave them too large, and no step is solved from there.
+        """
+        x, moving = x.clone(), torch.tensor([name == MOVING for name in self.fit.names])
+        for _ in range(SMALLER if bool(moving.any()) else 0):
+            M = -(self.fit.J @ x) * x[0].sign()
+            size = M.diagonal(dim1=-2, dim2=-1).abs().clamp_min(1e-300).sqrt()
+            M = (M + M.mT) / 2 / size[:, :, None] / size[:, None, :]
+            if not bool(torch.isfinite(M).all()) or float(torch.linalg.eigvalsh(M).min()) > SINGULAR:
+                break
+            x[moving] *= 0.9
+        return x
 
     def _problem(self, local: LocalPolynomials) -> LinearFit:
         """The linear problem of every candidate over the smoothed samples."""

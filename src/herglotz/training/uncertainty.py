@@ -3,7 +3,7 @@
 Around the fit, −log posterior ≈ ½ (x − x̂)ᵀ A (x − x̂) with A = JᵀJ of the trajectory problem, prior included, so the
 unknowns x (parameters and start states) have covariance A⁻¹. What a deterministic model misses is not white, and A⁻¹
 takes it for white: it is multiplied by (held-out RMS / σ)², the factor by which held-out blocks of time are worse than
-residuals.
+residuals. It is that of the median block: one that alone tells some number is lost without it, which A⁻¹ knows.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Laplace:
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         _, A, _ = self.problem.normal_equations(x)
         errors = held_out_errors(self.problem, self.path, self.theta, A)
-        held_out = float(errors.square().mean().sqrt())
+        held_out = float(errors.median())
         self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
         self.information = A.double()  # prior included
         self.covariance = inverse_of(self.information) * self.inflation**2
