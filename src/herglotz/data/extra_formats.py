@@ -96,7 +96,7 @@ def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     if isinstance(inside[0], Mapping):
         return _recordings(inside[0])
     several = isinstance(inside[0], (list, np.ndarray)) and all(isinstance(x, Mapping) for x in inside[0])
-    return inside[0] if several else [stored]
+    return list(inside[0]) if several else [stored]
 
 
 def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]:

@@ -149,16 +149,25 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
 
 def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
     """The header of a frame, and its first row of numbers: 1 behind one of units, as csv files have them."""
-    pairs = [tuple(map(str, name)) if isinstance(name, tuple) else (str(name), "") for name in frame.columns]
-    if all(len(pair) == 2 for pair in pairs) and any(unit for _, unit in pairs):  # a header of two rows
-        units = ["" if unit.startswith("Unnamed: ") else unit for _, unit in pairs]
-        if named := with_units([name for name, _ in pairs], units, str(where), wanted):
-            return named, 0
+    if (rows := _two_rows(list(frame.columns))) and (named := with_units(*rows, str(where), wanted)):
+        return named, 0
     heads = [str(name) for name in frame.columns]
-    first = [column[0] for column in raw if column.ndim == 1 and len(column)]
-    below = [x if isinstance(x, str) else "" if x is None or x != x else "0" for x in first]
+    below = [_text(column[0]) for column in raw if column.ndim == 1 and len(column)]
     named = with_units(heads, below, str(where), wanted)
-    return named or heads, int(named is not None)
+    return (heads, 0) if named is None else (named, 1)
+
+
+def _two_rows(names: Sequence[Any]) -> tuple[list[str], list[str]] | None:
+    """Names and units of a header of two rows, which pandas has as pairs; None of any other."""
+    if not all(isinstance(name, tuple) and len(name) == 2 for name in names):
+        return None
+    units = [str(unit) for _, unit in names]
+    return [str(name) for name, _ in names], ["" if x.startswith("Unnamed: ") else x for x in units]
+
+
+def _text(x: Any) -> str:
+    """A cell of a table as a csv file has it: a number, whatever its digits, is 0 here, and a missing one is blank."""
+    return x if isinstance(x, str) else "" if x is None or x != x else "0"
 
 
 def in_dates(found: Trajectories) -> Trajectories:
@@ -175,7 +184,7 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
     InputError
         If they are complex.
     """
-    array = np.asarray(x.astype(np.float64).filled(np.nan) if isinstance(x, np.ma.MaskedArray) else x)
+    array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
     return array
 

@@ -179,9 +179,9 @@ def test_masked_and_complex_numbers():  # fails if what numpy hides or drops bec
     mask = np.ma.masked_array(X, X > 5)
     for data in (as_trajectories(mask, h=0.5), as_trajectories({"t": T, "x": mask})):
         assert data.q[:, 0].tolist() == X[:5].tolist()
-    for wrong in ({"t": T, "x": X + 1j}, X + 1j):
+    for wrong, h in (({"t": T, "x": X + 1j}, None), (X + 1j, 0.5)):
         with pytest.raises(InputError, match="numbers are complex"):
-            as_trajectories(wrong, **({} if isinstance(wrong, dict) else {"h": 0.5}))
+            as_trajectories(wrong, h=h)
 
 
 def test_arrays_that_are_tables_or_transposed():  # fails if fields are refused, or N and n are taken for each other
