@@ -21,11 +21,12 @@ from herglotz.data.gaps import parted, without
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
-from herglotz.data.table import from_frame
+from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
 
+TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "sensor_zeros", "sensor_scales")
 
 
@@ -45,24 +46,28 @@ def as_trajectories(
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
 
-    A dict of columns is read like a DataFrame, and what each column was taken for is printed on stderr, as by `load`.
-    A list holds one recording an entry, unless its entries are numbers: that is one recording of one coordinate.
-    Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time` gives them; the
-    index of a DataFrame is a column, unless it merely counts the rows.
+    A dict of columns or a structured array is read like a DataFrame, and what each column was taken for is printed on
+    stderr, as by `load`. A list holds one recording an entry, unless its entries are numbers: that is one recording of
+    one coordinate. Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time`
+    gives them; the index of a DataFrame is a column, unless it merely counts the rows.
 
     Raises
     ------
     InputError
         If arrays come without times, or as `load` and `read_csv` do.
     """
-    names = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
+    told = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
+    names = {role: x.tolist() if _holds_names(x) else x for role, x in told.items()}
+    coordinates = names["coordinates"]
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
+    if fields := getattr(getattr(data, "dtype", None), "names", None):  # of a structured array, as genfromtxt makes
+        data = {name: data[name] for name in fields}
     if isinstance(data, Trajectories):
         wrong = "trajectories have their columns already; angles, sensor_zeros and sensor_scales alone change them"
         refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         found = data
     elif isinstance(data, (str, Path)):
-        columns = {k: v for k, v in {"time": time, **names}.items() if v not in (None, ())}
+        columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
         sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
         return _shown(_marked(load(data, like=like, show=False, **sensors, **columns), angles))
     elif hasattr(data, "columns") and h is not None:
@@ -92,6 +97,11 @@ def _is_list_of_recordings(data: Any) -> bool:
     return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
 
 
+def _holds_names(x: Any) -> bool:
+    """Whether this is an array or an index of names, as a DataFrame's columns are."""
+    return hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU"
+
+
 def _is_series(data: Any) -> bool:
     return hasattr(data, "index") and not callable(data.index)
 
@@ -110,23 +120,29 @@ def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories
     wanted = replace(wanted, known=() if like is None else like.columns)
     is_frame = hasattr(data, "columns")
     where = Path("DataFrame" if is_frame else "dict")
-    frame = data if is_frame else Table(where, {str(name): np.asarray(x) for name, x in data.items()})
+    frame = data if is_frame else Table(where, {str(name): plain(x) for name, x in data.items()})
     found = in_radians_and_seconds(from_frame(frame, wanted, where))
     return found if like is None else angles_like(found, like)
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
     called = names["coordinates"]
-    if h is None and time is None and _is_series(data):
-        time = _index(data.index)
-        called = called or (None if data.name is None else str(data.name))
-    q = data.detach().double() if isinstance(data, Tensor) else torch.from_numpy(_floats("positions", data))
-    if (h is None) == (time is None):
-        raise InputError("positions without times: give h, the time between two samples, or time, an array of times")
+    if _is_series(data) and getattr(data, "name", None) is not None:
+        called = called or str(data.name)
+    if h is None and time is None and _is_series(data) and type(data.index).__name__ != "RangeIndex":
+        time = data.index
+    q = torch.from_numpy(_floats("positions", data))
+    timeless = "positions without times: give h, the time between two samples, or time, an array of times"
+    refuse({
+        timeless: (h is None) == (time is None),
+        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, or give a "
+        "list of recordings": q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1],
+    })  # fmt: skip
     if names["group"] is not None or names["drop"]:
         raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
     n = len(q)
-    t = np.arange(n) * float(h) if h is not None else _floats("time", time)
+    clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
+    t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
     u = None if names["inputs"] is None else _floats("inputs", names["inputs"])
     missing = q.isnan().reshape(n, -1).any(1)
     known = n - int(missing.sum())
@@ -148,14 +164,9 @@ def _labels(called: Names | None) -> dict[str, Any]:
     return {"names": names, "units": units, "angles": [unit == "rad" for unit in units], "columns": columns}
 
 
-def _index(index: Any) -> np.ndarray:
-    raw = np.asarray(index)
-    return (raw - raw[:1]) / np.timedelta64(1, "s") if raw.dtype.kind == "M" else raw
-
-
 def _floats(name: str, x: Any) -> np.ndarray:
     try:
-        return np.array(x.detach().cpu() if isinstance(x, Tensor) else x, dtype=np.float64)
+        return np.array(plain(x.detach().cpu() if isinstance(x, Tensor) else x), dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"{name}: not numbers in rows of one length ({error})") from None
 

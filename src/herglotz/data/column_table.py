@@ -34,7 +34,7 @@ def column_rows(columns: Sequence[tuple[str, str, str]], labels: Labels) -> list
             if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
                 unit = f"- (an angle in rad? --angles {name})"
         elif role == "time":
-            unit = _converted(unit, labels.time_unit)
+            unit = _converted(unit, labels.time_unit) if unit else f"- (taken for {labels.time_unit})"
         rows.append((name, role, unit or "-"))
     return rows
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import re
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from herglotz.data.csv_columns import is_number
@@ -10,13 +13,23 @@ from herglotz.errors import InputError
 
 # Separators in the order in which they are tried; a comma last but one, as it may be the decimal sign of the others.
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
+EXCEL = "sep=(.|tab)?"  # a line above the header by which Excel is told the separator
+THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*|[+-]?\d{1,3}(?:,\d{3}){2,}")
 Rows = list[tuple[int, str]]  # row of the file, from 1, and its text
 
 
 def cells_of(line: str, separator: str = ",") -> list[str]:
-    """The cells of a line, without the quotes and spaces around them."""
+    """The cells of a line, without the quotes and spaces around them; a separator between quotes is part of a cell."""
     parts = line.split() if separator == " " else line.split(separator)
+    if '"' in line and separator != " ":
+        with suppress(csv.Error):  # of a cell that is too long
+            parts = next(csv.reader([line], delimiter=separator, skipinitialspace=True))
     return [cell.strip().strip('"').strip() for cell in parts]
+
+
+def header_cells(line: str, separator: str = ",") -> list[str]:
+    """The cells of a header, without commas, which stand between names where several are written."""
+    return [cell.replace(",", "") for cell in cells_of(line, separator)]
 
 
 def in_commas(
@@ -33,15 +46,29 @@ def in_commas(
     InputError
         If numbers have decimal commas in some rows and decimal points in others.
     """
-    rows, notes = _with_header([(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")])
-    separator = _separator(rows[0][1], rows[1][1]) if len(rows) > 1 else None
-    if separator in (None, ","):
-        return rows, tuple(notes)
-    notes.append(f"columns are separated by {SEPARATORS[separator]}")
-    if any("," in line for _, line in rows[1:]):
-        _check_decimals(path, rows[1:], separator)
-        notes[-1] += ", and decimals by commas"
-    return [(i, ",".join(_with_points(cells_of(line, separator)))) for i, line in rows], tuple(notes)
+    written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
+    rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
+    separator = (_separator(rows[0][1], rows[1][1]) if len(rows) > 1 else None) or ","
+    if separator != ",":
+        notes.append(f"columns are separated by {SEPARATORS[separator]}")
+    elif not any('"' in line for _, line in rows):
+        return _without_empty_ends(rows), tuple(notes)
+    table = [(i, cells_of(line, separator)) for i, line in rows]
+    if any("," in cell for _, cells in table[1:] for cell in cells):
+        _check_decimals(path, table[1:])
+        notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
+    names = ",".join(header_cells(rows[0][1], separator))
+    points = [(i, ",".join(cell.replace(",", ".") for cell in cells)) for i, cells in table[1:]]
+    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
+
+
+def _without_empty_ends(rows: Rows) -> Rows:
+    """The rows without columns at their end that hold nothing, as spreadsheets write them."""
+    if not any(line.rstrip().endswith(",") for _, line in rows):
+        return rows
+    filled = [line.rstrip(", \t").count(",") + 1 for _, line in rows]
+    width = min(rows[0][1].count(",") + 1, max(filled))
+    return [(i, ",".join(line.split(",")[: max(width, own)])) for (i, line), own in zip(rows, filled, strict=True)]
 
 
 def _with_header(written: Rows) -> tuple[Rows, list[str]]:
@@ -56,26 +83,25 @@ def _with_header(written: Rows) -> tuple[Rows, list[str]]:
 def _separator(header: str, row: str) -> str | None:
     """The first separator that gives both lines as many columns, two or more."""
     for separator in SEPARATORS:
-        count = len(cells_of(header, separator))
-        if count > 1 and count == len(cells_of(row, separator)):
+        counts = {len(cells_of(line.rstrip(f" {separator}"), separator)) for line in (header, row)}
+        same = len(cells_of(header, separator)) == len(cells_of(row, separator))  # the last cells may be missing
+        if max(counts) > 1 and (len(counts) == 1 or same):
             return separator
     return None
 
 
-def _with_points(cells: Sequence[str]) -> list[str]:
-    return [cell.replace(",", ".") for cell in cells]
-
-
 def _all_numbers(row: str, separator: str) -> bool:
-    return all(is_number(cell) for cell in _with_points(cells_of(row, separator)))
+    return all(is_number(cell.replace(",", ".")) for cell in cells_of(row, separator))
 
 
-def _check_decimals(path: Path, rows: Rows, separator: str) -> None:
-    """Raise where 1,5 and 2.5 stand in one table: one of the two signs may separate thousands."""
+def _check_decimals(path: Path, rows: Sequence[tuple[int, list[str]]]) -> None:
+    """Raise where 1,5 and 2.5 stand in one table, or 1.000,5: one of the two signs separates thousands."""
     first: dict[str, tuple[int, str]] = {}
-    for i, line in rows:
-        for cell in cells_of(line, separator):
+    for i, cells in rows:
+        for cell in cells:
             sign = "," if "," in cell else "."
+            if sign == "," and THOUSANDS.fullmatch(cell):
+                raise InputError(f"{path}, row {i}: {cell!r} has a separator of thousands; write numbers without it")
             if sign in cell and sign not in first and is_number(cell.replace(",", ".")):
                 first[sign] = i, cell
         if len(first) == 2:

@@ -14,13 +14,14 @@ import numpy as np
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
-from herglotz.data.csv_dialect import cells_of, in_commas
+from herglotz.data.csv_dialect import cells_of, header_cells, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import MISSING, SHOWN, number, number_or_none, quote
 from herglotz.data.sensors import measured
-from herglotz.data.table import from_numbers, from_table, moment
+from herglotz.data.table import from_numbers, from_table, in_dates, moment
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import InputError
+from herglotz.data.unit_row import with_units
+from herglotz.errors import InputError, refuse
 
 LONG = 100_000  # characters of a row of plain numbers
 SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs before they act, and what sensors read
@@ -42,13 +43,13 @@ def read_csv(
     which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
 
     The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
-    behind #, as `numpy.savetxt` writes it. `t`, `time`, `timestamp` or `datetime` is the time;
-    `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*` momenta; `u`, `u1`, `u_*`,
-    `force`, `F`, `torque`, `tau`, `motor` with or without a number or `_...`, and columns in N or Nm are inputs;
-    velocities and accelerations (`v`, `vx`, `velocity`, `*_dot`, `ax`, columns in m/s, rad/s², ...) and counters
-    (`index`, `frame`, `sample`, `row`, a first column without a name) are left aside; every other column is a
-    coordinate, and so is `v`, `vx`, `ax` in m, rad or deg. A column may be named with its unit. Times may be dates in
-    ISO 8601: they become seconds since the first row. Lines that start with # and blank lines are skipped, but for
+    behind #, as `numpy.savetxt` writes it, and the units in a row of their own below it. `t`, `time`, `timestamp` or
+    `datetime` is the time; `trajectory`, `trial` or `run`, if there, groups the rows; `s` is the action, `p`/`p_*`
+    momenta; `u`, `u1`, `u_*`, `force`, `F`, `torque`, `tau`, `motor` with or without a number or `_...`, and columns in
+    N or Nm are inputs; velocities and accelerations (`v`, `vx`, `velocity`, `*_dot`, `ax`, columns in m/s, rad/s², ...)
+    and counters (`index`, `frame`, `sample`, `row`, a first column without a name) are left aside; every other column
+    is a coordinate, and so is `v`, `vx`, `ax` in m, rad or deg. A column may be named with its unit. Times may be dates
+    in ISO 8601: they become seconds since the first row. Lines that start with # and blank lines are skipped, but for
     `# hold: zero` (or `first`, `smooth`), `# delay: 0.004` and `# lag: 0.02`, which say what the inputs do between
     samples and how late they act, in the file's unit of time, and `# zero: 0.02 -0.1` and `# scale: 1 0.5`, which make
     q = scale · (reading − zero) of the coordinates, one after the other (`herglotz.data.sensors`). A coordinate in rad
@@ -82,12 +83,16 @@ def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
     if not rows:
         raise InputError(f"{Path(path)}: there is no header; add a first line such as t[s],q[rad]")
     at, header = rows[0]
-    columns = assign(cells_of(header), f"{path}, row {at}", wanted)
+    cells, where = cells_of(header), f"{path}, row {at}"
+    text = len(cells) == 1 and any(mark in line for _, line in rows[1:] for mark in ",;\t")
+    refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": text})
+    if len(rows) > 1 and (named := with_units(cells, cells_of(rows[1][1]), where, wanted)):
+        cells, notes = named, (*notes, f"units stand in row {rows.pop(1)[0]}")
+    columns = assign(cells, where, wanted)
     _check_kinds(path, columns, rows[1:])
     found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]), lambda found: _held(found, lines))
     if not is_number(cells_of(rows[1][1])[columns.time]):
-        roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
-        found = replace(found, columns=tuple(roles))
+        found = in_dates(found)
     return replace(found, notes=(*notes, *found.notes))
 
 
@@ -109,7 +114,7 @@ def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
     try:
         with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
             lines = rows(file)
-            columns = assign(cells_of(next(lines)), str(path), wanted)
+            columns = assign(header_cells(next(lines)), str(path), wanted)
             table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
     except (OSError, ValueError, StopIteration, InputError):
         return None  # read row by row, the mistake has a place
@@ -196,7 +201,9 @@ def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) 
     """Raise where a column of text would be read as numbers: neither of its first two cells is one."""
     two = [cells for cells in (cells_of(line) for _, line in rows[:2]) if len(cells) == len(columns.names)]
     for i in columns.numeric if len(two) == 2 else ():
-        if any(is_number(x) or x.casefold() in MISSING or moment(x) for x in (cells[i] for cells in two)):
+        if any(is_number(x) or x.casefold() in MISSING for x in (cells[i] for cells in two)):
+            continue
+        if i == columns.time and any(moment(cells[i]) for cells in two):
             continue
         name, remedy = columns.names[i], "write numbers, or dates such as 2026-03-01 12:00:00.25"
         if i != columns.time:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ from herglotz.data.csv_columns import Wanted
 from herglotz.data.files import PathLike
 from herglotz.data.table import from_frame
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 
 INSTALL = "pip install 'herglotz[tables]'"
 COUNTER = re.compile(r"__index_level_\d+__")  # a column that pandas adds: an index without a name
@@ -69,7 +69,9 @@ def read_hdf5(path: PathLike, **columns: Any) -> Trajectories:
 
 
 def read_mat(path: PathLike, **columns: Any) -> Trajectories:
-    """Read the arrays of a MATLAB file as columns: vectors t, q, u, ... or matrices (N, n). Structs are left aside.
+    """Read the arrays of a MATLAB file as columns: vectors t, q, u, ... or matrices (N, n), in structs as well.
+
+    A struct array holds one recording an element. Text and single numbers are left aside.
 
     Raises
     ------
@@ -81,9 +83,33 @@ def read_mat(path: PathLike, **columns: Any) -> Trajectories:
             arrays = {name: array.T for name, array in _datasets(path).items()}
             return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
     scipy_io = _package("scipy.io", path)
-    stored = _opened(path, lambda: scipy_io.loadmat(str(path), struct_as_record=True))
-    arrays = {name: x for name, x in stored.items() if isinstance(x, np.ndarray) and x.dtype.kind in "fiub" and x.size}
-    return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+    stored = _opened(path, lambda: scipy_io.loadmat(str(path), simplify_cells=True))
+    sets = [Table(Path(path), _vectors(path, one)) for one in _recordings(stored)]
+    return Trajectories.cat(from_frame(one, Wanted(**columns), Path(path)) for one in sets)
+
+
+def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
+    """The elements of a struct array that is all that a file or its one struct holds; or else what it holds itself."""
+    inside = [x for name, x in stored.items() if not name.startswith("__")]
+    if len(inside) != 1:
+        return [stored]
+    if isinstance(inside[0], Mapping):
+        return _recordings(inside[0])
+    several = isinstance(inside[0], (list, np.ndarray)) and all(isinstance(x, Mapping) for x in inside[0])
+    return list(inside[0]) if several else [stored]
+
+
+def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Arrays of numbers, by the last part of their names where structs hold them."""
+    found: dict[str, np.ndarray] = {}
+    for name, x in stored.items():
+        inside = _vectors(path, x) if isinstance(x, Mapping) else {name: x}
+        twice = found.keys() & inside.keys()
+        refuse({f"{path}: two arrays are called {', '.join(twice)}; save each recording in a file of its own": twice})
+        found |= {key: x for key, x in inside.items() if np.size(x) > 1 and np.asarray(x).dtype.kind in "fiub"}
+    what = "holds no vectors of numbers; save t and q, or a struct of them (a table: writetable to csv)"
+    refuse({f"{path}: {what}": not found and "__version__" in stored})
+    return found
 
 
 def _datasets(path: PathLike) -> dict[str, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import errno
 import os
 import stat
@@ -47,17 +48,20 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
 
 
 def read_lines(path: PathLike) -> list[str]:
-    r"""Return the lines of a text file, without their ends (\n, \r\n or \r): UTF-8, or else units in Windows' letters.
+    r"""Return the lines of a text file, without their ends (\n, \r\n or \r).
+
+    It is UTF-8, UTF-16 with its mark, or else has units in Windows' letters.
 
     Raises
     ------
     InputError
-        As `read_bytes`, and if the file is neither.
+        As `read_bytes`, and if the file is none of them.
     """
     content = read_bytes(path)
     windows = all(byte < 128 or byte in UNITS for byte in set(content))
+    wide = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))  # "Unicode text" of spreadsheets
     try:
-        text = content.decode("cp1252" if windows else "utf-8-sig")  # spreadsheets put a byte-order mark first
+        text = content.decode("cp1252" if windows else "utf-16" if wide else "utf-8-sig")  # with a byte-order mark
     except UnicodeDecodeError as error:
         row = content.count(b"\n", 0, error.start) + 1
         raise InputError(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
 from torch import Tensor
 
 from herglotz.data.trajectories import Trajectories
@@ -30,6 +31,7 @@ def measured(data: Trajectories, zeros: Sequence[float] = (), scales: Sequence[f
     InputError
         If there is another number of them, one is not finite, or a scale is 0.
     """
+    zeros, scales = (np.atleast_1d(x).tolist() for x in (zeros, scales))
     if not len(zeros) and not len(scales):
         return data
     zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", zeros), ("scales", scales)))

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from datetime import datetime
+from contextlib import suppress
+from dataclasses import replace
+from datetime import datetime, time
 from pathlib import Path
 from typing import Any
 
@@ -11,11 +13,14 @@ import numpy as np
 import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
-from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign
+from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import without
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.errors import InputError
+from herglotz.data.unit_row import with_units
+from herglotz.errors import InputError, refuse
+
+CENTURIES = 1e11  # seconds, 3000 years: a time of so many counts milliseconds or less since 1970
 
 
 def from_table(
@@ -97,6 +102,11 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
     """The set whose samples are the rows of the table, (N, columns.numeric), trajectory after trajectory."""
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
+    name, last = columns.names[columns.time], float(t[-1, 0])
+    since_1970 = (
+        f"{path}: {name} of {last:.4g} without a unit is no time in s; write its unit, {name}[ms] or {name}[us]"
+    )
+    refuse({since_1970: last > CENTURIES and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
     return Trajectories.of(
         t[:, 0],
@@ -125,14 +135,79 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
         Naming column, row (counted from 0), value and remedy.
     """
     frame = _with_index(frame)
+    raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
+    heads, first = _heads(frame, raw, where, wanted)
+    columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
+    clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
+    dated = clock is not raw[columns.time] and raw[columns.time].dtype.kind != "m"
+    raw[columns.time] = clock
+    every = [_numbers(where, columns.names[i], raw[i], i in known, first) for i in columns.numeric]
+    labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
+    found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
+    return in_dates(found) if dated else found
+
+
+def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
+    """The header of a frame, and its first row of numbers: 1 behind one of units, as csv files have them."""
+    if (rows := _two_rows(list(frame.columns))) and (named := with_units(*rows, str(where), wanted)):
+        return named, 0
     heads = [str(name) for name in frame.columns]
-    columns = assign(heads, str(where), wanted)
-    raw = [np.asarray(frame[name]) for name in frame.columns]
-    known = (columns.time, *columns.u)  # columns without which no other value of the row has a meaning
-    every = [_numbers(where, columns.names[i], raw[i], i == columns.time, i in known) for i in columns.numeric]
-    numbers = np.stack(every, 1)
-    labels = [""] * len(numbers) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
-    return from_table(where, columns, range(len(numbers)), labels, numbers)
+    below = [_text(column[0]) for column in raw if column.ndim == 1 and len(column)]
+    named = with_units(heads, below, str(where), wanted)
+    return (heads, 0) if named is None else (named, 1)
+
+
+def _two_rows(names: Sequence[Any]) -> tuple[list[str], list[str]] | None:
+    """Names and units of a header of two rows, which pandas has as pairs; None of any other."""
+    if not all(isinstance(name, tuple) and len(name) == 2 for name in names):
+        return None
+    units = [str(unit) for _, unit in names]
+    return [str(name) for name, _ in names], ["" if x.startswith("Unnamed: ") else x for x in units]
+
+
+def _text(x: Any) -> str:
+    """A cell of a table as a csv file has it: a number, whatever its digits, is 0 here, and a missing one is blank."""
+    return x if isinstance(x, str) else "" if x is None or x != x else "0"
+
+
+def in_dates(found: Trajectories) -> Trajectories:
+    """The same; the table of columns tells that times are dates."""
+    roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
+    return replace(found, columns=tuple(roles))
+
+
+def plain(x: Any, what: str = "numbers") -> np.ndarray:
+    """Values as an array, those that are masked as NaN; messages call them `what`.
+
+    Raises
+    ------
+    InputError
+        If they are complex.
+    """
+    array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
+    refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
+    return array
+
+
+def seconds(column: np.ndarray) -> np.ndarray:
+    """Times in seconds, since the first one where they are dates; the column itself where it holds neither.
+
+    Raises
+    ------
+    InputError
+        If some dates have a time zone and others have none.
+    """
+    if column.dtype.kind in "OU" and len(column) and all(isinstance(x, str) for x in column):
+        dates = [None if is_number(x) else moment(x) for x in column]
+        column = column if None in dates else np.array(dates, dtype=object)
+    if column.dtype.kind == "O" and len(column) and isinstance(column[0], datetime):
+        try:
+            return np.array([(x - column[0]).total_seconds() for x in column])
+        except (TypeError, AttributeError):
+            raise InputError("times are not all dates, or not all with a time zone; write them alike") from None
+    if column.dtype.kind in "Mm":
+        return (column - column[:1] if column.dtype.kind == "M" else column) / np.timedelta64(1, "s")
+    return column
 
 
 def _with_index(frame: Any) -> Any:
@@ -142,16 +217,16 @@ def _with_index(frame: Any) -> Any:
         return frame
     if any(name is not None for name in index.names):
         return frame.reset_index()
-    is_clock = np.asarray(index).dtype.kind in "Mf" and not {"t", "time"} & set(map(str, frame.columns))
+    is_clock = index.dtype.kind in "Mmf" and not {"t", "time"} & set(map(str, frame.columns))
     return frame.rename_axis("time").reset_index() if is_clock else frame
 
 
 def moment(text: str) -> datetime | None:
-    """A date with time in ISO 8601, such as 2026-03-01 12:00:00.25; None for other text."""
-    try:
-        return datetime.fromisoformat(text.strip())
-    except ValueError:
-        return None
+    """A date with time in ISO 8601, such as 2026-03-01 12:00:00.25, or 12:00:00.25 of one day; None for other text."""
+    for read in (datetime.fromisoformat, lambda x: datetime.combine(datetime.min, time.fromisoformat(x))):
+        with suppress(ValueError):
+            return read(text.strip())
+    return None
 
 
 def _called(columns: Columns) -> tuple[str, str]:
@@ -159,17 +234,19 @@ def _called(columns: Columns) -> tuple[str, str]:
     return label, columns.names[columns.time]
 
 
-def _numbers(where: Path, name: str, column: np.ndarray, is_time: bool, known: bool) -> np.ndarray:
-    """A column as float64, finite or, unless it must be known, NaN; dates become seconds since the first of them."""
-    if is_time and column.dtype.kind == "M":
-        return (column - column[:1]) / np.timedelta64(1, "s")
+def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int) -> np.ndarray:
+    """A column, whose rows count from `first`, as float64: finite or, unless it must be known, NaN."""
     try:
         found = column.astype(np.float64)
     except (TypeError, ValueError) as error:
-        raise InputError(f"{where}, column {quote(name)}: {error}; convert it to numbers, or drop it") from None
+        row = next((k for k, x in enumerate(column, first) if isinstance(x, str) and not is_number(x)), first)
+        raise InputError(
+            f"{where}, row {row}, column {quote(name)}: {error}; convert it to numbers, or drop it"
+        ) from None
     if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
         raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
     bad = np.nonzero(~np.isfinite(found) if known else np.isinf(found))[0]
     if len(bad):
-        raise InputError(f"{where}, row {bad[0]}, column {quote(name)}: {found[bad[0]]} is not finite; drop that row")
+        at, value = bad[0] + first, found[bad[0]]
+        raise InputError(f"{where}, row {at}, column {quote(name)}: {value} is not finite; drop that row")
     return found

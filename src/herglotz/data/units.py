@@ -11,11 +11,14 @@ from torch import Tensor
 from herglotz.data.trajectories import DEGREES, Trajectories
 
 # How many of each unit of time make a second.
-PER_SECOND = {"ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9, "min": 1 / 60}
+PER_SECOND = {
+    "ms": 1e3, "us": 1e6, "µs": 1e6, "μs": 1e6, "ns": 1e9, "min": 1 / 60, "h": 1 / 3600,
+    "sec": 1.0, "seconds": 1.0, "msec": 1e3, "usec": 1e6,
+}  # fmt: skip
 
 
 def in_radians_and_seconds(data: Trajectories) -> Trajectories:
-    """Return the set with coordinates in degrees as angles in rad, and a time in ms, µs, ns or min in s."""
+    """Return the set with coordinates in degrees as angles in rad, and a time in ms, µs, ns, min or h in s."""
     degrees = [unit in DEGREES for unit in data.units]
     if any(degrees):
         factor = data.q.new_tensor([math.pi / 180 if turned else 1.0 for turned in degrees])

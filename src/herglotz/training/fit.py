@@ -107,7 +107,7 @@ def fit(
         if checkpoint is not None and is_first():  # only its process holds the lock
             remove_leftovers(checkpoint.parent, (checkpoint.name, *FILES, MANIFEST, LOG))
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
-        run = replace(run, reading=reading_told(reading))
+        run = replace(run, reading=reading_told(reading, data.names))
         if log is not None:
             log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, TypedDict, get_type_hints
+
+import numpy as np
 
 from herglotz.errors import refuse
 from herglotz.schema import check_entries, matches
@@ -41,7 +43,14 @@ def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
     return reading
 
 
-def reading_told(options: Mapping[str, Any]) -> dict[str, Any]:
-    """The options of `as_trajectories` that a file could be read with: names and numbers, no arrays."""
-    plain = {name: list(x) if isinstance(x, tuple) else x for name, x in options.items()}
+def reading_told(options: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """The options of `as_trajectories` that a file could be read with: names and numbers, no arrays of times.
+
+    `names` are the coordinates that were read: those that `angles=True` means.
+    """
+    plain = {name: list(x) if np.ndim(x) == 1 else x for name, x in options.items()}
+    if isinstance(angles := plain.get("angles"), bool):
+        plain["angles"] = list(names) if angles else []
+    for sensor in {"sensor_zeros", "sensor_scales"} & plain.keys():
+        plain[sensor] = [float(x) for x in np.atleast_1d(plain[sensor])]
     return {name: plain[name] for name, hint in get_type_hints(Reading).items() if matches(plain.get(name), hint)}

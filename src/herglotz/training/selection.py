@@ -21,6 +21,7 @@ from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
+from herglotz.training.reading import reading_told
 from herglotz.training.run import Run
 from herglotz.training.stages import Progress
 from herglotz.training.structure import structure_is_free, terms_are_free
@@ -171,6 +172,7 @@ def select(
             folder.mkdir(parents=True, exist_ok=True)
         settings = replace(config, level=level, seed=seed)
         run = fit(data, settings, out=folder, progress=progress, resume=resume)
+        run = replace(run, reading=reading_told(reading, data.names))
         told(run)
         return run
 

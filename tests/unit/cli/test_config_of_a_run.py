@@ -4,13 +4,14 @@ import json
 import re
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from herglotz.cli import main
 from herglotz.data import load, save, simulate
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, fit, load_run, save_run
+from herglotz.training import FitConfig, fit, load_run, save_run, select
 
 
 @pytest.fixture(scope="module")
@@ -97,6 +98,29 @@ def test_python_remembers_how_data_were_read(driven, tmp_path):
     assert load_run(tmp_path / "run").reading == run.reading
     x = load(file, time="clock", coordinates="x", inputs=(), show=False)
     assert fit(x.q[:, 0].numpy(), time=x.t.numpy(), iterations=5).reading == {}
+
+
+@pytest.mark.parametrize(("told", "named"), [(True, ["x"]), (False, []), ("x", "x"), (("x",), ["x"])])
+def test_angles_and_sensors_are_remembered(driven, tmp_path, told, named):
+    # fails if --config reads an angle as a length because Python said angles=True, or an array of zeros is forgotten
+    sensors = {"sensor_zeros": np.array([0.25]), "sensor_scales": 2}
+    columns = {"time": "clock", "coordinates": np.array(["x"]), "inputs": "drive"}
+    run = fit(driven / "driven.csv", angles=told, iterations=5, objective="residual", **columns, **sensors)
+    assert run.reading == {"angles": named, "time": "clock", "coordinates": ["x"], "inputs": "drive",
+                           "sensor_zeros": [0.25], "sensor_scales": [2.0]}  # fmt: skip
+    save_run(run, tmp_path / "run")
+    words = ["fit", str(driven / "driven.csv"), "--out", str(tmp_path / "again"), "--no-plots"]
+    assert main([*words, "--config", str(tmp_path / "run")]) in (0, 3)
+    again = load_run(tmp_path / "again")
+    assert again.data.digest() == run.data.digest()
+    assert again.data.angles == run.data.angles == (bool(named),)
+
+
+def test_a_selected_run_remembers_too(driven):  # fails if hz.select forgets how its data were read
+    told = {"time": "clock", "coordinates": "x", "inputs": (), "drop": "ticks", "angles": True}
+    few = FitConfig(iterations=5, objective="residual")
+    found = select(driven / "driven.csv", ["conservative"], 1, few, progress=False, **told)
+    assert found.run.reading == {**told, "inputs": [], "angles": ["x"]}
 
 
 def test_a_driven_run_without_inputs_says_so(driven, capsys):

@@ -38,6 +38,14 @@ def test_one_array(tmp_path):  # fails if times, names, angles or inputs of an a
     assert as_trajectories(str(tmp_path / "a.npz")).digest() == one.digest()
 
 
+def test_no_inputs_means_none(tmp_path):  # fails if inputs=() of a file is forgotten, and forces are fitted unasked
+    (tmp_path / "a.csv").write_text("t,x,force\n" + "".join(f"{t},{x},{y}\n" for t, (x, y) in zip(T, Q, strict=True)))
+    assert as_trajectories(tmp_path / "a.csv").u is not None
+    for data in (tmp_path / "a.csv", {"t": T, "x": Q[:, 0], "force": Q[:, 1]}):
+        assert as_trajectories(data, inputs=()).u is None
+        assert as_trajectories(data, coordinates=np.array(["x"]), inputs=np.array(["force"])).names == ("x",)
+
+
 def test_angles_are_continuous():  # fails if an array's angle keeps a jump of 2π, which would read as a motion
     assert as_trajectories([3.0, -3.0, -2.9], h=1, angles=True).q[1:, 0].tolist() == pytest.approx(
         [3.2832, 3.3832], 1e-4
@@ -99,7 +107,7 @@ def test_mistakes(data, options, message):  # fails if a mistake is a traceback,
 def test_what_a_frame_is_taken_for_is_printed(capsys):  # fails if the columns of a DataFrame are guessed silently
     as_trajectories(Frame({"t": T, "load": Q[:, 0], "F": Q[:, 1]}))
     lines = [line.split() for line in capsys.readouterr().err.splitlines()]
-    assert lines[2:] == [["t", "time", "s"], ["load", "coordinate", "-"], ["F", "input", "-"]]
+    assert lines[2:] == [["t", "time", "-", "(taken", "for", "s)"], ["load", "coordinate", "-"], ["F", "input", "-"]]
 
 
 @pytest.mark.parametrize("kind", ["frame", "dict", "path"])
@@ -110,7 +118,7 @@ def test_the_table_tells_of_the_angles_that_are_named(capsys, tmp_path, kind):
     path.write_text("t,theta,x\n" + "".join(f"{t},{a},{b}\n" for t, (a, b) in zip(T, Q, strict=True)))
     as_trajectories({"frame": Frame(columns), "dict": columns, "path": path}[kind], angles="theta")
     lines = [line.split() for line in capsys.readouterr().err.splitlines()]
-    assert lines[2:] == [["t", "time", "s"], ["theta", "angle", "rad"], ["x", "coordinate", "-"]]
+    assert lines[2:] == [["t", "time", "-", "(taken", "for", "s)"], ["theta", "angle", "rad"], ["x", "coordinate", "-"]]
 
 
 @pytest.mark.parametrize("name", ["t", None])

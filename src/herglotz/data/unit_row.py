@@ -1,0 +1,39 @@
+"""A row of units below the header, as measuring programs write it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from herglotz.data.csv_columns import Wanted, assign, is_number, name_and_unit
+from herglotz.data.units import PER_SECOND
+from herglotz.errors import refuse
+
+
+def with_units(
+    cells: Sequence[str],  # of the header
+    below: Sequence[str],  # the cells of the next row
+    where: str,  # begins messages: file and row
+    wanted: Wanted,
+) -> list[str] | None:
+    """Header cells `name[unit]` with the units of the row below; None where that row holds none.
+
+    It holds units where no cell is a number, and the time is in a unit of time: no sample has that.
+
+    Raises
+    ------
+    InputError
+        If a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
+    """
+    units = [cell.strip("[]()<> ").removesuffix("-") for cell in below]
+    if (
+        len(units) != len(cells)
+        or any(is_number(unit) and unit != "1" for unit in units)
+        or not {"s", *PER_SECOND}.intersection(units)
+    ):
+        return None
+    named = [(cell, unit, (name_and_unit(cell) or ("", ""))[1]) for cell, unit in zip(cells, units, strict=True)]
+    both = [f"{cell!r} and below it {unit!r}" for cell, unit, own in named if own and unit not in ("", own)]
+    refuse({f"{where}: two units of one column, {both and both[0]}; keep one of them": both})
+    found = [f"{cell}[{unit}]" if unit and not own else cell for cell, unit, own in named]
+    clock = assign(found, where, wanted).time
+    return found if units[clock] in ("s", *PER_SECOND) else None

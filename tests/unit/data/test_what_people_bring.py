@@ -1,0 +1,243 @@
+"""Tables of measuring programs, spreadsheets, pandas and MATLAB: read right, or refused with what to do."""
+
+import importlib.util
+from datetime import UTC, datetime, timedelta
+
+import numpy as np
+import pytest
+
+from herglotz.data import as_trajectories, load
+from herglotz.errors import InputError
+
+T = np.arange(6) * 0.5
+X = np.array([1.25, -0.5, 3e-3, 4.0, -5.125, 6.0])
+
+
+def written(tmp_path, text, encoding="utf-8"):
+    (tmp_path / "a.csv").write_bytes(text.encode(encoding))
+    return tmp_path / "a.csv"
+
+
+def rows(separator=",", *more):
+    return "".join(separator.join(map(str, (t, x, *more))) + "\n" for t, x in zip(T, X, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("header", "units", "rate"),
+    [
+        ("t,theta,omega", "s,rad,rad/s", "rad/s"),
+        ("t,theta,omega", "[s],[rad],[rad/s]", "rad/s"),
+        ("t,theta,load", "(s),(rad),-", ""),
+        ("t,theta[rad],load", "s,rad,1", "1"),
+    ],
+)
+def test_units_in_a_row_of_their_own(tmp_path, header, units, rate):
+    # fails if units below the header are refused, lost, or a column does not get the role of its unit
+    data = load(written(tmp_path, f"{header}\n{units}\n{rows(',', 7)}"), unwrap=False)
+    assert data.names[0] == "theta"
+    assert (data.units[0], data.angles[0], data.time_unit) == ("rad", True, "s")
+    assert (data.t.tolist(), data.q[:, 0].tolist()) == (T.tolist(), X.tolist())
+    role = "left aside" if rate == "rad/s" else "coordinate"
+    assert data.columns[2] == (header.split(",")[2], role, rate)
+    assert "  units stand in row 2" in data.table().splitlines()
+
+
+def test_units_below_are_converted(tmp_path):  # fails if ms and degrees of such a row stay, or of another separator
+    data = load(written(tmp_path, f"t;phi;F\n[ms];[°];[N]\n{rows(';', 2)}"), unwrap=False)
+    assert data.t.tolist() == (T / 1000).tolist()
+    assert data.q[:, 0].tolist() == pytest.approx(np.radians(X), rel=1e-15)
+    assert data.input_labels == (("F", "N"),)
+    assert data.columns[0] == ("t", "time", "ms")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t[s],x[m]\ns,mm\n", r"row 1: two units of one column, 'x\[m\]' and below it 'mm'"),
+        ("t,x\ns,5\n", "row 2, column 't': 's' is not a number"),
+        ("t,x\nfoo,bar\n", "row 2, column 't': 'foo' is not a number"),
+        ("t,x\nm,s\n", "row 2, column 't': 'm' is not a number"),
+        ("t,x\n,m\n", "row 2, column 't': a blank cell is not a number"),
+    ],
+)
+def test_a_row_that_is_no_row_of_units(tmp_path, text, message):
+    # fails if a damaged row is swallowed as units, or two units of one column are one by chance
+    with pytest.raises(InputError, match=message):
+        load(written(tmp_path, text + rows()))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "t,x,,\n" + rows(",", "", ""),
+        "t,x\n" + rows(",", "", ""),
+        "t,x,,\n" + rows(),
+        "t;x;;\n" + rows(";", "", ""),
+        't;x\n"0";"1,25"\n' + rows(";")[len("0.0;1.25\n") :].replace(".", ","),
+        't,x\n"0","1,25"\n' + "".join(f'"{t}","{x}"\n'.replace(".", ",") for t, x in zip(T[1:], X[1:], strict=True)),
+        "sep=;\nt;x\n" + rows(";").replace(".", ","),
+    ],
+)
+def test_what_spreadsheets_write(tmp_path, text):
+    # fails if empty columns at the end, quoted decimal commas, or Excel's own first line are refused or misread
+    data = load(written(tmp_path, text.replace("\n", "\r\n")))
+    assert (data.names, data.t.tolist(), data.q[:, 0].tolist()) == (("x",), T.tolist(), X.tolist())
+
+
+def test_a_last_column_without_a_name_is_not_lost(tmp_path):  # fails if numbers without a header are left out unsaid
+    with pytest.raises(InputError, match="column 3: '' is not a header cell"):
+        load(written(tmp_path, "t,x,\n" + rows(",", 5)))
+    with pytest.raises(InputError, match="row 2: 3 cells where the header has 2"):
+        load(written(tmp_path, "t,x\n" + rows(",", 5)))
+    with pytest.raises(InputError, match="row 3: 3 cells where the header has 2"):
+        load(written(tmp_path, "t,x\n0,1,\n1,2,9\n2,3,\n"))
+    gap = load(written(tmp_path, "t,x\n" + rows() + "3.5,\n4,1\n"))  # the last cell is empty, and its column is not
+    assert gap.samples == 7
+
+
+def test_unicode_text(tmp_path):  # fails if what spreadsheets call so, UTF-16 with tabs, is refused
+    data = load(written(tmp_path, "t\tx\n" + rows("\t"), "utf-16"))
+    assert data.q[:, 0].tolist() == X.tolist()
+    (tmp_path / "a.csv").write_bytes(b"\xff\xfe\x00\xd8")
+    with pytest.raises(InputError, match="not UTF-8 text"):
+        load(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('t,x\n0,"5,000.5"\n1,"6,000.5"\n2,"7,0.5"\n', r"row 2: '5,000.5' has a separator of thousands"),
+        ("t;x\n0;1.250,5\n1;2,5\n2;3\n", r"row 2: '1.250,5' has a separator of thousands; write numbers without it"),
+        ("t;x\n0;1,234,567\n1;2,5\n2;3\n", "row 2: '1,234,567' has a separator of thousands"),
+        ("Device 7\n2026\nt,x\n0,1\n1,2\n2,3\n", "'Device 7' is no header; delete the lines above the table"),
+        ("timestamp,x\n1700000000000,1\n1700000000050,2\n1700000000100,3\n", r"write its unit, timestamp\[ms\]"),
+        ("date,time,x\n2026-03-01,12:00:00,1\n2026-03-01,12:00:01,2\n", "leave the column out with --drop date"),
+    ],
+)
+def test_mistakes_say_what_to_do(tmp_path, text, message):
+    # fails if thousands become decimals, a title is taken for the header, or milliseconds since 1970 for seconds
+    with pytest.raises(InputError, match=message):
+        load(written(tmp_path, text))
+
+
+def test_a_comma_in_a_quoted_name(tmp_path):  # fails if one name becomes two columns, fast or row by row
+    for first in ("0,1", '"0",1'):
+        data = load(written(tmp_path, f't,"x, left [m]"\n{first}\n1,2\n2,3\n'))
+        assert (data.names, data.units) == (("x left",), ("m",))
+
+
+@pytest.mark.parametrize("unit", ["sec", "seconds"])
+def test_other_words_for_seconds(tmp_path, unit):  # fails if a second is another unit than s, and no run fits it
+    data = load(written(tmp_path, f"t[{unit}],x\n{rows()}"))
+    assert (data.time_unit, data.t.tolist()) == ("s", T.tolist())
+    assert load(written(tmp_path, f"t[msec],x\n{rows()}")).t.tolist() == (T / 1000).tolist()
+    assert load(written(tmp_path, f"t[h],x\n{rows()}")).t.tolist() == pytest.approx((T * 3600).tolist(), rel=1e-15)
+
+
+def test_a_unit_that_nobody_wrote_is_said_to_be_taken(tmp_path, capsys):
+    # fails if the table shows s where the header says nothing: the times may be milliseconds
+    load(written(tmp_path, f"t,x\n{rows()}"))
+    assert "t       time          - (taken for s)" in capsys.readouterr().err
+
+
+START = datetime(2026, 3, 1, 12, tzinfo=UTC)
+CLOCKS = {
+    "dates": np.array([START + timedelta(seconds=t) for t in T]),
+    "naive dates": np.datetime64("2026-03-01T12:00") + (T * 1000).astype("timedelta64[ms]"),
+    "durations": (T * 1000).astype("timedelta64[ms]"),
+    "texts": np.array([f"2026-03-01 12:00:0{t}" for t in T], dtype=object),
+    "time of day": np.array([f"12:00:0{t}00" for t in T]),
+}
+
+
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_clocks(kind, tmp_path, capsys):  # fails if nanoseconds are taken for seconds, or dates with a zone refused
+    clock = CLOCKS[kind]
+    assert as_trajectories({"t": clock, "x": X}).t.tolist() == T.tolist()
+    unit = "- (taken for s)" if kind == "durations" else "date, converted to s"
+    assert f"t       time          {unit}" in capsys.readouterr().err
+    assert as_trajectories(X, time=clock).t.tolist() == T.tolist()
+    if kind != "durations":
+        text = "".join(f"{t},{x}\n" for t, x in zip(map(str, clock), X, strict=True))
+        assert load(written(tmp_path, "time,x\n" + text)).t.tolist() == T.tolist()
+
+
+def test_dates_of_which_some_have_a_zone():  # fails if their difference, which is not known, is a traceback
+    clock = [START + timedelta(seconds=1), *(START.replace(tzinfo=None) + timedelta(seconds=t) for t in (2, 3, 4))]
+    with pytest.raises(InputError, match="not all with a time zone"):
+        as_trajectories({"t": np.array(clock), "x": X[:4]})
+
+
+def test_a_missing_date_has_its_row():  # fails if NaT reads as a time that does not increase
+    clock = CLOCKS["naive dates"].copy()
+    clock[2] = np.datetime64("NaT")
+    with pytest.raises(InputError, match="row 2, column 't': nan is not finite"):
+        as_trajectories({"t": clock, "x": X})
+
+
+def test_masked_and_complex_numbers():  # fails if what numpy hides or drops becomes data
+    mask = np.ma.masked_array(X, X > 5)
+    for data in (as_trajectories(mask, h=0.5), as_trajectories({"t": T, "x": mask})):
+        assert data.q[:, 0].tolist() == X[:5].tolist()
+    for wrong, h in (({"t": T, "x": X + 1j}, None), (X + 1j, 0.5)):
+        with pytest.raises(InputError, match="numbers are complex"):
+            as_trajectories(wrong, h=h)
+
+
+def test_arrays_that_are_tables_or_transposed():  # fails if fields are refused, or N and n are taken for each other
+    table = np.zeros(6, dtype=[("t", float), ("x", float)])
+    table["t"], table["x"] = T, X
+    assert as_trajectories(table).q[:, 0].tolist() == X.tolist()
+    with pytest.raises(InputError, match=r"shape \(1, 6\): few samples of many coordinates; transpose them"):
+        as_trajectories(X[None], h=0.5)
+
+
+def test_a_text_among_numbers_has_its_row():  # fails if a column of a table is refused without the place
+    with pytest.raises(InputError, match="row 3, column 'x': could not convert string to float: 'broken'"):
+        as_trajectories({"t": T, "x": np.array([*map(str, X[:3]), "broken", "4", "5"], dtype=object)})
+
+
+def test_frames():  # fails if pandas' headers of two rows, unit rows, zones or series without times are misread
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t": T, "x": X})
+    two = frame.set_axis(pandas.MultiIndex.from_tuples([("t", "ms"), ("x", "Unnamed: 1_level_1")]), axis=1)
+    assert as_trajectories(two).t.tolist() == (T / 1000).tolist()
+    text = pandas.concat([pandas.DataFrame({"t": ["ms"], "x": ["m"]}), frame.astype(str)])
+    data = as_trajectories(text)
+    assert (data.t.tolist(), data.units) == ((T / 1000).tolist(), ("m",))
+    zone = pandas.date_range("2026-03-01", periods=6, freq="500ms", tz="Europe/Berlin")
+    for index in (zone, pandas.to_timedelta(T, unit="s")):
+        assert as_trajectories(pandas.DataFrame({"x": X}, index=index)).t.tolist() == T.tolist()
+        assert as_trajectories(pandas.Series(X, index=index)).t.tolist() == T.tolist()
+    with pytest.raises(InputError, match="positions without times"):
+        as_trajectories(pandas.Series(X))
+    assert as_trajectories(pandas.Series(X, name="x[m]"), h=0.5).units == ("m",)
+    with pytest.raises(InputError, match="'x' comes twice"):
+        as_trajectories(pandas.concat([frame, frame[["x"]]], axis=1))
+
+
+@pytest.mark.skipif(importlib.util.find_spec("scipy") is None, reason="scipy is an extra")
+def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or several recordings become one
+    from scipy.io import savemat  # pyright: ignore[reportMissingImports]
+
+    path, one = tmp_path / "a.mat", {"t": T, "x": X, "fs": 2.0, "name": "first"}
+    several = np.zeros(2, dtype=[("t", object), ("x", object)])
+    for k in range(2):
+        several[k] = T, X
+    for stored, lengths in (
+        ({"data": one}, (6,)),
+        ({"log": {"t": T, "signals": {"values": X, "label": "x"}}}, (6,)),
+        ({"runs": several}, (6, 6)),
+        ({"exp": {"runs": several}}, (6, 6)),
+        (one, (6,)),
+    ):
+        savemat(path, stored)
+        data = load(path)
+        assert (data.lengths, data.q[:6, 0].tolist()) == (lengths, X.tolist())
+    for wrong, message in (
+        ({"a": "text"}, "holds no vectors of numbers; save t and q"),
+        ({"a": {"t": T, "x": X}, "b": {"t": T, "x": X}}, "two arrays are called"),
+    ):
+        savemat(path, wrong)
+        with pytest.raises(InputError, match=message):
+            load(path)
