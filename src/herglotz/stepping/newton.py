@@ -11,8 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials
-from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solve
-from herglotz.mechanics.newton_one import newton_one, newton_step, norm
+from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
@@ -96,7 +95,7 @@ def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations:
     x = guess - equation.q0 if equation.increments else guess
     rules = Rules(tol, max_iterations, keep=order == 1)
     if x.shape[:-1].numel() == 1:
-        return newton_one(equation, x, rules, sizes.numbers)
+        return newton(equation, x, rules, sizes.numbers, alone=True)
     found = newton(equation, x, rules, sizes.tensors)
     return found._replace(point=equation(found.x, order == 2)) if found.mixed else found
 
@@ -120,7 +119,7 @@ class _Sizes:
         """The same of one sample."""
         size = norm(x.flatten().tolist())
         if self.equation.increments:
-            other = newton_step(point.J, self.equation.push(point))[1] + size
+            other = newton_step(point.J, self.equation.push(point))[2] + size
         else:
             other = norm(self.equation.q0.flatten().tolist())
         limits = torch.finfo(x.dtype)
