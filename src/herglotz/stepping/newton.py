@@ -57,14 +57,9 @@ def solve_step(
     A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples do not
     influence one another: each has its own Jacobian, its own step length and its own status.
 
-    Parameters
-    ----------
-    order
-        Derivatives of L_d in the result. With 1, an iteration that starts close to the solution keeps its Jacobian
-        and costs first derivatives only; the answer is the same to `tol`.
-    increments
-        Take Δ = q1 − q0 for the unknown, for an L_d with `partials_increment`: no cancellation at small h.
-        Convergence is then relative to the size of Δ.
+    With `order` 1, an iteration that starts close to the solution keeps its Jacobian and costs first derivatives only;
+    the answer is the same to `tol`. With `increments` Δ = q1 − q0 is the unknown, for an L_d with
+    `partials_increment`: nothing cancels at small h, and convergence is relative to the size of Δ.
 
     Raises
     ------

@@ -56,11 +56,7 @@ from herglotz.theory.hamilton_jacobi import (
 from herglotz.theory.hamiltonian import (
     LeftHamiltonian as LeftHamiltonian,
     RightHamiltonian as RightHamiltonian,
-    left_hamiltonian as left_hamiltonian,
-    left_hamiltonian_on_flow as left_hamiltonian_on_flow,
-    right_hamiltonian as right_hamiltonian,
     right_hamiltonian_on_flow as right_hamiltonian_on_flow,
-    solve_right_position as solve_right_position,
 )
 from herglotz.theory.hj_on_q import (
     energy_on_section as energy_on_section,
