@@ -4,9 +4,7 @@ from herglotz.scenes.cart_pole import cart_pole as cart_pole
 from herglotz.scenes.chain import chain as chain
 from herglotz.scenes.double_pendulum import double_pendulum as double_pendulum
 from herglotz.scenes.driven import DrivenRule as DrivenRule, driven_scene as driven_scene
-from herglotz.scenes.driven_duffing import driven_duffing as driven_duffing
-from herglotz.scenes.driven_pendulum import driven_pendulum as driven_pendulum
-from herglotz.scenes.duffing import duffing as duffing
+from herglotz.scenes.duffing import driven_duffing as driven_duffing, duffing as duffing
 from herglotz.scenes.exact import (
     NumericallyExact as NumericallyExact,
     Reason as Reason,
@@ -23,10 +21,13 @@ from herglotz.scenes.motion import (
 )
 from herglotz.scenes.nonlinear_action import nonlinear_action as nonlinear_action
 from herglotz.scenes.oscillator import ExactOscillator as ExactOscillator, damped_oscillator as damped_oscillator
-from herglotz.scenes.parachute import ExactParachute as ExactParachute, parachute as parachute
-from herglotz.scenes.pendulum import damped_pendulum as damped_pendulum
+from herglotz.scenes.parachute import (
+    ExactParachute as ExactParachute,
+    parachute as parachute,
+    quadratic_drag as quadratic_drag,
+)
+from herglotz.scenes.pendulum import damped_pendulum as damped_pendulum, driven_pendulum as driven_pendulum
 from herglotz.scenes.printed_parachute import PrintedParachute as PrintedParachute
-from herglotz.scenes.quadratic_drag import quadratic_drag as quadratic_drag
 from herglotz.scenes.reference import (
     ReferenceSolution as ReferenceSolution,
     path_action as path_action,
