@@ -21,8 +21,7 @@ from typing import Any
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks import harness, machine_sets
-from benchmarks import measured_sets as sets
+from benchmarks import harness, machine_sets, measured_sets as sets
 from herglotz.plots import style
 
 COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept

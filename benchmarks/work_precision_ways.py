@@ -22,8 +22,7 @@ from herglotz.export import compile_c
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, fit
-from herglotz.tune.cost import Timed as Timing
-from herglotz.tune.cost import measure_costs, timed_stepping
+from herglotz.tune.cost import Timed as Timing, measure_costs, timed_stepping
 from herglotz.tune.distil import distil, pairs_of, widened
 from herglotz.tune.kick_composition import can_kick, fit_kicks
 from herglotz.tune.kick_composition_c import CompiledKicks

@@ -17,7 +17,7 @@ MUTANTS = [
     ("mechanics/contact.py", "torch.cat([-p, torch.zeros_like(p)", "torch.cat([p, torch.zeros_like(p)"),
     ("mechanics/partials.py", "D12=by_q1[..., :n, :]", "D12=by_q1[..., :n, :].mT"),
     ("theory/hamiltonian.py", "return (p1 * q1).sum(-1) - L", "return (p1 * q1).sum(-1) + L"),
-    ("theory/hamiltonian.py", "return -(p0 * q0).sum(-1) - L", "return (p0 * q0).sum(-1) - L"),
+    ("theory/hamiltonian.py", "return self.mirror(q1, -p0, s1, h)", "return self.mirror(q1, p0, s1, h)"),
     ("theory/hamiltonian.py", "D11=B @ P.D12.mT - P.D11", "D11=B @ P.D12.mT + P.D11"),
     ("theory/left.py", "(b3 + P.D33[..., None] * b)", "b3"),
     ("theory/hamilton_equations.py", "-P.D2 / (1 + P.D3)[..., None]", "-P.D2 / (1 - P.D3)[..., None]"),

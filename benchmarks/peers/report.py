@@ -9,8 +9,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from benchmarks.harness import picture, spread
-from benchmarks.harness import table as lines_of
+from benchmarks.harness import picture, spread, table as lines_of
 from herglotz.plots.style import INK, MODEL, MUTED, UNSEEN, new_figure, styled
 
 from . import PEERS

@@ -7,20 +7,15 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from herglotz.export.equation import dense
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Status
 
 
-class Box(nn.Module):
+class Box:
     """Where the model was fitted; angles count modulo 2π. `h_range` is (low, high), or None for any step."""
-
-    low: Tensor  # (2n + 1)
-    high: Tensor
-    turn: Tensor  # 2π for an angle, else 0
-    inverse: Tensor  # 1/2π for an angle, else 0
 
     def __init__(
         self,
@@ -30,20 +25,17 @@ class Box(nn.Module):
         h_range: Sequence[float] | None = None,
         by_s: bool = True,  # whether s counts: it grows without bound, and matters only where the motion depends on it
     ):
-        super().__init__()
         self.by_s = by_s
+        names = "qps" if by_s else "qp"
         low, high = (
-            torch.tensor(
-                [x for name in "qps" if by_s or name != "s" for x in box[f"{name}_{end}"]], dtype=torch.float64
-            )
+            torch.tensor([x for name in names for x in box[f"{name}_{end}"]], dtype=torch.float64)
             for end in ("low", "high")
         )
         turn = torch.zeros_like(low)
         turn[: len(angles)] = torch.tensor([2 * math.pi * bool(a) for a in angles], dtype=torch.float64)
-        inverse = torch.where(turn > 0, 1 / turn, 0.0)
-        for name, x in (("low", low), ("high", high), ("turn", turn), ("inverse", inverse)):
-            self.register_buffer(name, x.to(dtype))
-        self.register_buffer("span", None if h_range is None else torch.tensor(h_range, dtype=dtype))
+        inverse = torch.where(turn > 0, 1 / turn, 0.0)  # 1/2π for an angle, else 0
+        self.low, self.high, self.turn, self.inverse = (x.to(dtype) for x in (low, high, turn, inverse))
+        self.span = None if h_range is None else torch.tensor(h_range, dtype=dtype)
 
     @classmethod
     def of(
@@ -54,7 +46,7 @@ class Box(nn.Module):
             return None
         return cls(box, model.config.angles, next(model.parameters()).dtype, h_range, model.s_enters_motion)
 
-    def forward(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    def __call__(self, q: Tensor, p: Tensor, s: Tensor) -> Tensor:
         """(...) True where a state lies outside, or is not a number."""
         x = torch.cat([q, p, s[..., None]] if self.by_s else [q, p], -1)
         x = x - self.turn * torch.round((x - (self.low + self.high) / 2) * self.inverse)
@@ -63,10 +55,9 @@ class Box(nn.Module):
     def flags(self, h: Tensor, before: tuple[Tensor, ...], after: tuple[Tensor, ...]) -> Tensor:
         """(...) uint8: 1 where a step starts or ends outside, plus 2 where h is beyond its range."""
         flags = (self(*before) | self(*after)).to(torch.uint8)
-        span = self.span
-        if not isinstance(span, Tensor):
+        if self.span is None:
             return flags
-        return torch.where((h >= span[0]) & (h <= span[1]), flags, flags + 2)
+        return torch.where((h >= self.span[0]) & (h <= self.span[1]), flags, flags + 2)
 
 
 def s_matters(metadata: Mapping[str, Any]) -> bool:
@@ -74,25 +65,20 @@ def s_matters(metadata: Mapping[str, Any]) -> bool:
     return metadata.get("level") in ("affine", "full")
 
 
-class Report(nn.Module):
-    """What a step says of itself: its status, NaN where it failed, and the box."""
+def report(box: Box | None, h: Tensor, *x: Tensor) -> tuple[Tensor, ...]:
+    """q1, p1, s1, c, residual, status[, outside]: what a step says of itself, NaN where it failed.
 
-    def __init__(self, box: Box | None):
-        super().__init__()
-        self.box = box
-
-    def forward(
-        self, h: Tensor, q: Tensor, p: Tensor, s: Tensor, q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, *solved: Tensor
-    ) -> tuple[Tensor, ...]:
-        """q1, p1, s1, c, residual, status[, outside]; `solved` is the residual and status of steps that iterate."""
-        residual, said = solved or (0.0 * c, None)
-        sound = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
-        status = torch.where(sound, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
-        if said is not None:
-            status = torch.where(said != int(Status.CONVERGED), said, status)
-        status = torch.where(c == 0, int(Status.SINGULAR), status)
-        status = torch.where((h > 0) & torch.isfinite(h), status, int(Status.BAD_INPUT)).to(torch.uint8)
-        nan = torch.where(status == int(Status.CONVERGED), 0.0, torch.nan).to(q1.dtype)
-        new = (q1 + nan[:, None], p1 + nan[:, None], s1 + nan)
-        outside = () if self.box is None else (self.box.flags(h, (q, p, s), new),)
-        return tuple(dense(x) for x in (*new, c + nan, residual, status, *outside))
+    x is (q, p, s) before and after the step, then c, then the residual and status of steps that iterate.
+    """
+    before, (q1, p1, s1), (c, *solved) = x[:3], x[3:6], x[6:]
+    residual, said = solved or (0.0 * c, None)
+    sound = torch.isfinite(residual + s1) & torch.isfinite(q1 + p1).all(-1)
+    status = torch.where(sound, int(Status.CONVERGED), int(Status.DIVERGED)).to(torch.uint8)
+    if said is not None:
+        status = torch.where(said != int(Status.CONVERGED), said, status)
+    status = torch.where(c == 0, int(Status.SINGULAR), status)
+    status = torch.where((h > 0) & torch.isfinite(h), status, int(Status.BAD_INPUT)).to(torch.uint8)
+    nan = torch.where(status == int(Status.CONVERGED), 0.0, torch.nan).to(q1.dtype)
+    new = (q1 + nan[:, None], p1 + nan[:, None], s1 + nan)
+    outside = () if box is None else (box.flags(h, before, new),)
+    return tuple(dense(y) for y in (*new, c + nan, residual, status, *outside))

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import copy
 import inspect
+from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import torch
@@ -20,9 +21,8 @@ from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
 
-HELD = 2  # tensors that set-valued friction adds to an iteration: K and w/K
 # Arguments are q0, p0 (B, n), s0, h (B,), then Δ = q1 − q0 (B, n), then V and V′ at q0 where the model has them, then
-# u (B, m) where it takes inputs. What a step gains is told without the potential at q1: `FieldAt` adds that.
+# u (B, m) where it takes inputs. What a step gains is told without the potential at q1, which the caller adds.
 
 
 class Terms:
@@ -51,67 +51,29 @@ class Terms:
         return form.end(x, point) if isinstance(form, PartialsEquation) else form.end_without_field(form.at(x, point))
 
 
-class StepEquation(nn.Module):
-    """One iteration: a Newton step from a trial Δ, and what the step gains there.
+def step_equation(model: ContactLagrangian, held: int, *x: Tensor) -> tuple[Tensor, ...]:
+    """A Newton step from a trial Δ, and what the step gains there: −J⁻¹F, |J⁻¹cp0|, |F|, p1, L, c, J.
 
-    With `sticking` Δ is the z of `herglotz.stepping.stick_slip`, and the arguments end with K and w/K.
+    Where the arguments end with K and w/K (`held` is 2), Δ is the z of `herglotz.stepping.stick_slip`.
     """
-
-    def __init__(self, model: ContactLagrangian, sticking: bool = False):
-        super().__init__()
-        self.model, self.held = model, HELD * sticking
-
-    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
-        """−J⁻¹F (B, n), |J⁻¹cp0| and |F| (B,), p1 (B, n), L, c (B,), then J (B, n, n)."""
-        split = len(more) - self.held
-        form = terms = Terms(self.model, State(q, p, s), h, more[:split])
-        if self.held:
-            assert isinstance(terms.equation, PartialsEquation)
-            form = StickSlip(terms.equation, *more[split:])
-        point = form(delta, True)
-        assert point.J is not None
-        move, size = eliminate(point.J, torch.stack([point.F, terms.equation.push(point)], -1)).unbind(-1)
-        gained = terms.gained(delta, point)
-        return tuple(dense(x) for x in (-move, length(size), length(point.F), *gained[:3], point.J))
+    (q, p, s, h, delta), more, sticking = x[:5], x[5 : len(x) - held], x[len(x) - held :]
+    form = terms = Terms(model, State(q, p, s), h, more)
+    if sticking:
+        assert isinstance(terms.equation, PartialsEquation)
+        form = StickSlip(terms.equation, *sticking)
+    point = form(delta, True)
+    assert point.J is not None
+    move, size = eliminate(point.J, torch.stack([point.F, terms.equation.push(point)], -1)).unbind(-1)
+    gained = terms.gained(delta, point)
+    return tuple(dense(y) for y in (-move, length(size), length(point.F), *gained[:3], point.J))
 
 
-class FirstOrder(nn.Module):
-    """The same equation with first derivatives only."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *more: Tensor) -> tuple[Tensor, ...]:
-        """F, p1 (B, n), L, c (B,)."""
-        terms = Terms(self.model, State(q, p, s), h, more)
-        point = terms(delta, False)
-        return tuple(dense(x) for x in (point.F, *terms.gained(delta, point)[:3]))
-
-
-class StepJacobian(nn.Module):
-    """The derivative of a solved step (`herglotz.stepping.linearise`)."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> Tensor:
-        """d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m), at the solution Δ."""
-        return dense(step_jacobian(step_functions(self.model), State(q, p, s), h, delta, u[0] if u else None))
-
-
-class FieldAt(nn.Module):
-    """V and V′ at a position."""
-
-    def __init__(self, model: ContactLagrangian):
-        super().__init__()
-        self.model = model
-
-    def forward(self, q: Tensor) -> tuple[Tensor, Tensor]:
-        """V (B,) and V′ (B, n)."""
-        V, slope = FieldOf(self.model.potential)(q)
-        return dense(V), dense(slope)
+def first_order(model: ContactLagrangian, *x: Tensor) -> tuple[Tensor, ...]:
+    """F, p1 (B, n), L, c (B,) of the same equation, with first derivatives only."""
+    (q, p, s, h, delta), more = x[:5], x[5:]
+    terms = Terms(model, State(q, p, s), h, more)
+    point = terms(delta, False)
+    return tuple(dense(y) for y in (point.F, *terms.gained(delta, point)[:3]))
 
 
 @dataclass(frozen=True)
@@ -127,8 +89,9 @@ class Equations:
 
     @cached_property
     def potential(self) -> Graph:
-        """`FieldAt`."""
-        return traced(FieldAt(self.model), example(self.model, 0.1)[:1])
+        """V (B,) and V′ (B, n) at a position."""
+        q = example(self.model, 0.1)[0]
+        return traced(lambda q: tuple(map(dense, FieldOf(self.model.potential)(q))), (q,))
 
     @property
     def field(self) -> Graph | None:
@@ -137,36 +100,33 @@ class Equations:
 
     @cached_property
     def slopes(self) -> Graph:
-        """`StepEquation`."""
-        return self._traced(StepEquation(self.model))
+        """`step_equation`."""
+        return self._traced(partial(step_equation, self.model, 0))
 
     @cached_property
     def first_order(self) -> Graph:
-        """`FirstOrder`."""
-        return self._traced(FirstOrder(self.model))
+        """`first_order`."""
+        return self._traced(partial(first_order, self.model))
 
     @cached_property
     def jacobian(self) -> Graph:
-        """`StepJacobian`."""
+        """The derivative of a solved step at Δ, d(q, p, s)′ / d(q, p, s, h, u), (B, 2n+1, 2n+2+m)."""
         q, p, s, h, *u = example(self.model, 0.1)
-        return traced(StepJacobian(self.model), (q, p, s, h, 0.1 * p, *u))
 
-    def _traced(self, module: nn.Module) -> Graph:
+        def slopes(q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, *u: Tensor) -> Tensor:
+            return dense(step_jacobian(step_functions(self.model), State(q, p, s), h, delta, u[0] if u else None))
+
+        return traced(slopes, (q, p, s, h, 0.1 * p, *u))
+
+    def _traced(self, function: Callable[..., Any]) -> Graph:
         q, p, s, h, *u = example(self.model, 0.1)
-        return traced(module, (q, p, s, h, 0.1 * p, *self._here(q), *u))
-
-    def _here(self, q: Tensor) -> tuple[Tensor, ...]:
-        return field_like(q) if self.model.capabilities.by_terms else ()
+        here = field_like(q) if self.model.capabilities.by_terms else ()
+        return traced(function, (q, p, s, h, 0.1 * p, *here, *u))
 
 
 def field_like(q: Tensor) -> tuple[Tensor, Tensor]:
     """Stand-ins for V and V′ at q."""
     return 0.3 * q.sum(-1), 0.3 * q
-
-
-def input_count(model: ContactLagrangian) -> int:
-    """The number m of inputs u (a motor's torque) that a step of this model takes."""
-    return int(getattr(model.config, "inputs", 0) or 0)
 
 
 def inverse(matrix: Tensor) -> Tensor:
@@ -192,7 +152,7 @@ def example(model: ContactLagrangian, h: float) -> tuple[Tensor, ...]:
     options: dict[str, Any] = {"dtype": parameter.dtype, "device": parameter.device}
     q, p = (0.1 * torch.randn(batch, model.config.dof, generator=make).to(**options) for _ in range(2))
     s, steps = torch.zeros(batch, **options), torch.full((batch,), float(h), **options)
-    m = input_count(model)
+    m = model.inputs
     return q, p, s, steps, *((torch.zeros(batch, m, **options),) if m else ())
 
 

@@ -13,7 +13,6 @@ import herglotz
 from herglotz.data.files import PathLike
 from herglotz.data.holds import Arrival, check_arrival
 from herglotz.errors import InputError, refuse
-from herglotz.export.equation import input_count
 from herglotz.models import ContactLagrangian
 from herglotz.schema import check_entries
 
@@ -113,7 +112,7 @@ def describe(
         "weights_sha256": weights_digest(model),
         "level": model.config.level,
         "dof": n,
-        "inputs": input_count(model),
+        "inputs": model.inputs,
         "input_zero": _input_zero(model),
         "dtype": str(dtype).removeprefix("torch."),
         "h": float(h),
@@ -135,7 +134,7 @@ def describe(
 def _input_zero(model: ContactLagrangian) -> list[float]:
     """The inputs that do not act: what a sensor shows where there is no force."""
     zero = getattr(model.friction, "input_zero", None)
-    return [0.0] * input_count(model) if zero is None else zero.detach().double().tolist()
+    return [0.0] * model.inputs if zero is None else zero.detach().double().tolist()
 
 
 def weights_digest(model: torch.nn.Module) -> str:

@@ -11,8 +11,7 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.export.equation import Equations, dense
-from herglotz.export.newton import CARRIED, CONVERGED, Values, unfinished
-from herglotz.export.step import STATE, StepGraphs
+from herglotz.export.step import CARRIED, CONVERGED, STATE, StepGraphs, Values, unfinished
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.stepping.linearise import eliminate
 

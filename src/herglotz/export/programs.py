@@ -18,8 +18,7 @@ from herglotz.export.equation import Equations, batched, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import describe
 from herglotz.export.module import InitModule, RolloutModule, StepModule
-from herglotz.export.newton import ITERATIONS
-from herglotz.export.step import StepGraphs
+from herglotz.export.step import ITERATIONS, StepGraphs
 from herglotz.export.trusted import remember
 from herglotz.models import ContactLagrangian
 

@@ -67,34 +67,23 @@ class GivenPotential(nn.Module):
         return Jet(torch.cat(rows), n, order)
 
 
-class StepParts(nn.Module):
+class StepParts:
     """Everything that a step is made of, for a format that cuts it into pieces itself (`herglotz.export.lower.c`).
 
     Where the step is `explicit`, the guess is the solution, and J is not known.
     """
 
     def __init__(self, model: ContactLagrangian, explicit: bool):
-        super().__init__()
         self.model, self.explicit = model, explicit
 
-    def forward(
-        self,
-        q: Tensor,  # (B, n)
-        p: Tensor,  # (B, n)
-        s: Tensor,  # (B,)
-        h: Tensor,  # (B,)
-        V0: Tensor,  # (B,)
-        slope0: Tensor,  # (B, n)
-        delta: Tensor,  # (B, n) a trial q1 − q0
-        x: Tensor,  # (B, n) the exact q1 − q0, near by
-        V1: Tensor,  # (B,)
-        slope1: Tensor,  # (B, n)
-        *u: Tensor,  # (B, m)
-    ) -> tuple[Tensor, ...]:
+    def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1.
 
-        Where dry friction can hold a coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K follows.
+        The arguments are q, p (B, n), s, h (B,), V0 (B,) and V′ (B, n) at q0, a trial Δ = q1 − q0 and the exact one
+        near by (B, n), V1 and V′ at q1, and the inputs u (B, m) where the model takes some. Where dry friction can hold
+        a coordinate, Δ stands for the z of `herglotz.stepping.stick_slip`, and w/K follows.
         """
+        (q, p, s, h, V0, slope0, delta, x, V1, slope1), u = arguments[:10], arguments[10:]
         ends = Field(V0, slope0), Field(V1, slope1)
         form = self._explicit if self.explicit else self._by_jets
         if not self.explicit and model_equation(self.model) is not None:

@@ -65,17 +65,17 @@ def example_batch(sizes: set[int]) -> int:
     return next(prime for prime in PRIMES if all(size % prime for size in sizes if size))
 
 
-def traced(module: nn.Module, arguments: tuple[Tensor, ...]) -> Graph:
-    """The module as a graph without classes, repetitions and constant parts, for any batch size.
+def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph:
+    """The function as a graph without classes, repetitions and constant parts, for any batch size.
 
-    The module takes and returns tensors whose batch is axis 0, and may differentiate by `torch.func`; `arguments` are
+    The function takes and returns tensors whose batch is axis 0, and may differentiate by `torch.func`; `arguments` are
     examples, with a batch from `example_batch`.
     """
     recorder = Recorder(arguments)
     with torch.no_grad():
-        module(*arguments)  # fills index caches outside the trace
+        function(*arguments)  # fills index caches outside the trace
         with recorder:
-            outputs = module(*arguments)
+            outputs = function(*arguments)
         graph = recorder.graph_of(outputs if isinstance(outputs, tuple) else (outputs,))
         values = _values(graph.code, (*arguments, *graph.constants))
     for node in graph.code.graph.nodes:

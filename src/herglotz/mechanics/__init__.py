@@ -1,50 +1,29 @@
 """What learning and stepping need of every discrete contact Lagrangian: derivatives, momenta, regularity."""
 
-from herglotz.mechanics.contact import contact_defect, contact_form, flow_derivative
+from herglotz.mechanics.contact import (
+    contact_defect as contact_defect,
+    contact_form as contact_form,
+    flow_derivative as flow_derivative,
+)
 from herglotz.mechanics.legendre import (
-    herglotz_residual,
-    legendre_minus,
-    legendre_plus,
-    mixed_hessian,
-    momentum_jacobian,
-    momentum_minus,
-    momentum_plus,
-    momentum_residual,
+    herglotz_residual as herglotz_residual,
+    legendre_minus as legendre_minus,
+    legendre_plus as legendre_plus,
+    mixed_hessian as mixed_hessian,
+    momentum_jacobian as momentum_jacobian,
+    momentum_minus as momentum_minus,
+    momentum_plus as momentum_plus,
+    momentum_residual as momentum_residual,
 )
 from herglotz.mechanics.partials import (
-    ClosedForm,
-    DiscreteLagrangian,
-    Driven,
-    Forced,
-    Forces,
-    Partials,
-    autograd_partials,
-    partials,
+    ClosedForm as ClosedForm,
+    DiscreteLagrangian as DiscreteLagrangian,
+    Driven as Driven,
+    Forced as Forced,
+    Forces as Forces,
+    Partials as Partials,
+    autograd_partials as autograd_partials,
+    partials as partials,
 )
-from herglotz.mechanics.regularity import Regularity, regularity
-from herglotz.mechanics.tangent import step_derivative
-
-__all__ = [
-    "ClosedForm",
-    "DiscreteLagrangian",
-    "Driven",
-    "Forced",
-    "Forces",
-    "Partials",
-    "Regularity",
-    "autograd_partials",
-    "contact_defect",
-    "contact_form",
-    "flow_derivative",
-    "herglotz_residual",
-    "legendre_minus",
-    "legendre_plus",
-    "mixed_hessian",
-    "momentum_jacobian",
-    "momentum_minus",
-    "momentum_plus",
-    "momentum_residual",
-    "partials",
-    "regularity",
-    "step_derivative",
-]
+from herglotz.mechanics.regularity import Regularity as Regularity, regularity as regularity
+from herglotz.mechanics.tangent import step_derivative as step_derivative

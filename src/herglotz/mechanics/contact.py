@@ -14,29 +14,12 @@ Flow = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
 
 
 def contact_form(p: Tensor) -> Tensor:
-    """Components of η = ds − p·dq at a point with momentum p.
-
-    Parameters
-    ----------
-    p
-        (..., n) momentum.
-
-    Returns
-    -------
-    Tensor
-        (..., 2n+1): (−p, 0, 1).
-    """
+    """Components (−p, 0, 1) of η = ds − p·dq at a point with momentum p (..., n); (..., 2n+1)."""
     return torch.cat([-p, torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
 
 
 def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
-    """Value and derivative of a map (q, p, s) → (q1, p1, s1), by autograd, batched.
-
-    Returns
-    -------
-    tuple
-        ((q1, p1, s1), DΦ) with DΦ of shape (..., 2n+1, 2n+1).
-    """
+    """Value (q1, p1, s1) and derivative DΦ (..., 2n+1, 2n+1) of a map Φ of (q, p, s), by autograd, batched."""
     return flow_derivatives([flow], q, p, s)[0]
 
 

@@ -28,11 +28,6 @@ def legendre_minus(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """FL⁻(q0, q1, s0) = (q0, −D1 L_d / c, s0).
 
-    Returns
-    -------
-    tuple of Tensor
-        (q0, p0, s0) with shapes (..., n), (..., n), (...).
-
     Source: discrete Legendre transforms of the paper.
     """
     return q0, momentum_minus(partials(L_d, q0, q1, s0, h)), s0
@@ -45,13 +40,7 @@ def legendre_plus(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """FL⁺(q0, q1, s0) = (q1, D2 L_d, s0 + L_d), plus F⁺ where there are forces; s is taken at s0 (erratum E3).
-
-    Returns
-    -------
-    tuple of Tensor
-        (q1, p1, s1) with shapes (..., n), (..., n), (...).
-    """
+    """FL⁺(q0, q1, s0) = (q1, D2 L_d, s0 + L_d), plus F⁺ where there are forces; s is taken at s0 (erratum E3)."""
     P = partials(L_d, q0, q1, s0, h)
     return q1, momentum_plus(P), s0 + P.L
 
@@ -65,12 +54,9 @@ def herglotz_residual(
     h0: Tensor | float,  # t_k − t_{k−1}
     h1: Tensor | float,  # t_{k+1} − t_k
 ) -> Tensor:
-    """R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), with s_k = s_{k−1} + L_d.
+    """R_k = D1 L_d(q_k, q_{k+1}, s_k) + c_k D2 L_d(q_{k−1}, q_k, s_{k−1}), with s_k = s_{k−1} + L_d; (..., n).
 
-    Returns
-    -------
-    Tensor
-        Shape (..., n), in units of momentum. Zero along discrete trajectories.
+    In units of momentum, and zero along discrete trajectories.
 
     Source: discrete Herglotz equations; indices by erratum E3.
     """

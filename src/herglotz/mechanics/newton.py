@@ -1,13 +1,14 @@
 """Newton's iteration with backtracking, batched: the one loop for every equation of this package.
 
 Samples do not influence one another: each has its own Jacobian, its own fraction of a step and its own end. One sample
-alone takes the same iteration in plain numbers (`herglotz.mechanics.newton_one`) where its rules allow that.
+alone may take the same loop with Python's floats in the place of tensors (...), for small tensors cost the most there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from math import inf, isfinite, nan
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -33,8 +34,9 @@ class Equation(Protocol):
         ...
 
 
-# The size of the unknown and the size below which a move is rounding, (...) each, from x, the first point and |J⁻¹F|.
-Sizes = Callable[[Tensor, Point, Tensor], tuple[Tensor, Tensor]]
+Number = Any  # (...) a number a sample; a float of one sample that is `alone`
+# The size of the unknown and the size below which a move is rounding, from x, the first point and |J⁻¹F|.
+Sizes = Callable[[Tensor, Point, Number], tuple[Number, Number]]
 
 
 def largest(x: Tensor) -> Tensor:
@@ -122,75 +124,138 @@ class _Here(NamedTuple):
     x: Tensor  # (..., m)
     point: Point
     J: Jacobian
-    delta: Tensor  # (..., m) −J⁻¹F
-    merit: Tensor  # (...) |F|
-    residual: Tensor  # (...) |J⁻¹F|
+    delta: Tensor | float  # (..., m) −J⁻¹F
+    merit: Number  # |F|
+    residual: Number  # |J⁻¹F|
 
 
-def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes) -> Found:
-    """Iterate from x (..., m), all samples at once."""
-    here = _evaluate(equation, x, rules)
+def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: bool = False) -> Found:
+    """Iterate from x (..., m), all samples at once.
+
+    One sample may be iterated `alone`, with floats for numbers, by rules that are not `natural` and have no solver.
+    """
+    here = _evaluate(equation, x, rules, alone)
     scale, floor = sizes(x, here.point, here.residual)
     tiny, near = rules.tol * scale, NEAR * scale
     # A direction that is not finite can never be followed: such a sample is over, and costs its neighbours nothing.
-    done = (here.residual <= tiny) | ~torch.isfinite(here.residual)
-    fraction: Tensor | None = None  # None: every sample takes full steps
-    slow: Tensor | None = None  # samples whose old Jacobian has served its time
+    going = (here.residual > tiny) & (here.residual < inf)
+    fraction: Number = None  # every sample takes full steps
+    slow: Number = False  # samples whose old Jacobian has served its time
     mixed, iterations = False, 0
-    while iterations < rules.max_iterations and not bool(done.all()):
-        if not rules.natural or bool((here.residual > floor).any()):  # the last digits are not counted
+    while iterations < rules.max_iterations and _any(going):
+        if not rules.natural or _any(here.residual > floor):  # the last digits are not counted
             iterations += 1
-        move = here.delta if fraction is None else fraction[..., None] * here.delta
-        fresh = ~done & (here.residual > near)  # at a trial that may be far off, the Jacobian is wanted as well
-        fresh = fresh if slow is None else fresh | slow
-        trial = _evaluate(equation, here.x + torch.where(done[..., None], 0.0, move), rules, here.J, fresh)
+        move = here.delta if fraction is None else (fraction if alone else fraction[..., None]) * here.delta
+        fresh = going & (here.residual > near) | slow  # at a trial that may be far off, the Jacobian is wanted as well
+        move = move if alone else torch.where(going[..., None], move, 0.0)
+        trial = _evaluate(equation, here.x + move, rules, alone, here.J, fresh)
         settled = trial.residual <= tiny
         better = _falls(rules, here, trial, 1.0 if fraction is None else fraction) | settled
-        stalled = ~better & (here.residual <= floor)  # rounding, not a wrong direction
+        stalled = _not(better) & (here.residual <= floor)  # rounding, not a wrong direction
         if rules.keep:
-            still = ~fresh & ~done & ~settled & torch.isfinite(trial.residual)
+            still = _not(fresh | settled) & going & (trial.residual < inf)
             slow = still & (trial.residual > CONTRACTION * here.residual)
-            better = better | (slow & ~stalled)
-        accept = better & ~done
-        mixed = not bool((better | done).all())
-        done = done | settled | stalled
+            better = better | (slow & _not(stalled))
+        accept = better & going
+        refused = going & _not(better)
+        going = going & _not(settled | stalled)
         if rules.natural:  # this test may accept a trial where J is singular
-            done = done | (accept & ~torch.isfinite(trial.residual))
-        if not mixed:  # a done sample's trial is its own x: nothing to select
+            going = going & _not(accept & _not(trial.residual < inf))
+        mixed = not alone and _any(refused)
+        if not _any(refused):  # a done sample's trial is its own x: nothing to select
             here = trial
-        else:  # the point is that of no sample
+        elif not alone:  # the point is that of no sample
             values = (select(accept, new, old) for new, old in zip(trial[2:], here[2:], strict=True))
             here = _Here(select(accept, trial.x, here.x), here.point, *values)
-        if mixed or fraction is not None:
+        if fraction is not None or _any(refused):
             fraction = _next(fraction, accept, rules.natural, like=here.merit)
-            done = done | (fraction < rules.shortest)
+            going = going & (fraction >= rules.shortest)
+    if alone:
+        return _found_alone(here, not going, iterations)
     x, point, J, delta, merit, residual = here
-    return Found(x, point, merit, residual, done, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed)
+    return Found(
+        x, point, merit, residual, ~going, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed
+    )
 
 
-def _evaluate(equation: Equation, x: Tensor, rules: Rules, J: Jacobian = None, fresh: Tensor | None = None) -> _Here:
+def _evaluate(
+    equation: Equation, x: Tensor, rules: Rules, alone: bool, J: Jacobian = None, fresh: Number = True
+) -> _Here:
     """The equation at x, with the Jacobian J in the samples that are not `fresh` where the rules keep it."""
-    second = fresh is None or not rules.keep or bool(fresh.any())
+    second = not rules.keep or _any(fresh)
     point = equation(x, second)
     if second:
-        J = select(fresh, point.J, J) if rules.keep and fresh is not None else point.J
-    solver = rules.solver or solve
-    delta = -solver(J, point.F)
+        J = select(fresh, point.J, J) if rules.keep and isinstance(fresh, Tensor) else point.J
+    if alone:
+        return _Here(x, point, J, *newton_step(J, point.F))
+    delta = -(rules.solver or solve)(J, point.F)
     return _Here(x, point, J, delta, largest(point.F), rules.length(delta))
 
 
-def _next(fraction: Tensor | None, accept: Tensor, natural: bool, like: Tensor) -> Tensor:
+def _next(fraction: Number, accept: Number, natural: bool, like: Number) -> Number:
     """The fractions of the next move: halves after a refused trial; after an accepted one all, or twice as much."""
+    if isinstance(accept, bool):
+        return 1.0 if accept else (fraction or 1.0) / 2
     fraction = torch.ones_like(like) if fraction is None else fraction
     return torch.where(accept, (2 * fraction).clamp(max=1.0) if natural else 1.0, fraction / 2)
 
 
-def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Tensor | float) -> Tensor:
-    """In which samples a trial passes the test of descent, (...)."""
+def _falls(rules: Rules, here: _Here, trial: _Here, fraction: Number) -> Number:
+    """In which samples a trial passes the test of descent."""
     if rules.natural:
         solver = rules.solver or solve
         return rules.length(solver(here.J, trial.point.F)) <= (1 - NATURAL * fraction) * here.residual
     return trial.merit <= (1 - ARMIJO * fraction) * here.merit
+
+
+def _any(mask: Number) -> bool:
+    return mask if isinstance(mask, bool) else bool(mask.any())
+
+
+def _not(mask: Number) -> Number:
+    return not mask if isinstance(mask, bool) else ~mask
+
+
+def _found_alone(here: _Here, done: bool, iterations: int) -> Found:
+    """Where one sample ended, its floats as tensors."""
+    shape, healthy = here.x.shape[:-1], done and isfinite(here.merit + here.residual)
+    merit, residual = here.x.new_full(shape, here.merit), here.x.new_full(shape, here.residual)
+    flag = torch.full(shape, done, device=here.x.device)
+    return Found(here.x, here.point, merit, residual, flag, iterations, healthy)
+
+
+def newton_step(J: Tensor, F: Tensor) -> tuple[Tensor | float, float, float]:
+    """−J⁻¹F of one sample, not finite where J is singular, |F| and |J⁻¹F|."""
+    n = F.shape[-1]
+    if n == 1:
+        f, j = F.item(), J.item()
+        delta = -f / j if j else (-inf if f else nan)
+        return delta, abs(f), abs(delta)
+    f = F.flatten().tolist()
+    if n == 2:
+        delta = _eliminate_numbers(*J.flatten().tolist(), *f)
+        return torch.tensor(delta, dtype=F.dtype, device=F.device).reshape(F.shape), norm(f), norm(delta)
+    delta = -torch.linalg.solve_ex(J, F[..., None])[0][..., 0]
+    return delta, norm(f), norm(delta.flatten().tolist())
+
+
+def _eliminate_numbers(a: float, b: float, c: float, d: float, x: float, y: float) -> list[float]:
+    """−(a b; c d)⁻¹ (x, y), Gauss with a row exchange."""
+    if abs(c) > abs(a):
+        a, b, c, d, x, y = c, d, a, b, y, x
+    if not a:
+        return [nan, nan]
+    factor = c / a
+    pivot = d - factor * b
+    if not pivot:
+        return [nan, nan]
+    second = (y - factor * x) / pivot
+    return [(b * second - x) / a, -second]
+
+
+def norm(values: list[float]) -> float:
+    """The largest absolute value, NaN if one is."""
+    return nan if any(v != v for v in values) else max(map(abs, values), default=0.0)
 
 
 def select(mask: Tensor, a: Any, b: Any) -> Any:

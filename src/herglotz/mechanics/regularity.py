@@ -60,21 +60,7 @@ def regularity(
 ) -> Regularity:
     """How far every condition is from failing at (q0, q1, s0).
 
-    Parameters
-    ----------
-    L_d
-        The discrete Lagrangian; it is also evaluated at h(1 ± √eps), to see a pole in h.
-    q0, q1
-        (..., n) positions.
-    s0
-        (...) action variable.
-    h
-        Time step, scalar or (...).
-
-    Returns
-    -------
-    Regularity
-        Margins, each (...).
+    L_d is also evaluated at h(1 ± √eps), to see a pole in h.
 
     Source: erratum E4; for H⁻ the same argument on the left Lagrangian of erratum E5.
     """

@@ -1,11 +1,10 @@
 """Learnable discrete contact Lagrangians."""
 
-from herglotz.models.capabilities import Capabilities, capabilities
-from herglotz.models.config import LEVELS, ModelConfig
-from herglotz.models.model import ContactLagrangian, DrivenLagrangian, numbers_of
-from herglotz.models.term import TERMS, Term
-
-__all__ = [
-    "LEVELS", "TERMS", "Capabilities", "ContactLagrangian", "DrivenLagrangian", "ModelConfig", "Term", "capabilities",
-    "numbers_of",
-]  # fmt: skip
+from herglotz.models.capabilities import Capabilities as Capabilities, capabilities as capabilities
+from herglotz.models.config import LEVELS as LEVELS, ModelConfig as ModelConfig
+from herglotz.models.model import (
+    ContactLagrangian as ContactLagrangian,
+    DrivenLagrangian as DrivenLagrangian,
+    numbers_of as numbers_of,
+)
+from herglotz.models.term import TERMS as TERMS, Term as Term

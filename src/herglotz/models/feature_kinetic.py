@@ -34,8 +34,7 @@ class FeatureKinetic(nn.Module):
 
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
-        p, base = phase, self.base
-        K = base(p.q0, p.q1, p.h, p.order, p.delta) if isinstance(base, Kinetic) else base(p)
+        K = self.base(phase)
         f = self._functions(phase, 0)
         for velocities, which in self.monomials.items():
             K = K + _times(_sum(f, which), phase.velocity, velocities) * phase.h

@@ -160,17 +160,14 @@ class ContactLagrangian(nn.Module):
         return self._terms(Phase(q0, q1, h, order, self.config, delta))
 
     def _terms(self, phase: Phase) -> Terms:
-        q0, q1, h, order, n = phase.q0, phase.q1, phase.h, phase.order, phase.q0.shape[-1]
-        g = self.damping
-        if g is not None:
-            g = g(phase) if isinstance(g, AffineDamping) else g(q0, q1, h, order)
+        order, n = phase.order, phase.q0.shape[-1]
+        g = None if self.damping is None else self.damping(phase)
         N = None if self.correction is None else self.correction(phase)
         b = None if self.action is None else self.action.offsets(phase.features)
         if not self.config.baseline:
             return Terms(g, None, None, None, N, b)
-        V = self.potential(torch.stack([q0, q1]), order)  # both ends in one network call
-        m = self.kinetic
-        K = m(q0, q1, h, order, phase.delta) if isinstance(m, Kinetic) else m(phase)
+        V = self.potential(torch.stack([phase.q0, phase.q1]), order)  # both ends in one network call
+        K = self.kinetic(phase)
         V0, V1 = Jet(V.data[:, 0], n, order).embed(2 * n, 0), Jet(V.data[:, 1], n, order).embed(2 * n, n)
         if self.config.order == 4:
             N = self._missing(phase, V0, V1)
@@ -279,13 +276,11 @@ class ContactLagrangian(nn.Module):
         if self.friction is None:
             return None
         assert isinstance(self.damping, LinearDamping)
-        q0, q1, h, order, delta = phase.q0, phase.q1, phase.h, phase.order, phase.delta
-        v = (q1 - q0 if delta is None else delta) / h[..., None]
-        c = self.damping(q0, q1, h, order).exp()
-        forces = self.friction(v, c, h, order, u)
+        h, v, c = phase.h, phase.move / phase.h[..., None], self.damping(phase).exp()
+        forces = self.friction(v, c, h, phase.order, u)
         for term in self.forces_between:
             forces = with_force(forces, *term.force(v), c, h)
-        return forces if self.drag is None else self.drag((q0 + q1) / 2, v, c, h, forces)
+        return forces if self.drag is None else self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces)
 
 
 def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:

@@ -31,6 +31,11 @@ class Phase:
         self._features: Jet | None = None
 
     @property
+    def move(self) -> Tensor:
+        """Δ = q1 − q0, (..., n)."""
+        return self.q1 - self.q0 if self.delta is None else self.delta
+
+    @property
     def mean(self) -> Jet:
         """q̄, vector-valued (..., n)."""
         return self._pair()[0]

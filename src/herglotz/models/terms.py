@@ -53,17 +53,16 @@ class Kinetic(nn.Module):
         C = self.factor()
         return C if self.dof == 1 else C @ C.T
 
-    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Jet:
-        """K as a jet over (q0, q1); Δ = q1 − q0 unless it is given."""
-        n = self.dof
-        delta = q1 - q0 if delta is None else delta
+    def forward(self, phase: Phase) -> Jet:
+        """K as a jet over (q0, q1)."""
+        n, h, order, delta = self.dof, phase.h, phase.order, phase.move
         m = self.mass()
         momentum = delta @ m / h[..., None]  # (..., n)
         value = (momentum * delta).sum(-1) / 2
         gradient = torch.cat([-momentum, momentum], -1).movedim(-1, 0)
         rows = [value[None], gradient]
         if order == 2:
-            i, j = pairs(2 * n, q0.device)
+            i, j = pairs(2 * n, m.device)
             block = torch.cat([torch.cat([m, -m], 1), torch.cat([-m, m], 1)])[i, j]
             rows.append(block.reshape(-1, *(1,) * value.ndim) / h.expand(value.shape))
         return Jet(torch.cat(rows), 2 * n, order)
@@ -135,9 +134,9 @@ class LinearDamping(nn.Module):
         super().__init__()
         self.rate = nn.Parameter(torch.tensor(rate, dtype=torch.float64))
 
-    def forward(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Tensor:  # noqa: ARG002  one signature for all
+    def forward(self, phase: Phase) -> Tensor:
         """The exponent g, independent of position."""
-        return -self.rate * h
+        return -self.rate * phase.h
 
 
 class AffineDamping(nn.Module):

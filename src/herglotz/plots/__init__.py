@@ -9,17 +9,25 @@ from matplotlib.figure import Figure
 
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.plots.animation import save_animation
-from herglotz.plots.bands import plot_bands
-from herglotz.plots.hamilton_jacobi import plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
-from herglotz.plots.learned import plot_learned
-from herglotz.plots.motion import plot_data, plot_trajectory
-from herglotz.plots.parachute import physical_fall, plot_fall, plot_printed_map, printed_map
-from herglotz.plots.phase import plot_phase_portrait
-from herglotz.plots.plan import plot_plan
-from herglotz.plots.selection import plot_selection
-from herglotz.plots.style import save_figure
-from herglotz.plots.training import plot_training
+from herglotz.plots.animation import save_animation as save_animation
+from herglotz.plots.bands import plot_bands as plot_bands
+from herglotz.plots.hamilton_jacobi import (
+    plot_hamilton_jacobi_residual as plot_hamilton_jacobi_residual,
+    plot_momentum_vs_generating_function as plot_momentum_vs_generating_function,
+)
+from herglotz.plots.learned import plot_learned as plot_learned
+from herglotz.plots.motion import plot_data as plot_data, plot_trajectory as plot_trajectory
+from herglotz.plots.parachute import (
+    physical_fall,
+    plot_fall as plot_fall,
+    plot_printed_map as plot_printed_map,
+    printed_map,
+)
+from herglotz.plots.phase import plot_phase_portrait as plot_phase_portrait
+from herglotz.plots.plan import plot_plan as plot_plan
+from herglotz.plots.selection import plot_selection as plot_selection
+from herglotz.plots.style import save_figure as save_figure
+from herglotz.plots.training import plot_training as plot_training
 from herglotz.verify.subject import named
 
 if TYPE_CHECKING:
@@ -95,25 +103,3 @@ def _saved(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
     for file, figure in zip(files, drawn.values(), strict=True):
         save_figure(figure, file)
     return files
-
-
-__all__ = [
-    "FIGURES",
-    "IDENTITIES",
-    "plot_bands",
-    "plot_data",
-    "plot_fall",
-    "plot_hamilton_jacobi_residual",
-    "plot_learned",
-    "plot_momentum_vs_generating_function",
-    "plot_phase_portrait",
-    "plot_plan",
-    "plot_printed_map",
-    "plot_selection",
-    "plot_training",
-    "plot_trajectory",
-    "save_animation",
-    "save_figure",
-    "save_figures",
-    "save_theory_figures",
-]

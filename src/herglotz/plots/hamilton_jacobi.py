@@ -16,7 +16,7 @@ from herglotz.plots import style
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
-from herglotz.theory import GeneratingFunction, hamilton_jacobi_residual, right_hamiltonian
+from herglotz.theory import GeneratingFunction, RightHamiltonian, hamilton_jacobi_residual
 
 STEPS, SIZE = 8, 31
 NULL_STEPS = (1, 4, 8)  # first, middle and last of STEPS
@@ -120,7 +120,7 @@ def _residual(fan: Fan, S0: GeneratingFunction, S1: GeneratingFunction, near: Ge
 
     H⁺ has branches: its Newton iteration starts at the solution `near`.
     """
-    H_plus = right_hamiltonian(fan.L_d, S0.q, S1.D2, S0.s, fan.h, near.q)
+    H_plus = RightHamiltonian(fan.L_d, near.q)(S0.q, S1.D2, S0.s, fan.h)
     residual = hamilton_jacobi_residual(S1.S, S0.S, S1.D2, S1.q, H_plus).detach().abs()
     size = S1.S.abs() + S0.S.abs() + (S1.D2 * S1.q).sum(-1).abs() + H_plus.detach().abs()
     return torch.where(regular(S0) & regular(S1), residual / size, torch.nan)

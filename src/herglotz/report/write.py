@@ -53,23 +53,9 @@ print(run.predict("another.csv").rms)"""
 
 @one_thread()
 def write_report(run: Run, folder: str | Path, against: Trajectories | None = None, *, name: str = "RUN") -> list[Path]:
-    """Write report.html and report.md into a folder.
+    """Write report.html, which fetches nothing, and report.md into a folder, made if missing; both paths.
 
-    Parameters
-    ----------
-    run
-        What `fit` returned.
-    folder
-        Where to write; made if missing.
-    against
-        Another recording, on which the model is scored (`Run.predict`).
-    name
-        What the commands in the report call the run: its folder.
-
-    Returns
-    -------
-    list of Path
-        Both files; the HTML file fetches nothing.
+    The model is scored on the recording `against` (`Run.predict`), and commands in the report call the run `name`.
     """
     document = describe(run, against, name)
     folder = Path(folder)

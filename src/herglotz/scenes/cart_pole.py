@@ -18,14 +18,10 @@ def cart_pole(cart: float = 1.0, m: float = 0.3, length: float = 0.5, g: float =
 
     Parameters
     ----------
-    cart
-        Mass M of the cart, kg.
-    m
-        Mass at the end of the pole, kg.
-    length
-        Length ℓ of the pole, m.
-    g
-        Gravity, m/s².
+    cart, m
+        Masses M of the cart and m at the end of the pole, kg.
+    length, g
+        Length ℓ of the pole, m, and gravity, m/s².
     gamma
         Damping rate γ, 1/s; one scalar s damps both momenta alike (trap 4 of `docs/mathematics.md`).
 

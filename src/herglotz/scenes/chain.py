@@ -21,10 +21,8 @@ def chain(masses: float = 10, m: float = 1.0, k: float = 1.0, beta: float = 0.5,
     ----------
     masses
         Number of masses N ≥ 1, the degrees of freedom.
-    m
-        Each mass, kg.
-    k
-        Stiffness of a spring, N/m. At β = 0 the frequencies are 2√(k/m) sin(jπ/(2N + 2)), j = 1 … N.
+    m, k
+        Each mass, kg, and stiffness of a spring, N/m. At β = 0 the frequencies are 2√(k/m) sin(jπ/(2N + 2)), j = 1 … N.
     beta
         Hardening β ≥ 0 of a spring, N/m³.
     gamma

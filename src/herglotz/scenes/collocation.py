@@ -15,23 +15,15 @@ from herglotz.scenes.motion import Motion
 from herglotz.theory.continuous import square_jacobian
 
 Array = np.ndarray
+MOST = 65  # nodes that have finer ones
 
 
 @cache
 def lobatto(count: int) -> tuple[Tensor, Tensor, Tensor]:
     """The nodes c_i, the matrix a_ij = ∫_0^{c_i} l_j (the quadrature is its last row), and the values on finer nodes.
 
-    Legendre's series of l_j is exact and loses no digits with many nodes, as powers of x would.
-
-    Parameters
-    ----------
-    count
-        k nodes, k ≥ 3; both ends are nodes, and the middle of an odd number.
-
-    Returns
-    -------
-    tuple of Tensor
-        (k,), (k, k) and (2k − 1, k), float64.
+    Of shapes (k,), (k, k) and (2k − 1, k), float64, for `count` = k ≥ 3 nodes; both ends are nodes. Legendre's series
+    of l_j is exact and loses no digits with many nodes, as powers of x would.
     """
     last = np.polynomial.legendre.Legendre.basis(count - 1)
     x = np.concatenate([[-1.0], np.sort(last.deriv().roots().real), [1.0]])
@@ -62,9 +54,6 @@ def _values(nodes: Array, size: Array, x: Array) -> Array:
     hit = np.abs(apart) < 1e-15
     terms = size * (-1.0) ** np.arange(len(nodes)) / np.where(hit, 1.0, apart)
     return np.where(hit.any(1, keepdims=True), hit, terms / terms.sum(1, keepdims=True))
-
-
-MOST = 65  # nodes that have finer ones
 
 
 SMALL = 1e-8  # of the unknowns: the move after one below is below rounding

@@ -1,4 +1,4 @@
-"""Duffing's oscillator, ẍ = −γẋ − kx − βx³: a hardening spring, no closed form, so its answer is the reference flow.
+"""Duffing's oscillator, ẍ = −γẋ − kx − βx³ + u, free or driven by a force u: no closed form but the reference flow.
 
 L = v²/2 − kx²/2 − βx⁴/4 − γs and H = p²/2 + kx²/2 + βx⁴/4 + γs, with mass 1 kg.
 """
@@ -10,8 +10,9 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.scenes.driven import driven_scene
 from herglotz.scenes.natural import natural_scene
-from herglotz.scenes.scene import Scene
+from herglotz.scenes.scene import Scene, require_positive
 
 
 def hardening(k: float, beta: float) -> tuple[Callable[[Tensor], Tensor], Callable[[Tensor], Tensor]]:
@@ -31,10 +32,8 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
 
     Parameters
     ----------
-    k
-        Linear stiffness, N/m; negative: two wells.
-    beta
-        Cubic stiffness β > 0, N/m³.
+    k, beta
+        Linear stiffness, N/m (negative: two wells), and cubic stiffness β > 0, N/m³.
     gamma
         Damping rate γ, 1/s.
 
@@ -58,4 +57,40 @@ def duffing(k: float = 1.0, beta: float = 25.0, gamma: float = 0.15) -> Scene:
         v_range=(-0.4, 0.4),
         h=0.1,
         examples=({"k": 0.7, "beta": 12.0, "gamma": 0.3}, {"k": -0.6, "beta": 4.0, "gamma": 0.1}),
+    )
+
+
+def driven_duffing(
+    k: float = 1.0, beta: float = 4.0, gamma: float = 0.2, amplitude: float = 0.5, frequency: float = 1.3
+) -> Scene:
+    """A mass on a hardening spring under the force u(t) = A cos νt, held over each step of a simulation.
+
+    Parameters
+    ----------
+    k, beta, gamma
+        As of `duffing`.
+    amplitude, frequency
+        Force A, N, and its angular frequency ν, rad/s.
+
+    Raises
+    ------
+    InputError
+        If β ≤ 0.
+    """
+    require_positive("driven_duffing", cubic_stiffness_beta=beta)
+
+    return driven_scene(
+        *hardening(k, beta),
+        gamma,
+        amplitude,
+        frequency,
+        name="driven_duffing",
+        description="hardening spring under a given force, ẍ = −γẋ − kx − βx³ + u; reference flow to about 1e-13",
+        coordinates=("x",),
+        units=("m",),
+        parameters={"k": k, "beta": beta, "gamma": gamma, "amplitude": amplitude, "frequency": frequency},
+        q_range=(-0.8, 0.8),
+        v_range=(-0.8, 0.8),
+        h=0.15,
+        examples=({"k": 0.7, "beta": 2.5, "gamma": 0.35, "amplitude": 0.3, "frequency": 0.9},),
     )

@@ -18,10 +18,8 @@ def kepler(m: float = 1.0, k: float = 1.0, gamma: float = 0.05) -> Scene:
 
     Parameters
     ----------
-    m
-        Mass, kg.
-    k
-        Strength of the attraction, N·m²; negative repels.
+    m, k
+        Mass, kg, and strength of the attraction, N·m²; negative repels.
     gamma
         Damping rate γ, 1/s.
 

@@ -106,10 +106,8 @@ def damped_oscillator(m: float = 1.0, omega0: float = 1.0, gamma: float = 0.2) -
 
     Parameters
     ----------
-    m
-        Mass, kg.
-    omega0
-        Undamped angular frequency Ω, rad/s.
+    m, omega0
+        Mass, kg, and undamped angular frequency Ω, rad/s.
     gamma
         Damping rate γ, 1/s; γ = 2Ω is critical.
 

@@ -7,7 +7,7 @@ analytic in λg, so g = 0 (quadratic drag alone) needs no case of its own.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -155,10 +155,8 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
 
     Parameters
     ----------
-    m
-        Mass, kg.
-    g
-        Gravity, m/s²; 0 leaves quadratic drag alone.
+    m, g
+        Mass, kg, and gravity, m/s²; 0 leaves quadratic drag alone.
     lam
         Drag λ, 1/m, not 0; positive brakes downward motion.
 
@@ -194,4 +192,38 @@ def parachute(m: float = 1.0, g: float = 10.0, lam: float = 0.01) -> Scene:
         H_plus=L_d.H_plus,
         H_minus=L_d.H_minus,
         examples=({"m": 1.4, "g": 7.0, "lam": 0.012},),
+    )
+
+
+def quadratic_drag(m: float = 1.0, lam: float = 0.01) -> Scene:
+    """Motion with quadratic drag and no gravity, q̈ = λq̇²: the parachute's formulas, analytic in λg, at g = 0.
+
+    L = mv²/2 + 2λvs, H = (p − 2λs)²/2m, L_d = (e^{2λΔ}−1)s0 + (m/2λ²h)(e^{λΔ}−1)². It brakes where λq̇ < 0 and speeds up
+    without bound where λq̇ > 0: q1 = q0 − ln(1 − λv0h)/λ exists until λv0h = 1.
+
+    Parameters
+    ----------
+    m
+        Mass, kg.
+    lam
+        Drag λ, 1/m, not 0; positive brakes motion to negative q.
+
+    Raises
+    ------
+    InputError
+        If m ≤ 0 or lam = 0.
+
+    Source: section 3 of `docs/mathematics.md`.
+    """
+    require_positive("quadratic_drag", mass_m=m)
+    if lam == 0:
+        raise InputError(f"quadratic_drag: drag lam must not be 0, got {lam}; without drag use a value such as 1e-6")
+    return replace(
+        parachute(m, 0.0, lam),
+        name="quadratic_drag",
+        description="quadratic drag without gravity, q̈ = λq̇², in closed form",
+        parameters={"m": m, "lam": lam},
+        q_range=(-50.0, 50.0),
+        v_range=(-20.0, -1.0) if lam > 0 else (1.0, 20.0),
+        examples=({"m": 1.4, "lam": 0.03}, {"m": 0.7, "lam": -0.02}),
     )

@@ -49,12 +49,8 @@ def reference_solve(
 
     A sample keeps the first result that agrees with the one of half its substeps to `tolerance`, so it does not depend
     on the rest of its batch; after `max_substeps` it keeps the last, with whatever `error` says. The result is in the
-    dtype of q, and differentiable if the vector field is.
-
-    Returns
-    -------
-    ReferenceSolution
-        `error` belongs to the coarser of the last two results: the one returned is better.
+    dtype of q, and differentiable if the vector field is. `error` belongs to the coarser of the last two results: the
+    one returned is better.
     """
     n, dtype = q.shape[-1], q.dtype
     h = torch.as_tensor(h, dtype=torch.float64, device=q.device)
@@ -77,12 +73,9 @@ def integrate(
     tolerance: float = 1e-13,
     max_substeps: int = 128,
 ) -> tuple[Tensor, Tensor]:
-    """Integrate ẋ = f(x), the number of substeps doubled from 2 until a sample agrees with itself.
+    """ẋ = f(x) integrated, the number of substeps doubled from 2 until a sample agrees with itself.
 
-    Returns
-    -------
-    tuple of Tensor
-        x at the end, (..., d), and the error of the coarser of its last two results, (...).
+    x at the end, (..., d), and the error of the coarser of its last two results, (...).
     """
     span, substeps = span[..., None], 2
     # One substep, and the first of two: one batch.
@@ -111,11 +104,6 @@ def reference_flow(
     max_substeps: int = 128,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The state of `reference_solve`, or an error where it has not converged.
-
-    Returns
-    -------
-    tuple of Tensor
-        (q1, p1, s1) with shapes (..., n), (..., n), (...).
 
     Raises
     ------
@@ -176,17 +164,6 @@ def path_action(lagrangian: Lagrangian, path: Path, s0: Tensor, T: Tensor | floa
 
     s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 it is stationary
     exactly at the solutions of Herglotz's equations; there it is L_d(q(0), q(T), s0), the exact discrete Lagrangian.
-
-    Parameters
-    ----------
-    lagrangian
-        L(q, v, s).
-    path
-        t ↦ (q(t), q̇(t)), (...) → (..., n) and (..., n).
-    s0
-        (...) initial value.
-    T
-        Final time, () or (...).
 
     Raises
     ------

@@ -10,16 +10,13 @@ from herglotz.errors import InputError
 from herglotz.scenes.cart_pole import cart_pole
 from herglotz.scenes.chain import chain
 from herglotz.scenes.double_pendulum import double_pendulum
-from herglotz.scenes.driven_duffing import driven_duffing
-from herglotz.scenes.driven_pendulum import driven_pendulum
-from herglotz.scenes.duffing import duffing
+from herglotz.scenes.duffing import driven_duffing, duffing
 from herglotz.scenes.kepler import kepler
 from herglotz.scenes.linear_drag import linear_drag
 from herglotz.scenes.nonlinear_action import nonlinear_action
 from herglotz.scenes.oscillator import damped_oscillator
-from herglotz.scenes.parachute import parachute
-from herglotz.scenes.pendulum import damped_pendulum
-from herglotz.scenes.quadratic_drag import quadratic_drag
+from herglotz.scenes.parachute import parachute, quadratic_drag
+from herglotz.scenes.pendulum import damped_pendulum, driven_pendulum
 from herglotz.scenes.rigid_body import rigid_body
 from herglotz.scenes.scene import Scene
 from herglotz.scenes.servo_axis import servo_axis

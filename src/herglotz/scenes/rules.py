@@ -127,32 +127,13 @@ def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rul
     return L_d
 
 
-RULES: dict[str, Callable[[Lagrangian], DiscreteLagrangian]] = {
-    "left": left,
-    "right": right,
-    "midpoint": midpoint,
-    "midpoint_heun": midpoint_heun,
-    "midpoint_plain": midpoint_plain,
-    "trapezoid": trapezoid,
-    "trapezoid_heun": trapezoid_heun,
-    "trapezoid_plain": trapezoid_plain,
-    "lobatto4": lobatto4,
-    "lobatto6": lobatto6,
-}
-
-# Order on a damped problem, measured in tests/unit/scenes/test_rules.py.
-ORDERS = {
-    "left": 1,
-    "right": 1,
-    "midpoint": 2,
-    "midpoint_heun": 2,
-    "midpoint_plain": 1,
-    "trapezoid": 2,
-    "trapezoid_heun": 2,
-    "trapezoid_plain": 1,
-    "lobatto4": 4,
-    "lobatto6": 6,
-}
+# Each rule with its order on a damped problem, measured in tests/unit/scenes/test_rules.py.
+_MEASURED: tuple[tuple[Callable[[Lagrangian], DiscreteLagrangian], int], ...] = (
+    (left, 1), (right, 1), (midpoint, 2), (midpoint_heun, 2), (midpoint_plain, 1), (trapezoid, 2), (trapezoid_heun, 2),
+    (trapezoid_plain, 1), (lobatto4, 4), (lobatto6, 6),
+)  # fmt: skip
+RULES = {rule.__name__: rule for rule, _ in _MEASURED}
+ORDERS = {rule.__name__: order for rule, order in _MEASURED}
 
 
 def all_rules(L: Lagrangian) -> dict[str, DiscreteLagrangian]:

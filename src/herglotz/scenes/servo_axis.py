@@ -43,14 +43,10 @@ def servo_axis(
 
     Parameters
     ----------
-    m
-        Moving mass M, kg.
-    viscous
-        Viscous friction d ≥ 0, N s/m.
-    dry
-        Dry (Coulomb) friction F_c ≥ 0, N.
-    offset
-        Constant force f₀, N: an offset of the amplifier.
+    m, offset
+        Moving mass M, kg, and constant force f₀, N: an offset of the amplifier.
+    viscous, dry
+        Viscous friction d ≥ 0, N s/m, and dry (Coulomb) friction F_c ≥ 0, N.
     amplitude, frequency
         Force A of the motor, N, and its angular frequency ν, rad/s.
 

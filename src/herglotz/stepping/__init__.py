@@ -1,34 +1,25 @@
 """Time steppers: batched Newton, steps, rollouts."""
 
-from herglotz.mechanics.newton import solve
-from herglotz.stepping.composition import Composition, adjoint_pair, kahan_li, suzuki, yoshida
-from herglotz.stepping.events import Event
-from herglotz.stepping.explain import explain_step
-from herglotz.stepping.linearise import Linearised
-from herglotz.stepping.method import OneStepMethod
-from herglotz.stepping.newton import Solution, solve_step
-from herglotz.stepping.state import Status
-from herglotz.stepping.stepper import Crossings, Rollout, State, Step, StepError, Stepper, step_sizes
-
-__all__ = [
-    "Composition",
-    "Crossings",
-    "Event",
-    "Linearised",
-    "OneStepMethod",
-    "Rollout",
-    "Solution",
-    "State",
-    "Status",
-    "Step",
-    "StepError",
-    "Stepper",
-    "adjoint_pair",
-    "explain_step",
-    "kahan_li",
-    "solve",
-    "solve_step",
-    "step_sizes",
-    "suzuki",
-    "yoshida",
-]
+from herglotz.mechanics.newton import solve as solve
+from herglotz.stepping.composition import (
+    Composition as Composition,
+    adjoint_pair as adjoint_pair,
+    kahan_li as kahan_li,
+    suzuki as suzuki,
+    yoshida as yoshida,
+)
+from herglotz.stepping.events import Event as Event
+from herglotz.stepping.explain import explain_step as explain_step
+from herglotz.stepping.linearise import Linearised as Linearised
+from herglotz.stepping.method import OneStepMethod as OneStepMethod
+from herglotz.stepping.newton import Solution as Solution, solve_step as solve_step
+from herglotz.stepping.state import Status as Status
+from herglotz.stepping.stepper import (
+    Crossings as Crossings,
+    Rollout as Rollout,
+    State as State,
+    Step as Step,
+    StepError as StepError,
+    Stepper as Stepper,
+    step_sizes as step_sizes,
+)

@@ -101,7 +101,7 @@ class ModelEquation:
         rate = (1 / h)[..., None]
         g = torch.zeros_like(h)
         if isinstance(self.model.damping, LinearDamping):
-            g = self.model.damping(h, h, h, 1)
+            g = -self.model.damping.rate * h
         c_minus_1, root = torch.expm1(g), (g / 2).exp()[..., None]
         J = -(rate if self.affine is not None else root * rate)[..., None] * self.mass
         more = (self.config.angles, self.config.scale, self.config.speed)

@@ -24,22 +24,7 @@ def explain_step(
     The step is solved again and the conditions c ≠ 0, det M ≠ 0 and no pole of L_d are looked at where Newton ended.
     A step can converge and still be lost: at a conjugate point q1 is right and p1 is rounding. Where Newton fails, the
     longest step that exists is looked for, which tells a motion that runs off to infinity before h from one that ends.
-
-    Parameters
-    ----------
-    L_d
-        The discrete Lagrangian.
-    state
-        (q, p, s) with shapes (..., n), (..., n), (...).
-    h
-        Time step, scalar or (...).
-    max_iterations
-        Of Newton.
-
-    Returns
-    -------
-    list of str
-        E.g. `sample (3,), h = 5: SINGULAR: c = 0: FL⁻ is not defined`.
+    A line is, for example, `sample (3,), h = 5: SINGULAR: c = 0: FL⁻ is not defined`.
 
     Source: erratum E4 and the critical steps of section 4 of `docs/mathematics.md`.
     """
@@ -76,14 +61,11 @@ def longest_step(
     h: Tensor,  # (...)
     max_iterations: int = 30,
 ) -> tuple[Tensor, Tensor]:
-    """The longest step up to h that can be taken from here, and whether the motion escapes there.
+    """The longest step h' ≤ h that can be taken from here, (...), and whether the motion escapes there, (...).
 
-    Returns
-    -------
-    tuple of Tensor
-        h' ≤ h, (...), and (...) bool: whether h' < h and q1 goes ESCAPE times as far between h'/2 and h' as before,
-        and a fifth of that in the last thousandth of h'. Towards a logarithmic pole, q1 = −ln(1 − h/h*)/λ, both ratios
-        grow without bound; towards a fold, q1 = q* − a√(h* − h), they are 2.4 and 0.04.
+    It escapes where h' < h and q1 goes ESCAPE times as far between h'/2 and h' as before, and a fifth of that in the
+    last thousandth of h'. Towards a logarithmic pole, q1 = −ln(1 − h/h*)/λ, both ratios grow without bound; towards a
+    fold, q1 = q* − a√(h* − h), they are 2.4 and 0.04.
     """
     reach, end = _continued(L_d, state, h, max_iterations)
     half, late = (_continued(L_d, state, part * reach, max_iterations)[1] for part in (0.5, 0.999))

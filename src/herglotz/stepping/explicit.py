@@ -108,7 +108,7 @@ class Leapfrog:
         g = torch.zeros_like(h)
         if self.model.damping is not None:
             assert isinstance(self.model.damping, LinearDamping)
-            g = self.model.damping(h, h, h, 1)
+            g = -self.model.damping.rate * h
         c_minus_1, root = torch.expm1(g), (g / 2).exp()
         matrix, stretch, c, half = self.mass, h * root, 1.0 + c_minus_1, h / 2
         if self.friction is not None:

@@ -11,8 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials
-from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, solve
-from herglotz.mechanics.newton_one import newton_one, newton_step, norm
+from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
@@ -58,14 +57,9 @@ def solve_step(
     A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples do not
     influence one another: each has its own Jacobian, its own step length and its own status.
 
-    Parameters
-    ----------
-    order
-        Derivatives of L_d in the result. With 1, an iteration that starts close to the solution keeps its Jacobian
-        and costs first derivatives only; the answer is the same to `tol`.
-    increments
-        Take Δ = q1 − q0 for the unknown, for an L_d with `partials_increment`: no cancellation at small h.
-        Convergence is then relative to the size of Δ.
+    With `order` 1, an iteration that starts close to the solution keeps its Jacobian and costs first derivatives only;
+    the answer is the same to `tol`. With `increments` Δ = q1 − q0 is the unknown, for an L_d with
+    `partials_increment`: nothing cancels at small h, and convergence is relative to the size of Δ.
 
     Raises
     ------
@@ -96,7 +90,7 @@ def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations:
     x = guess - equation.q0 if equation.increments else guess
     rules = Rules(tol, max_iterations, keep=order == 1)
     if x.shape[:-1].numel() == 1:
-        return newton_one(equation, x, rules, sizes.numbers)
+        return newton(equation, x, rules, sizes.numbers, alone=True)
     found = newton(equation, x, rules, sizes.tensors)
     return found._replace(point=equation(found.x, order == 2)) if found.mixed else found
 
@@ -120,7 +114,7 @@ class _Sizes:
         """The same of one sample."""
         size = norm(x.flatten().tolist())
         if self.equation.increments:
-            other = newton_step(point.J, self.equation.push(point))[1] + size
+            other = newton_step(point.J, self.equation.push(point))[2] + size
         else:
             other = norm(self.equation.q0.flatten().tolist())
         limits = torch.finfo(x.dtype)

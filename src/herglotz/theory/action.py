@@ -31,17 +31,6 @@ def curve_action(
 ) -> Tensor:
     """s_0 … s_N with s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k), shape (..., N+1).
 
-    Parameters
-    ----------
-    L_d
-        The discrete Lagrangian.
-    q
-        (..., N+1, n) the discrete curve.
-    s0
-        (...) initial value.
-    h
-        Time steps, a scalar, (N,) or (..., N).
-
     Raises
     ------
     InputError
@@ -65,16 +54,6 @@ def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | 
 
     with R_0 = D1L_d and, at the far end, ∂s_N/∂q_N = D2L_d = p_N. Interior gradients vanish exactly on the solutions
     of the discrete Herglotz equations.
-
-    Parameters
-    ----------
-    L_d, q, s0, h
-        As for `curve_action`.
-
-    Returns
-    -------
-    Action
-        s, σ, R and the gradient.
 
     Raises
     ------

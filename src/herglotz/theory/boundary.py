@@ -73,12 +73,6 @@ def boundary_value(
 
     Parameters
     ----------
-    L_d
-        The discrete Lagrangian.
-    q_start, q_end
-        (..., n) fixed ends.
-    s0
-        (...) initial action.
     h, steps
         A scalar h with a count N, or (N,) or (..., N) steps.
     guess
@@ -139,13 +133,7 @@ def initial_value(
     h: Tensor | float,
     steps: int | None = None,
 ) -> Rollout:
-    """The discrete Cauchy problem: the solution with given q_0, q_1 and s_0.
-
-    Returns
-    -------
-    Rollout
-        N+1 states, the first of them (q_0, p_0, s_0) = FL⁻(q_0, q_1, s_0).
-    """
+    """The discrete Cauchy problem: the solution with given q_0, q_1 and s_0, from FL⁻(q_0, q_1, s_0) on."""
     h_all = step_sizes(torch.as_tensor(h, dtype=q0.dtype, device=q0.device), steps)
     P = partials(L_d, q0, q1, s0, h_all[..., 0])
     start = State(q0.expand(P.D1.shape), momentum_minus(P), s0.expand(P.L.shape))

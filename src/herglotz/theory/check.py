@@ -83,25 +83,18 @@ def check(
 ) -> TheoremCheck:
     """Measure whether S1 = S^{k+1} follows S0 = S^k under L_d, on the open set that the points q stand for.
 
+    L_d is without forces.
+
     Parameters
     ----------
-    L_d
-        The discrete Lagrangian, without forces.
     S0, S1
         Functions on Q, (..., n) → (...): their values are values of s. Derivatives come from autograd, or from a method
         `germ` (`Quadratic`, `PointSource`, `Propagated`).
     q
         (B, n) positions q_k that spread in all n directions: on a single trajectory the equations determine nothing
         (erratum E7).
-    h
-        Time step.
     bound
         Largest residual that passes, relative to the terms of its equation.
-
-    Returns
-    -------
-    TheoremCheck
-        `passed`, `table()`, and the three residuals.
 
     Raises
     ------

@@ -66,16 +66,8 @@ class ConstrainedStepper(OneStepMethod):
         ----------
         state
             (q, p, s) with g(q) = 0; a p off the tangent space is as good as its projection.
-        h
-            Time step > 0, scalar or (...).
         guess
             (..., n) near q1; default q + h v.
-
-        Returns
-        -------
-        Step
-            `residual` is the last Newton step relative to the size of q. NaN where the status is not
-            `Status.CONVERGED`.
 
         Raises
         ------

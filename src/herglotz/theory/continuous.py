@@ -84,11 +84,6 @@ def contact_vector_field(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H.
 
-    Returns
-    -------
-    tuple of Tensor
-        (q̇, ṗ, ṡ) with shapes (..., n), (..., n), (...).
-
     Source: contact Hamilton equations of the paper.
     """
     q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
@@ -103,11 +98,6 @@ def evolution_vector_field(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """E_H = X_H + H ∂_s: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p. H is constant along it and η(E_H) = 0.
 
-    Returns
-    -------
-    tuple of Tensor
-        (q̇, ṗ, ṡ) with shapes (..., n), (..., n), (...).
-
     Source: erratum E2; it is the field for which Theorem 1 of the paper holds as printed.
     """
     return _evolution(H, q, p, s)[:3]
@@ -120,11 +110,6 @@ def herglotz_acceleration(
     s: Tensor,  # (...)
 ) -> Tensor:
     """The acceleration a of Herglotz's equations, L_vv a = L_q + L_s L_v − L_vq v − L_vs L; with q̇ = v and ṡ = L.
-
-    Returns
-    -------
-    Tensor
-        Shape (..., n).
 
     Raises
     ------

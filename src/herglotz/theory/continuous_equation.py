@@ -43,17 +43,7 @@ def inverse_step(L_d: DiscreteLagrangian, state: State, h: Tensor | float, guess
 
     FL⁺ is solved for (q0, s0): p1 = D2L_d(q0, q1, s0) + F⁺, s1 = s0 + L_d; then p0 by FL⁻. `c` is that of the step
     forward.
-
-    Parameters
-    ----------
-    L_d
-        The discrete Lagrangian.
-    state
-        (q1, p1, s1).
-    h
-        Time step > 0.
-    guess
-        (..., n + 1) near (q0, s0); default uniform motion at rest, (q1, s1).
+    `state` is (q1, p1, s1), and `guess` is (..., n + 1) near (q0, s0), by default (q1, s1).
     """
     q1, p1, s1 = state
     n = q1.shape[-1]

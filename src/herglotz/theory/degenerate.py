@@ -80,8 +80,6 @@ class LegendrianStepper(OneStepMethod):
         ----------
         state
             (q, p, s), on the primary constraint; `consistent` puts it there.
-        h
-            Time step > 0, scalar or (...); steps ahead are as long.
         guess
             (..., n) near q1; default q.
 

@@ -56,18 +56,8 @@ class EvolutionStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """One step. Differentiable once with respect to the state, by the implicit-function theorem.
 
-        Parameters
-        ----------
-        state
-            (q, p, s) with shapes (..., n), (..., n), (...).
-        h
-            Time step > 0, scalar or (...).
-
-        Returns
-        -------
-        Step
-            `c` is (1 − h∇̄_sH/2)/(1 + h∇̄_sH/2): for "contact" exactly H1/H0, for "evolution" a second-order value of
-            the factor by which η shrinks along a level of H. NaN where the status is not `Status.CONVERGED`.
+        `c` is (1 − h∇̄_sH/2)/(1 + h∇̄_sH/2): for "contact" exactly H1/H0, for "evolution" a second-order value of the
+        factor by which η shrinks along a level of H.
         """
         q, p, s = check_state(state)
         h = check_h(h, q)

@@ -58,11 +58,6 @@ def generating_function(
     The chain rule through the endpoint map (q̂0, p̂0, ŝ0) ↦ q_k gives D2 S = (∂s_k/∂p̂0)(∂q_k/∂p̂0)⁻¹ and, with it,
     D1 and D3.
 
-    Returns
-    -------
-    GeneratingFunction
-        `spread` tells how far each sample is from a caustic.
-
     Source: generating functions of the paper, with the sign of erratum E1.
     """
     return GeneratingFunction.of(s, *flow_derivative(flow_k, q, p, s))
@@ -76,17 +71,8 @@ def generating_functions(flows: Iterable[Flow], q: Tensor, p: Tensor, s: Tensor)
 def left_generating_function(flow_k: Flow, q: Tensor, p: Tensor, s: Tensor) -> GeneratingFunction:
     """S^{k−}(q̂0, q_k, s_k) = s_k − ŝ0 and its three derivatives along the solutions from (q̂0, p̂0, ŝ0).
 
-    The chain rule through (p̂0, ŝ0) ↦ (q_k, s_k) at fixed q̂0 gives D2 and D3 together, and with them D1.
-
-    Parameters
-    ----------
-    flow_k, q, p, s
-        As for `generating_function`.
-
-    Returns
-    -------
-    GeneratingFunction
-        With D3 = ∂S^{k−}/∂s_k. Not defined where σ_k = 0 or at a caustic.
+    The chain rule through (p̂0, ŝ0) ↦ (q_k, s_k) at fixed q̂0 gives D2 and D3 = ∂S^{k−}/∂s_k together, and with them
+    D1. Not defined where σ_k = 0 or at a caustic.
 
     Source: erratum E5 for k = 1, composed.
     """

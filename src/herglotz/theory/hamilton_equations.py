@@ -22,11 +22,6 @@ def right_equations(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """q1 = D2H⁺, p0 = D1H⁺/(1 − D3H⁺), s1 = s0 + p1·D2H⁺ − H⁺.
 
-    Returns
-    -------
-    tuple of Tensor
-        (q1, p0, s1) with shapes (..., n), (..., n), (...).
-
     Source: right discrete contact Hamilton equations of the paper.
     """
     return P.D2, P.D1 / (1 - P.D3)[..., None], s0 + (p1 * P.D2).sum(-1) - P.L
@@ -38,11 +33,6 @@ def left_equations(
     s1: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
     """q0 = −D1H⁻, p1 = −D2H⁻/(1 + D3H⁻), s0 = s1 + H⁻ − p0·D1H⁻.
-
-    Returns
-    -------
-    tuple of Tensor
-        (q0, p1, s0) with shapes (..., n), (..., n), (...).
 
     Source: left discrete contact Hamilton equations of the paper, corrected by erratum E5.
     """
@@ -57,13 +47,7 @@ def right_step(
     h: Tensor | float,
     guess: Tensor | None = None,  # (..., n) near p1; default p0
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(q1, p1, s1) by the right equations: D1H⁺(q0, p1, s0) = (1 − D3H⁺) p0 is solved for p1.
-
-    Returns
-    -------
-    tuple of Tensor
-        NaN in the samples where Newton found no solution.
-    """
+    """(q1, p1, s1) by the right equations: D1H⁺(q0, p1, s0) = (1 − D3H⁺) p0 is solved for p1; NaN without one."""
 
     def equations(p1: Tensor) -> tuple[Tensor, Tensor]:
         P = partials(H_plus, q0, p1, s0, h, order=2)
@@ -82,13 +66,7 @@ def left_step(
     h: Tensor | float,
     guess: tuple[Tensor, Tensor] | None = None,  # (..., n), (...) near (q1, s1); default (q0, s0)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """(q1, p1, s1) by the left equations: those for q0 and s0 are solved for (q1, s1) together.
-
-    Returns
-    -------
-    tuple of Tensor
-        NaN in the samples where Newton found no solution.
-    """
+    """(q1, p1, s1) by the left equations: those for q0, s0 are solved for (q1, s1) together; NaN without any."""
     n = q0.shape[-1]
 
     def equations(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -96,17 +96,8 @@ def riccati_step(P: Partials, S: Quadratic) -> Quadratic:
 
     α′ = C − Bᵀ(A + cα)⁻¹B,    β′ = −cBᵀ(A + cα)⁻¹β,    δ′ = cδ − ½c²β·(A + cα)⁻¹β
 
-    Parameters
-    ----------
-    P
-        Second-order partials of L_d at the origin.
-    S
-        S^k.
-
-    Returns
-    -------
-    Quadratic
-        Not finite at a caustic, where A + cα is singular.
+    P are the second-order partials of L_d at the origin, and S is S^k. The result is not finite at a caustic, where
+    A + cα is singular.
 
     Source: section 3 of `docs/mathematics.md`.
     """

@@ -5,7 +5,6 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.legendre import mixed_hessian
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.mechanics.regularity import scaled_margin
@@ -15,11 +14,6 @@ from herglotz.theory.left import LeftLagrangian, unforced
 def right_hamiltonian_on_flow(q1: Tensor, p1: Tensor, L: Tensor) -> Tensor:
     """H⁺ = p1·q1 − L_d for a step already solved; shape (...)."""
     return (p1 * q1).sum(-1) - L
-
-
-def left_hamiltonian_on_flow(q0: Tensor, p0: Tensor, L: Tensor) -> Tensor:
-    """H⁻ = −p0·q0 − L⁻, with L⁻ = s1 − s0 = L_d along the step (erratum E5); shape (...)."""
-    return -(p0 * q0).sum(-1) - L
 
 
 class RightHamiltonian:
@@ -56,7 +50,9 @@ class RightHamiltonian:
             start = q0 if self.near is None else self.near.broadcast_to(q0.shape)
             q1 = find_root(equations, start).solved
             P = unforced(partials(self.L_d, q0, q1, s0, h, order=2))
-            return torch.where(_fold(P.D22, mixed_hessian(P), P)[..., None], torch.nan, q1)
+            # (...) where D22, which must be inverted, is singular to rounding beside the other blocks
+            fold = ~(scaled_margin(P.D22, P.D12, P.D11, P.D22) > 1e3 * torch.finfo(q1.dtype).eps)
+            return torch.where(fold[..., None], torch.nan, q1)
 
     def __call__(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float) -> Tensor:
         """H⁺, shape (...); once differentiable (q1 is stationary, so its own derivative does not enter)."""
@@ -89,7 +85,8 @@ class LeftHamiltonian:
 
     D1H⁻ = −q0,    D2H⁻ = −D2L⁻,    D3H⁻ = −D3L⁻  (envelope theorem).
 
-    Exists where c ≠ 0 and det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton found no q0.
+    It is the right Hamiltonian of L⁻ with its two positions exchanged, at the momentum −p0. Exists where c ≠ 0 and
+    det D1D1L⁻ ≠ 0; NaN elsewhere, and where Newton found no q0.
 
     Parameters
     ----------
@@ -102,81 +99,41 @@ class LeftHamiltonian:
     """
 
     def __init__(self, L_d: DiscreteLagrangian, near: Tensor | None = None):
-        self.left = LeftLagrangian(L_d)
-        self.near = near
+        self.mirror = RightHamiltonian(_Exchanged(LeftLagrangian(L_d)), near)
 
     def position(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
         """q0 with D1L⁻(q0, q1, s1) = −p0, without a graph; shape (..., n), NaN where there is none."""
-
-        def equations(q0: Tensor) -> tuple[Tensor, Tensor]:
-            P = partials(self.left, q0, q1, s1, h, order=2)
-            return P.D1 + p0, P.D11
-
-        with torch.no_grad():
-            p0, q1, s1 = _broadcast(p0.detach(), q1.detach(), s1.detach(), h)
-            start = q1 if self.near is None else self.near.broadcast_to(q1.shape)
-            q0 = find_root(equations, start).solved
-            P = partials(self.left, q0, q1, s1, h, order=2)
-            return torch.where(_fold(P.D11, P.D12, P)[..., None], torch.nan, q0)
+        return self.mirror.position(q1, -p0, s1, h)
 
     def __call__(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float) -> Tensor:
         """H⁻, shape (...); once differentiable."""
-        q0 = self.position(p0, q1, s1, h)
-        return left_hamiltonian_on_flow(q0, p0, self.left(q0, q1, s1, h))
+        return self.mirror(q1, -p0, s1, h)
 
     def partials(self, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
-        """H⁻ and its derivatives with respect to (p0, q1, s1): a Legendre transform in the first argument."""
-        q0 = self.position(p0, q1, s1, h)
-        P = partials(self.left, q0, q1, s1, h, order)
-        first = (left_hamiltonian_on_flow(q0, p0, P.L), -q0, -P.D2, -P.D3)
+        """H⁻ and its derivatives with respect to (p0, q1, s1)."""
+        P = _exchanged(self.mirror.partials(q1, -p0, s1, h, order))
+        first = (P.L, -P.D1, P.D2, P.D3)
         if order == 1:
             return Partials(*first)
-        G = torch.linalg.inv_ex(P.D11)[0]
-        B = G @ P.D12
-        v = (G @ P.D13[..., None])[..., 0]
-        return Partials(
-            *first,
-            D11=G,
-            D12=B,
-            D22=P.D12.mT @ B - P.D22,
-            D13=v,
-            D23=(P.D12.mT @ v[..., None])[..., 0] - P.D23,
-            D33=(P.D13 * v).sum(-1) - P.D33,
-        )
+        return Partials(*first, D11=P.D11, D12=-P.D12, D22=P.D22, D13=-P.D13, D23=P.D23, D33=P.D33)
 
 
-def solve_right_position(
-    L_d: DiscreteLagrangian,
-    q0: Tensor,  # (..., n)
-    p1: Tensor,  # (..., n)
-    s0: Tensor,  # (...)
-    h: Tensor | float,
-    guess: Tensor,  # (..., n) near q1
-) -> Tensor:
-    """Solve D2L_d(q0, q1, s0) = p1 for q1 by Newton from `guess`; shape (..., n), NaN where there is no solution.
+class _Exchanged:
+    """A function of two positions and an action, its positions exchanged."""
 
-    This needs det D2D2L_d ≠ 0, which is *not* what stepping needs (erratum E4): steps go through FL⁻.
-    """
-    return RightHamiltonian(L_d, guess).position(q0, p1, s0, h)
+    def __init__(self, of: LeftLagrangian):
+        self.of = of
+
+    def __call__(self, q1: Tensor, q0: Tensor, s: Tensor, h: Tensor) -> Tensor:
+        return self.of(q0, q1, s, h)
+
+    def partials(self, q1: Tensor, q0: Tensor, s: Tensor, h: Tensor, order: int = 1) -> Partials:
+        return _exchanged(self.of.partials(q0, q1, s, h, order))
 
 
-def right_hamiltonian(
-    L_d: DiscreteLagrangian, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float, guess: Tensor
-) -> Tensor:
-    """H⁺(q0, p1, s0), with Newton's iteration for q1 started at `guess`; see `RightHamiltonian`."""
-    return RightHamiltonian(L_d, guess)(q0, p1, s0, h)
-
-
-def left_hamiltonian(
-    L_d: DiscreteLagrangian, p0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, guess: Tensor
-) -> Tensor:
-    """H⁻(p0, q1, s1), with Newton's iteration for q0 started at `guess`; see `LeftHamiltonian`."""
-    return LeftHamiltonian(L_d, guess)(p0, q1, s1, h)
-
-
-def _fold(X: Tensor, M: Tensor, P: Partials) -> Tensor:
-    """(...) whether X, a block that must be inverted, is singular to rounding beside M, D11 and D22."""
-    return ~(scaled_margin(X, M, P.D11, P.D22) > 1e3 * torch.finfo(X.dtype).eps)
+def _exchanged(P: Partials) -> Partials:
+    D12 = P.D12 if P.D12 is None else P.D12.mT
+    return Partials(P.L, P.D2, P.D1, P.D3, P.D22, D12, P.D11, P.D23, P.D13, P.D33)
 
 
 def _broadcast(q: Tensor, p: Tensor, s: Tensor, h: Tensor | float) -> tuple[Tensor, Tensor, Tensor]:

@@ -80,13 +80,9 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
 
         D1 L_d(q0, q1, s0) + c γ0(q0, s0) = 0,    s0 + L_d(q0, q1, s0) = s1,
 
-    by Newton with closed derivatives, from (q1, s1), and returns γ1 = D2 L_d. No step of the flow is inverted.
-
-    Returns
-    -------
-    Callable
-        γ1(q1, s1), differentiable once by the implicit-function theorem, so that it can be transported again. It raises
-        `InputError` where no preimage is found: past a caustic of γ0, or for too large an h.
+    by Newton with closed derivatives, from (q1, s1), and returns γ1 = D2 L_d. No step of the flow is inverted. γ1 is
+    differentiable once by the implicit-function theorem, so that it can be transported again. It raises `InputError`
+    where no preimage is found: past a caustic of γ0, or for too large an h.
     """
 
     def equation(x: Tensor, q1: Tensor, s1: Tensor) -> tuple[Tensor, Tensor]:

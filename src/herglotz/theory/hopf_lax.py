@@ -47,12 +47,8 @@ def hopf_lax(
 
     Parameters
     ----------
-    L_d
-        The discrete Lagrangian.
     S
         S^k: a callable on (..., n), e.g. `Quadratic` or `PointSource`. Values are values of s.
-    y
-        (..., n) where S^{k+N} is wanted.
     h, steps
         A scalar h with a count N, or (N,) or (..., N) steps.
     guess

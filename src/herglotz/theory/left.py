@@ -60,11 +60,7 @@ class LeftLagrangian:
         """Value and derivatives of L⁻ with respect to (q0, q1, s1), by the implicit-function theorem.
 
         With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c.
-
-        Returns
-        -------
-        Partials
-            Of L⁻: its `c` is 1 + D3L⁻, not the conformal factor, which is 1/(1 − D3L⁻).
+        Their `c` is 1 + D3L⁻, not the conformal factor, which is 1/(1 − D3L⁻).
 
         Raises
         ------

@@ -35,11 +35,6 @@ def fiber_inverse(
 
     Differentiable once with respect to q, y and s, by the implicit-function theorem.
 
-    Returns
-    -------
-    Tensor
-        Shape (..., n).
-
     Raises
     ------
     InputError
@@ -67,11 +62,7 @@ def legendre_dual(f: ScalarField) -> ScalarField:
     """The Legendre transform f*(q, y, s) = x·y − f(q, x, s) with f_x = y: L ↦ H and H ↦ L.
 
     The value is stationary in x, so a slope of x that is right to first order makes f* right up to third derivatives.
-
-    Returns
-    -------
-    Callable
-        (q, y, s) → (...); it raises `InputError` where `fiber_inverse` does.
+    It raises `InputError` where `fiber_inverse` does.
     """
 
     def dual(q: Tensor, y: Tensor, s: Tensor) -> Tensor:

@@ -65,17 +65,8 @@ def contact_complement(p: Tensor, tangent: Tensor) -> Tensor:
 def contact_product_point(start: Triple, end: Triple, tau: Tensor) -> Triple:
     """A point (x̂, x, τ) of the contact product in the Darboux coordinates of T*(Q̂×Q×R) × R.
 
-    Parameters
-    ----------
-    start, end
-        (q̂, p̂, ŝ) and (q, p, s).
-    tau
-        (...) the coordinate τ of the extra R; σ on the graph of a map with conformal factor σ.
-
-    Returns
-    -------
-    tuple of Tensor
-        Base (q̂, q, ŝ), momenta (τp̂, −p, −τ), both (..., 2n+1), and z = −s, (...).
+    `start` and `end` are (q̂, p̂, ŝ) and (q, p, s), and `tau` is σ on the graph of a map with conformal factor σ. The
+    base is (q̂, q, ŝ), the momenta are (τp̂, −p, −τ), both (..., 2n+1), and z = −s.
     """
     (q0, p0, s0), (q1, p1, s1) = start, end
     base = torch.cat([q0, q1, s0[..., None]], -1)
@@ -91,12 +82,7 @@ def contact_product_states(base: Tensor, momenta: Tensor, z: Tensor) -> tuple[Tr
 
 
 def product_potential(S: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Function:
-    """W(q̂, q, ŝ) = −(ŝ + S(q̂, q, ŝ)), whose prolongation is the graph of the map that S generates.
-
-    Returns
-    -------
-    Callable
-        A function of the joint base point, (..., 2n+1) → (...).
+    """W(q̂, q, ŝ) = −(ŝ + S(q̂, q, ŝ)) of the base point (..., 2n+1): j¹W is the graph of the map that S generates.
 
     Source: generating functions of the paper with the sign of erratum E1.
     """

@@ -30,13 +30,7 @@ def infinitesimal_generator(action: Action, q: Tensor) -> Tensor:
 
 
 def momentum_map(action: Action, shift: Shift | None = None) -> ScalarField:
-    """J(q, p, s) = p·ξ(q) − χ′(q), in units of action per unit of ε.
-
-    Returns
-    -------
-    Callable
-        (q, p, s) → (...), differentiable, so that it has a bracket with H.
-    """
+    """J(q, p, s) = p·ξ(q) − χ′(q), in units of action per unit of ε; differentiable, so it has a bracket with H."""
 
     def J(q: Tensor, p: Tensor, s: Tensor) -> Tensor:  # noqa: ARG001  one signature for all functions on T*Q × R
         def moved(e: Tensor) -> Tensor:

@@ -84,17 +84,7 @@ class RigidBodyStepper:
     def step(self, state: BodyState, h: Tensor | float) -> Step:
         """One step: solve FL⁻ for F → attitude → momentum → action. Differentiable with respect to the state and h.
 
-        Parameters
-        ----------
-        state
-            (R, M, s) with shapes (..., 3, 3), (..., 3), (...).
-        h
-            Time step > 0, scalar or (...).
-
-        Returns
-        -------
-        Step
-            NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F.
+        NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F.
 
         Raises
         ------

@@ -14,18 +14,7 @@ def hat(w: Tensor) -> Tensor:
 
 
 def cayley(f: Tensor) -> Tensor:
-    """(I + f̂)(I − f̂)⁻¹ = I + 2(f̂ + f̂²)/(1 + |f|²): the rotation about f by 2 arctan |f|; all but θ = π.
-
-    Parameters
-    ----------
-    f
-        (..., 3), any size.
-
-    Returns
-    -------
-    Tensor
-        (..., 3, 3).
-    """
+    """(I + f̂)(I − f̂)⁻¹ = I + 2(f̂ + f̂²)/(1 + |f|²) of f (..., 3): the rotation by 2 arctan |f|; all but θ = π."""
     F = hat(f)
     eye = torch.eye(3, dtype=f.dtype, device=f.device)
     return eye + 2.0 / (1.0 + (f * f).sum(-1))[..., None, None] * (F + F @ F)

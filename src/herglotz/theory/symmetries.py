@@ -131,14 +131,12 @@ def symmetries(
 ) -> Symmetries:
     """The Lie algebra of affine point symmetries of L_d, and the quantities J with J_{k+1} = c_k J_k.
 
+    L_d may have forces.
+
     Parameters
     ----------
-    L_d
-        The discrete Lagrangian, also one with forces.
     states
         Starts of motions that fill an open set; of a single motion not every direction is determined (`unseen`).
-    h
-        Time step.
     steps
         K, the steps of each motion; the motions should last long enough for what is no symmetry to change.
     precision
@@ -147,10 +145,6 @@ def symmetries(
         Which coordinates are angles: ξ and χ do not depend on those, which keeps them single-valued.
     coordinates
         Names for the words; by default q1, q2, ….
-
-    Returns
-    -------
-    Symmetries
 
     Raises
     ------

@@ -91,13 +91,7 @@ def pairs_of(states: State, stride: int, count: int, seed: int) -> tuple[State, 
 def distil(
     model: ContactLagrangian, before: State, after: State, h: float, *, iterations: int = 80
 ) -> tuple[ContactLagrangian, float]:
-    """Fit every parameter of a model to a flow map over h; the given model is the starting point.
-
-    Returns
-    -------
-    tuple
-        The distilled model, and the RMS of its one-step residuals, in units of q.
-    """
+    """A model whose parameters are fitted, from those it has, to a flow map over h; and its one-step RMS, as q is."""
     problem = FlowProblem(model, before, after, h)
     result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3)
     new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)

@@ -16,8 +16,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.polynomial import chebyshev
-from numpy.polynomial import polynomial as power
+from numpy.polynomial import chebyshev, polynomial as power
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import torch
@@ -51,6 +51,7 @@ class Candidate:
     cost: Cost
     model: ContactLagrangian = field(repr=False)
     kicks: KickStepper | None = field(default=None, repr=False)  # steps in place of the model
+    stepper: Any = field(default=None, repr=False)  # the form that was measured
 
     @property
     def us(self) -> float:
@@ -64,13 +65,11 @@ class Candidate:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain dictionary for JSON."""
-        s, e = self.setting, [self.median, self.bound, self.worst]
+        errors = {f"error_{k}": getattr(self, k) for k in ("median", "bound", "worst")}
         parameters = sum(p.numel() for p in self.model.parameters())
-        median, bound, worst = (x if math.isfinite(x) else None for x in e)  # JSON has no infinity: a step failed
         return {
-            "h": s.h, "multiple": s.multiple, "width": s.width, "artefact": s.artefact, "dtype": s.dtype, "tol": s.tol,
-            "kicks": s.kicks,
-            "error_median": median, "error_bound": bound, "error_worst": worst,
+            **asdict(self.setting),
+            **{k: x if math.isfinite(x) else None for k, x in errors.items()},  # JSON has no infinity: a step failed
             "step_us": self.cost.step_us, "us_per_time": self.us, "us_per_time_spread": self.spread,
             "parameters": parameters if self.kicks is None else self.kicks.parameters,
         }  # fmt: skip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -14,7 +14,7 @@ from tqdm import tqdm
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Stepper
+from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Run
 from herglotz.tune.config import TuneConfig, allowed_failures
@@ -27,15 +27,7 @@ from herglotz.tune.result import Candidate, Setting, Tuning
 
 HOPELESS = 10.0  # where a distilled model exceeds the limit this many times, no larger step is tried at its width
 LONGEST = 200  # steps of the run in the default horizon, at most
-
-
-@dataclass(frozen=True)
-class _Tried:
-    setting: Setting
-    model: ContactLagrangian
-    stepper: Any
-    errors: Tensor  # (B,) on the choosing starts
-    kicks: KickStepper | None = None
+UNTIMED = Cost(math.nan, math.nan)
 
 
 @one_thread()
@@ -81,23 +73,19 @@ def tune(
     training, choosing, judging = (
         record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon) for k in range(3)
     )
-    tried: list[_Tried] = []
-    notes: list[str] = []
     total = len(config.multiples) * (1 + len(config.widths))
     with tqdm(total=total, desc="settings", disable=None if progress is None else not progress, leave=False) as bar:
-        for key, model in _models(run, config, training, choosing, max_error, notes, bar):
-            tried += _forms(key, model, key[0] * run.h, config, choosing, notes)
-            bar.update(1)
-        tried += _kicks(run, config, training, choosing, notes, bar)
+        search = _Search(run, frozen_double(run), config, max_error, training, choosing, [], bar)
+        tried = [*search.forms(), *search.kicks()]
     costs = _costs(tried, choosing, config.rounds)
-    candidates = [_candidate(t, cost, config) for t, cost in zip(tried, costs, strict=True)]
+    candidates = [replace(c, cost=cost) for c, cost in zip(tried, costs, strict=True)]
     chosen = choose(candidates, asked)
-    errors = _errors(tried[candidates.index(chosen)].stepper, chosen.setting.h, judging)
+    errors = _errors(chosen.stepper, chosen.setting.h, judging)
     held_out = _held_out(errors, chosen.bound if max_error is None else max_error, config)
     stride = round(chosen.setting.h / training.base)
     return Tuning(
         run, config, horizon, asked, candidates, chosen, held_out, training.every(stride),
-        list(dict.fromkeys(notes)),
+        list(dict.fromkeys(search.notes)),
     )  # fmt: skip
 
 
@@ -122,91 +110,92 @@ def _horizon(run: Run, config: TuneConfig, horizon: float | None) -> float:
     return horizon
 
 
-def _models(
-    run: Run,
-    config: TuneConfig,
-    training: Motions,
-    choosing: Motions,
-    max_error: float | None,
-    notes: list[str],
-    bar: tqdm,
-) -> Iterator[tuple[tuple[float, int | None], ContactLagrangian]]:
-    """Yield ((multiple, width), model) to try: the run's own model at every step, then the distilled models."""
-    own = frozen_double(run)
-    yield (1, None), own  # `Tuning.own` relies on the run as it is being the first
-    multiples = sorted(config.multiples)
-    for m in multiples:
-        if m != 1:
-            yield (m, None), own
-    for width in config.widths:
+@dataclass(frozen=True)
+class _Search:
+    run: Run
+    own: ContactLagrangian  # the run's model
+    config: TuneConfig
+    max_error: float | None
+    training: Motions
+    choosing: Motions
+    notes: list[str]
+    bar: tqdm
+
+    def _models(self) -> Iterator[tuple[int, int | None, ContactLagrangian]]:
+        """Yield (multiple, width, model): the run's own model at every step, then the distilled models."""
+        config, own = self.config, self.own
+        yield 1, None, own  # `Tuning.own` relies on the run as it is being the first
+        multiples = sorted(config.multiples)
         for m in multiples:
-            start = widened(own, width, max(run.model.config.correction_depth, 2))
-            if m == 1 and _size(start) >= _size(own):
-                continue  # the run's own model is exact at this step and no larger
-            h = m * run.h
-            bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
-            before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
-            model, _ = distil(start, before, after, h, iterations=config.iterations)
-            model.requires_grad_(False)
-            yield (m, width), model
-            bound = bound_of(_errors(Stepper(model), h, choosing), config)
-            if not math.isfinite(bound) or (max_error is not None and bound > HOPELESS * max_error):
-                notes.append(f"width {width}: no step beyond h = {h:.4g}, where the bound is {bound:.2g}")
-                break
+            if m != 1:
+                yield m, None, own
+        for width in config.widths:
+            for m in multiples:
+                start = widened(own, width, max(own.config.correction_depth, 2))
+                if m == 1 and _size(start) >= _size(own):
+                    continue  # the run's own model is exact at this step and no larger
+                h = m * self.run.h
+                self.bar.set_postfix_str(f"distilling to h {h:.3g}, width {width}")
+                model, _ = distil(start, *self._pairs(h), h, iterations=config.iterations)
+                model.requires_grad_(False)
+                yield m, width, model
+                bound = bound_of(_errors(Stepper(model), h, self.choosing), config)
+                if not math.isfinite(bound) or (self.max_error is not None and bound > HOPELESS * self.max_error):
+                    self.notes.append(f"width {width}: no step beyond h = {h:.4g}, where the bound is {bound:.2g}")
+                    break
+
+    def _pairs(self, h: float) -> tuple[State, State]:
+        return pairs_of(self.training.states, round(h / self.training.base), self.config.pairs, self.config.seed)
+
+    def forms(self) -> Iterator[Candidate]:
+        """Yield every model in every demanded form; the first is the run's own in eager float64."""
+        for multiple, width, model in self._models():
+            h = multiple * self.run.h
+            if (multiple, width) == (1, None) or "eager" in self.config.artefacts:
+                solved = model.linear_in_q1  # then a tolerance changes nothing
+                for tol in dict.fromkeys((None, *(() if solved else self.config.tolerances))):
+                    yield self._tried(
+                        Setting(multiple, h, width, "eager", "float64", tol), Stepper(model, tol=tol), model
+                    )
+            if "c" in self.config.artefacts:
+                yield from self._in_c(Setting(multiple, h, width, "c", "float64", None), model)
+            self.bar.update(1)
+
+    def kicks(self) -> Iterator[Candidate]:
+        """Yield steps of a few kicks and drifts in C, fitted to motions of the reference."""
+        config = self.config
+        if not config.kicks or "c" not in config.artefacts or not can_kick(self.own):
+            return
+        for m in sorted(config.multiples):
+            h = m * self.run.h
+            for count in config.kicks:
+                self.bar.set_postfix_str(f"{count} kicks, h {h:.3g}")
+                found = fit_kicks(self.own, *self._pairs(h), h, kicks=count, iterations=2 * config.iterations)
+                compiled = list(self._in_c(Setting(m, h, None, "c", "float64", None, count), self.own, found))
+                if not compiled:
+                    return
+                yield from compiled
+
+    def _in_c(
+        self, setting: Setting, model: ContactLagrangian, kicks: KickStepper | None = None
+    ) -> Iterator[Candidate]:
+        try:
+            for dtype in ("float64", "float32"):
+                form = CompiledKicks(kicks, dtype) if kicks else compile_c(model, h=setting.h, dtype=dtype)
+                yield self._tried(replace(setting, dtype=dtype), form, model, kicks)
+        except InputError as error:
+            self.notes.append(f"no C: {error}")
+
+    def _tried(
+        self, setting: Setting, stepper: Any, model: ContactLagrangian, kicks: KickStepper | None = None
+    ) -> Candidate:
+        e = _errors(stepper, setting.h, self.choosing)
+        bounds = float(e.median()), bound_of(e, self.config), float(e.max())
+        return Candidate(setting, *bounds, UNTIMED, model, kicks, stepper)
 
 
 def _size(model: ContactLagrangian) -> int:
     return sum(p.numel() for p in model.parameters())
-
-
-def _forms(
-    key: tuple[float, int | None],
-    model: ContactLagrangian,
-    h: float,
-    config: TuneConfig,
-    choosing: Motions,
-    notes: list[str],
-) -> Iterator[_Tried]:
-    """Yield a model in every demanded form, with its errors; the first form is always eager float64."""
-
-    def tried(stepper: Any, artefact: str, dtype: str, tol: float | None = None) -> _Tried:
-        setting = Setting(key[0], h, key[1], artefact, dtype, tol)
-        return _Tried(setting, model, stepper, _errors(stepper, h, choosing))
-
-    own = key == (1, None)
-    if own or "eager" in config.artefacts:
-        solved = model.linear_in_q1  # then a tolerance changes nothing
-        for tol in dict.fromkeys((None, *(() if solved else config.tolerances))):
-            yield tried(Stepper(model, tol=tol), "eager", "float64", tol)
-    if "c" in config.artefacts:
-        try:
-            for dtype in ("float64", "float32"):
-                yield tried(compile_c(model, h=h, dtype=dtype), "c", dtype)
-        except InputError as error:
-            notes.append(f"no C: {error}")
-
-
-def _kicks(
-    run: Run, config: TuneConfig, training: Motions, choosing: Motions, notes: list[str], bar: tqdm
-) -> Iterator[_Tried]:
-    """Yield steps of a few kicks and drifts in C, fitted to motions of the reference."""
-    own = frozen_double(run)
-    if not config.kicks or "c" not in config.artefacts or not can_kick(own):
-        return
-    for m in sorted(config.multiples):
-        h = m * run.h
-        before, after = pairs_of(training.states, round(h / training.base), config.pairs, config.seed)
-        for count in config.kicks:
-            bar.set_postfix_str(f"{count} kicks, h {h:.3g}")
-            found = fit_kicks(own, before, after, h, kicks=count, iterations=2 * config.iterations)
-            try:
-                for dtype in ("float64", "float32"):
-                    stepper = CompiledKicks(found, dtype)
-                    setting = Setting(m, h, None, "c", dtype, None, count)
-                    yield _Tried(setting, own, stepper, _errors(stepper, h, choosing), found)
-            except InputError as error:
-                notes.append(f"no C: {error}")
-                return
 
 
 def _errors(stepper: Any, h: float, motions: Motions) -> Tensor:
@@ -226,18 +215,13 @@ def bound_of(errors: Tensor, config: TuneConfig) -> float:
     return float(errors.sort(descending=True).values[allowed])
 
 
-def _costs(tried: list[_Tried], choosing: Motions, rounds: int) -> list[Cost]:
+def _costs(tried: list[Candidate], choosing: Motions, rounds: int) -> list[Cost]:
     timed = []
-    for t in tried:
-        stride = round(t.setting.h / choosing.base)
+    for c in tried:
+        stride = round(c.setting.h / choosing.base)
         steps = (choosing.states.s.shape[1] - 1) // stride
-        timed.append(timed_stepping(t.stepper, choosing.starts(), t.setting.h, steps))
+        timed.append(timed_stepping(c.stepper, choosing.starts(), c.setting.h, steps))
     return measure_costs(timed, rounds)
-
-
-def _candidate(t: _Tried, cost: Cost, config: TuneConfig) -> Candidate:
-    e = t.errors
-    return Candidate(t.setting, float(e.median()), bound_of(e, config), float(e.max()), cost, t.model, t.kicks)
 
 
 def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:

@@ -1,7 +1,5 @@
 """Checks that a scene, a fit, a file or any L_d is a contact integrator, and that a fit predicts its data."""
 
-from herglotz.verify.report import Check, Report
-from herglotz.verify.symmetries import symmetries
-from herglotz.verify.verifier import verify
-
-__all__ = ["Check", "Report", "symmetries", "verify"]
+from herglotz.verify.report import Check as Check, Report as Report
+from herglotz.verify.symmetries import symmetries as symmetries
+from herglotz.verify.verifier import verify as verify

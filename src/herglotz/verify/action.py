@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -20,10 +19,10 @@ from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import State
 from herglotz.theory import (
     GeneratingFunction,
+    LeftHamiltonian,
+    RightHamiltonian,
     hamilton_jacobi_residual,
     left_hamilton_jacobi_residual,
-    left_hamiltonian,
-    right_hamiltonian,
     right_hamiltonian_on_flow,
 )
 from herglotz.verify.legendre import LEFT, RIGHT
@@ -126,7 +125,7 @@ def hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
             H = right_hamiltonian_on_flow(after.q, after.p, after.s - before.s)
         else:  # the guess picks the branch of H⁺; it is slightly wrong, so that the solver has to work
             guess = after.q + 1e-3 * (after.q - before.q)
-            H = right_hamiltonian(subject.L_d, before.q, after.D2, before.s, subject.h, guess)
+            H = RightHamiltonian(subject.L_d, guess)(before.q, after.D2, before.s, subject.h)
         residual = hamilton_jacobi_residual(after.S, before.S, after.D2, after.q, H)
         return residual, (after.D2 * after.q).sum(-1), H
 
@@ -142,11 +141,11 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
 
     H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
     """
-    L_d: Any = subject.L_d
+    assert subject.L_d is not None  # `verify` asks
 
     def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
         guess = before.q - 1e-3 * (after.q - before.q)  # slightly wrong, so that the solver has to work
-        H = left_hamiltonian(L_d, before.D2, after.q, after.s, subject.h, guess)
+        H = LeftHamiltonian(subject.L_d, guess)(before.D2, after.q, after.s, subject.h)
         residual = left_hamilton_jacobi_residual(after.S, before.S, before.D2, before.q, H)
         return residual, (before.D2 * before.q).sum(-1), H
 

@@ -8,8 +8,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.stepping import State
-from herglotz.theory import Symmetries
-from herglotz.theory import symmetries as of_lagrangian
+from herglotz.theory import Symmetries, symmetries as of_lagrangian
 from herglotz.theory.symmetries import PRECISION
 from herglotz.threads import one_thread
 from herglotz.training import Run

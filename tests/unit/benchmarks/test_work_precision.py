@@ -6,9 +6,7 @@ import pytest
 import torch
 
 pytest.importorskip("scipy", reason="scipy is an extra of the benchmarks")
-from benchmarks import work_precision
-from benchmarks import work_precision_rivals as rivals
-from benchmarks import work_precision_ways as ways
+from benchmarks import work_precision, work_precision_rivals as rivals, work_precision_ways as ways
 from herglotz.scenes.rigid_body import FreeBody
 
 

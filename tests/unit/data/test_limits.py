@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from herglotz.data import Trajectories, load
-from herglotz.data import npz_format as npz
+from herglotz.data import Trajectories, load, npz_format as npz
 from herglotz.data.checks import check_sizes
 from herglotz.data.csv_columns import Wanted, assign
 from herglotz.data.csv_format import _read_numbers, _read_rows, read_csv

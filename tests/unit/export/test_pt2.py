@@ -16,8 +16,7 @@ from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
 from herglotz.export import ExportedStepper, compare, export_pt2, load_pt2, weights_digest
 from herglotz.export.metadata import FORMAT
-from herglotz.export.newton import status_of, unfinished
-from herglotz.export.step import StepGraphs
+from herglotz.export.step import StepGraphs, status_of, unfinished
 from herglotz.mechanics import flow_derivative, partials, step_derivative
 from herglotz.models import ModelConfig
 from herglotz.stepping import State, Status, Stepper

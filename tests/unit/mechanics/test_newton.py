@@ -1,12 +1,11 @@
-"""The one Newton iteration: samples apart, bad starts, singular Jacobians, and its twin in plain numbers."""
+"""The one Newton iteration: samples apart, bad starts, singular Jacobians, and one sample in plain numbers."""
 
 import math
 
 import pytest
 import torch
 
-from herglotz.mechanics.newton import Point, Rules, attached, find_root, largest, newton
-from herglotz.mechanics.newton_one import _eliminate, newton_one
+from herglotz.mechanics.newton import Point, Rules, _eliminate_numbers, attached, find_root, largest, newton
 
 EPS = torch.finfo(torch.float64).eps
 
@@ -49,7 +48,7 @@ def test_one_sample_takes_the_same_iterations_in_plain_numbers(n, keep):
 
     x = torch.full((1, n), 9.0, dtype=torch.float64)
     rules = Rules(4 * EPS, 60, keep=keep)
-    one = newton_one(equation, x, rules, lambda *_: (1.0, 1e3 * EPS))
+    one = newton(equation, x, rules, lambda *_: (1.0, 1e3 * EPS), alone=True)
     many = newton(
         equation, x, rules, lambda x, *_: (torch.ones_like(x[..., 0]), 1e3 * EPS * torch.ones_like(x[..., 0]))
     )
@@ -63,7 +62,8 @@ def test_one_sample_takes_the_same_iterations_in_plain_numbers(n, keep):
 def test_one_sample_under_any_axes(batch):
     # fails if what is known of a sample without a batch, or with two axes of one, is of another shape
     x = torch.full((*batch, 2), 0.4, dtype=torch.float64)
-    one = newton_one(lambda x, _: Point(*arctangent(x)), x, Rules(4 * EPS, 60), lambda *_: (1.0, 1e3 * EPS))
+    sizes = lambda *_: (1.0, 1e3 * EPS)  # noqa: E731
+    one = newton(lambda x, _: Point(*arctangent(x)), x, Rules(4 * EPS, 60), sizes, alone=True)
     assert one.merit.shape == one.residual.shape == one.done.shape == batch
 
 
@@ -81,10 +81,10 @@ def test_a_solution_gets_its_derivative():
 def test_two_equations_are_solved_by_hand(matrix):
     # fails if a row is not exchanged with its right side, or a factor has another sign; small whole numbers are exact
     J = torch.tensor(matrix, dtype=torch.float64).reshape(2, 2)
-    move = torch.tensor(_eliminate(*[*matrix, 3.0, -1.0]), dtype=torch.float64)
+    move = torch.tensor(_eliminate_numbers(*[*matrix, 3.0, -1.0]), dtype=torch.float64)
     torch.testing.assert_close(J @ move, torch.tensor([-3.0, 1.0], dtype=torch.float64), rtol=0, atol=1e-14)
 
 
 @pytest.mark.parametrize("matrix", [[0.0, 1.0, 0.0, 2.0], [1.0, 2.0, 2.0, 4.0]])
 def test_two_singular_equations_move_nowhere(matrix):  # fails if a division by zero is raised
-    assert all(math.isnan(x) for x in _eliminate(*[*matrix, 3.0, -1.0]))
+    assert all(math.isnan(x) for x in _eliminate_numbers(*[*matrix, 3.0, -1.0]))

@@ -16,7 +16,7 @@ from herglotz.mechanics import (
 from herglotz.mechanics.contact import flow_derivative
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
-from herglotz.theory import contact_vector_field, right_hamiltonian
+from herglotz.theory import RightHamiltonian, contact_vector_field
 
 
 def polynomial(q0, q1, s0, h):
@@ -147,7 +147,7 @@ def test_right_hamiltonian_by_newton_matches_the_closed_form():
     q = torch.linspace(-1, 1, 5, dtype=torch.float64)[:, None]
     p, s = torch.ones_like(q), torch.full((5,), 0.2, dtype=torch.float64)
     q1, p1, _ = oscillator.flow(q, p, s, 0.3)
-    H = right_hamiltonian(oscillator.L_d, q, p1, s, 0.3, guess=q1 + 0.3)
+    H = RightHamiltonian(oscillator.L_d, q1 + 0.3)(q, p1, s, 0.3)
     assert oscillator.H_plus is not None
     torch.testing.assert_close(H, oscillator.H_plus(q, p1, s, 0.3), rtol=1e-12, atol=1e-13)
 

@@ -14,7 +14,7 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.scenes import ORDERS, reference_flow, scene, scene_names
-from herglotz.theory import contact_vector_field, right_hamiltonian
+from herglotz.theory import RightHamiltonian, contact_vector_field
 
 # at each scene's own examples, off the default parameters, where m = 1 and Ω = 1 would hide powers
 SCENES = [scene(name, **parameters) for name in scene_names() for parameters in scene(name).examples]
@@ -134,7 +134,7 @@ def test_right_hamiltonian(system):
     assert relative(H_p, q1) < 1e-11
     assert relative(H_q, -P.D1) < 1e-10
     assert relative(H_s, -P.D3) < 1e-10
-    numeric = right_hamiltonian(system.L_d, q.detach(), p1.detach(), s.detach(), h, guess=q1 + 0.01)
+    numeric = RightHamiltonian(system.L_d, q1 + 0.01)(q.detach(), p1.detach(), s.detach(), h)
     assert relative(H, numeric) < 1e-11
 
 

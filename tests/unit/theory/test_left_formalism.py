@@ -14,7 +14,6 @@ from herglotz.theory import (
     LeftLagrangian,
     RightHamiltonian,
     left_equations,
-    left_hamiltonian,
     left_step,
     right_equations,
     right_step,
@@ -120,7 +119,7 @@ def test_hamiltonians_of_the_oscillator_in_closed_form():
     assert OSCILLATOR.H_plus is not None
     assert OSCILLATOR.H_minus is not None
     close(RightHamiltonian(L_d)(q0, p1, s0, h), OSCILLATOR.H_plus(q0, p1, s0, h), 1e-12)
-    close(left_hamiltonian(L_d, p0, q1, s1, h, q1), OSCILLATOR.H_minus(p0, q1, s1, h), 1e-12)
+    close(LeftHamiltonian(L_d, q1)(p0, q1, s1, h), OSCILLATOR.H_minus(p0, q1, s1, h), 1e-12)
 
 
 @pytest.mark.parametrize("name", CASES)

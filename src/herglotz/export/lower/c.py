@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from herglotz.export.equation import Equations, input_count
+from herglotz.export.equation import Equations
 from herglotz.export.lower.interpret import interpret
 from herglotz.export.lower.program import NAME, Program, Ref, literal
 from herglotz.export.step_parts import step_parts
@@ -33,8 +33,7 @@ class StepInC:
     def __init__(self, equations: Equations, explicit: bool):
         self.explicit = explicit
         self.program = Program()
-        n, m = equations.model.config.dof, input_count(equations.model)
-        self.n, self.m = n, m
+        self.n, self.m = n, m = equations.model.dof, equations.model.inputs
         names = {
             "P->q0": n, "P->p0": n, "P->s0": 0, "P->h": 0, "P->V0.value": 0, "P->V0.slope": n, "t->move": n, "x": n,
             "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}),
