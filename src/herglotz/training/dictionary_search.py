@@ -130,7 +130,7 @@ class DictionarySearch:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
         families = (self.all, *(replace(self.all.only(x.names), apart=x.apart) for x in chains(self.data)))
         linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
-        grown = ((self._grown(x.terms, x.values, 1, start), at) for at, x in enumerate(linear, 1))
+        grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
             bare = self._grown(*self._bare(), 1, start)

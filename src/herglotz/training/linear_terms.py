@@ -17,7 +17,7 @@ from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_start import LinearFit, NamedForces
-from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, loads, own_terms
+from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, own_terms
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
@@ -32,6 +32,12 @@ class LinearStart(NamedTuple):
     terms: NamedTerms
     values: dict  # by the name of a term or of a parameter
     error: float  # J⁻¹R, RMS over the triples, in units of q
+
+    @property
+    def ways(self) -> list[NamedTerms]:
+        """Its terms, and those without dry friction that drives every joint, where no step may be solved with it."""
+        pushes = self.terms.dry and max(self.values[DRY]) <= 0
+        return [self.terms, replace(self.terms, dry=False)] if pushes else [self.terms]
 
 
 def linear_starts(
@@ -86,16 +92,7 @@ class LinearTerms:
         self.fit = self._problem(local)
 
     def start(self, of: NamedTerms) -> LinearStart | None:
-        """The terms of a family that the linear problem needs, their values and its error; None where no mass fits.
-
-        Dry friction that drives every joint makes up for what smoothing hides, unless it is the load of one that only
-        turns one way: the problem is solved without it.
-        """
-        found = self._start(of)
-        pushes = found is not None and found.terms.dry and max(found.values[DRY]) <= 0
-        return self._start(replace(of, dry=False)) if pushes and not loads(self.data, one_way=True) else found
-
-    def _start(self, of: NamedTerms) -> LinearStart | None:
+        """The terms of a family that the linear problem needs, their values and its error; None where no mass fits."""
         fit, columns = self.fit, self._columns(of)
         if fit.R[..., 0].numel() < ENOUGH * int(columns.sum()):
             return None

@@ -30,6 +30,7 @@ from herglotz.training.task import Task
 from herglotz.training.verdict import unseen_window_errors
 
 REFINED = 2  # searches for terms with better zeros
+FOLLOWS = 0.5  # of the spread: a free run that misses by more is lost, and tells nothing of terms
 INNER = 0.75  # of the training part that rivals are fitted to
 
 
@@ -48,7 +49,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         return seen, named
     if (fewer := _without_terms(seen)) is not None:
         bare = stages.keep("held out, no terms", lambda: _held_out(fewer, config, choose(fewer, config)))
-        if bare["rms"] <= MARGIN * first["rms"]:
+        if bare["rms"] <= min(MARGIN * first["rms"], FOLLOWS * _spread(seen)):
             seen, first, named = fewer, bare, choose(fewer, config)
     other = look(data, config, _of(stages, seen.zeros), named=False, zeros=seen.zeros)
     other = replace(other, apart=seen.apart) if seen.apart else other
@@ -115,8 +116,11 @@ def _without_terms(seen: Look) -> Look | None:
 
 def _both(found: dict[str, Any], seen: Look) -> float:
     """Geometric mean of both errors over held-out time; a free run that is lost, as of chaos, misses by the spread."""
-    q = (seen.kept.q - seen.kept.q.mean(0)) / seen.kept.balance
-    return (found["windows"] * min(found["rms"], float(q.square().mean().sqrt()))) ** 0.5
+    return (found["windows"] * min(found["rms"], _spread(seen))) ** 0.5
+
+
+def _spread(seen: Look) -> float:
+    return float(((seen.kept.q - seen.kept.q.mean(0)) / seen.kept.balance).square().mean().sqrt())
 
 
 def _of(stages: Stages, zeros: tuple[float, ...]) -> Stages:
