@@ -8,7 +8,7 @@ import torch
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, ensemble_bands, fit, laplace
+from herglotz.training import FitConfig, ensemble_bands, fit, laplace, uncertainty
 
 NOISE = 0.01
 SETTINGS = FitConfig(departures=(6e-4, 2e-3), objective="trajectory")  # with networks, not with named terms
@@ -69,6 +69,16 @@ def test_standard_deviation_of_the_damping_rate(posteriors):
         scores.append(abs(run.metrics["rate"] - 0.2) / std)
     assert sorted(scores)[2] < 2.0
     assert max(scores) < 5.0
+
+
+@pytest.mark.parametrize(("worst", "factor"), [((1e3, 1.0, 1.0), 1.0), ((1e3, 2.0, 2.0), 2.0), ((0.5, 0.5, 0.5), 1.0)])
+def test_a_block_that_alone_tells_a_number_widens_no_band(posteriors, monkeypatch, worst, factor):
+    # fails if the error of a block that nothing else foretells, 4000 times the noise where motion dies out within five
+    # periods of eight samples, is the factor of all deviations: the equation had no number left
+    run, _, _ = posteriors[0]
+    sigma = run.metrics["sigma"]
+    monkeypatch.setattr(uncertainty, "held_out_errors", lambda *_: sigma * torch.tensor([1.0, *worst, worst[-1]]))
+    assert laplace(run).inflation == pytest.approx(factor)
 
 
 def test_directions_without_data_are_reported(posteriors):
