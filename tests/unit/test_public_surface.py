@@ -7,6 +7,7 @@ import argparse
 import inspect
 import re
 from enum import Enum
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,9 @@ import pytest
 
 import herglotz as hz
 from herglotz.cli.parser import build_parser
+from herglotz.training.motion import Motion
+from herglotz.training.selection import Selection
+from herglotz.training.uncertainty import Bands
 
 GOLDEN = Path(__file__).resolve().parents[1] / "golden" / "public_surface.txt"
 
@@ -23,19 +27,53 @@ def has_no_signature(value: object) -> bool:
     return isinstance(value, type) and issubclass(value, (Exception, Enum))
 
 
+def _named(path: str) -> Any:
+    home, _, name = path.rpartition(".")
+    return getattr(import_module(home), name)
+
+
+PAGE = (GOLDEN.parents[2] / "docs" / "reference" / "python.md").read_text(encoding="utf-8")
+# The regressor can be imported where scikit-learn is; its own tests look at it (`check_estimator`).
+REFERENCE = {path: _named(path) for path in re.findall(r"^::: (\S+)$", PAGE, re.M) if "regressor" not in path}
+PUBLIC = {f"hz.{name}": getattr(hz, name) for name in hz.__all__}
+PUBLIC |= {path: value for path, value in REFERENCE.items() if value not in PUBLIC.values()}
+OWNERS = (hz.Run, hz.Stepper, hz.Trajectories, hz.State, hz.FitConfig, hz.ModelConfig, Motion, Selection, Bands)
+
+
+def methods(owner: type) -> dict[str, Any]:
+    """Public functions of a class, class methods too; `Run` stands in the file with its properties besides."""
+    own = {name: getattr(value, "__func__", value) for name, value in vars(owner).items() if not name.startswith("_")}
+    return {f"{owner.__name__}.{name}": value for name, value in own.items() if inspect.isfunction(value)}
+
+
+def _signature(name: str, value: Any) -> str:
+    parameters = () if has_no_signature(value) else inspect.signature(value).parameters
+    return f"{name}({', '.join(x for x in parameters if x not in ('self', 'cls'))})"
+
+
+def _flags(command: argparse.ArgumentParser) -> str:
+    """Arguments by place, then flags, each with what it can be."""
+    found = []
+    for action in command._actions:
+        names = [flag for flag in action.option_strings if flag.startswith("--")] or [
+            str(action.metavar or action.dest)
+        ]
+        choices = f"={{{','.join(map(str, action.choices))}}}" if action.choices else ""
+        found += [name + choices for name in names if name != "--help"]
+    return " ".join(sorted(found))
+
+
 def surface() -> list[str]:
     """One line a public name with its parameters, and one a subcommand with its flags."""
-    lines = []
-    for name in sorted(hz.__all__):
-        value = getattr(hz, name)
-        parameters = () if has_no_signature(value) else inspect.signature(value).parameters
-        lines.append(f"hz.{name}({', '.join(parameters)})")
+    lines = [_signature(name, value) for name, value in sorted(PUBLIC.items())]
     lines += [f"Run.{name}" for name in sorted(vars(hz.Run)) if not name.startswith("_")]
+    lines += [_signature(*one) for owner in OWNERS for one in sorted(methods(owner).items())]
     commands = next(a for a in build_parser()._actions if isinstance(a, argparse._SubParsersAction))
-    for name, command in sorted(commands.choices.items()):
-        flags = sorted(flag for flag in command._option_string_actions if flag.startswith("--") and flag != "--help")
-        lines.append(f"herglotz {name} {' '.join(flags)}")
-    return lines
+    return lines + [f"herglotz {name} {_flags(command)}" for name, command in sorted(commands.choices.items())]
+
+
+def test_every_public_name_is_in_the_reference():  # fails if a name becomes public and its docstring is on no page
+    assert [name for name in hz.__all__ if getattr(hz, name) not in REFERENCE.values()] == []
 
 
 def test_public_names_and_flags_are_the_frozen_ones():
@@ -45,30 +83,30 @@ def test_public_names_and_flags_are_the_frozen_ones():
 
 def _callables() -> list[tuple[str, Any]]:
     """Public functions, classes and methods that take something, by name."""
-    own = [(f"hz.{name}", getattr(hz, name)) for name in hz.__all__]
-    own += [
-        (f"{owner.__name__}.{name}", value)
-        for owner in (hz.Run, hz.Stepper)
-        for name, value in vars(owner).items()
-        if inspect.isfunction(value) and not name.startswith("_")
-    ]
-    return [(name, value) for name, value in own if not has_no_signature(value)]
+    own = PUBLIC | methods(hz.Run) | methods(hz.Stepper)
+    return [(name, value) for name, value in own.items() if not has_no_signature(value)]
 
 
 @pytest.mark.parametrize("value", [pytest.param(value, id=name) for name, value in _callables()])
 def test_a_public_docstring_is_whole(value):
-    # fails if a parameter has no words, or a function does not say what it returns and when it raises
+    # fails if a parameter has no words, a tensor no shape, a function not its result or errors
     text = inspect.getdoc(value) or ""
-    parameters = {str(p).split(":")[0].split("=")[0].strip() for p in inspect.signature(value).parameters.values()}
+    parameters = inspect.signature(value).parameters
     section = re.split(r"\n\n\w+\n---", text.partition("Parameters\n---")[2])[0]
-    heads = re.findall(r"^([*\w]+(?:, \w+)*)$", section, re.M)
-    own = parameters - {"self", "**start"}  # of a rollout: its entries are told one by one
+    told = dict(re.findall(r"^([*\w]+(?:, [*\w]+)*)\n((?: {4}.*\n?)+)", section, re.M))
+    words = {one: body for heads, body in told.items() for one in heads.split(", ")}
+    own = {str(p).split(":")[0].split("=")[0].strip() for p in parameters.values()}
+    own -= {"self", "**start"}  # of a rollout: its entries are told one by one
     if own == {"**settings"} or value is hz.Run.save:
         return  # the docstring names the function that takes them
-    assert own <= {one for head in heads for one in head.split(", ")}
+    assert own <= words.keys()
+    tensors = [name for name, p in parameters.items() if "Tensor" in str(p.annotation)]
+    assert [name for name in tensors if "(" not in words[name]] == []
     if inspect.isfunction(value) and own:
+        returned = inspect.signature(value).return_annotation
         assert "Raises\n------" in text
-        assert "Returns\n-------" in text or value.__annotations__["return"] == "None"
+        assert returned == "None" or re.search(r"Returns\n-------\n.+\n {4}\S", text)
+        assert "Tensor" not in str(returned) or re.search(r"[Ss]hape|\(", text.partition("Returns\n")[2])
 
 
 if __name__ == "__main__":

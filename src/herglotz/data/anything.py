@@ -33,16 +33,16 @@ OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "sen
 def as_trajectories(
     data: Any,
     *,
-    h: float | None = None,  # time between the samples of arrays
-    time: Any = None,  # of a table: name of its column; of an array: the times (N,)
-    coordinates: Names | None = None,  # of a table: columns; of an array: what to call its columns
-    inputs: Any = None,  # of a table: columns; of an array: the inputs (N,) or (N, m)
+    h: float | None = None,
+    time: Any = None,
+    coordinates: Names | None = None,
+    inputs: Any = None,
     drop: Names = (),
     group: str | None = None,
-    angles: Names | bool | None = None,  # coordinates that are angles in rad; True for all, () for none
-    sensor_zeros: Sequence[float] = (),  # what the sensors read at 0, n numbers or n for each recording
-    sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth: q = scale · (reading − zero)
-    like: Trajectories | None = None,  # another recording: columns of a table that have its names mean the same
+    angles: Names | bool | None = None,
+    sensor_zeros: Sequence[float] = (),
+    sensor_scales: Sequence[float] = (),
+    like: Trajectories | None = None,
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
 
@@ -50,6 +50,32 @@ def as_trajectories(
     stderr, as by `load`. A list holds one recording an entry, unless its entries are numbers: that is one recording of
     one coordinate. Angles come unwrapped, as from `load`. A Series takes its times from its index, unless `h` or `time`
     gives them; the index of a DataFrame is a column, unless it merely counts the rows.
+
+    Parameters
+    ----------
+    data
+        One of these, or `Trajectories`.
+    h
+        Time between the samples of arrays.
+    time
+        Of a table the name of its column; of an array the times (N,): numbers, dates or durations.
+    coordinates
+        Of a table the columns; of an array what to call its columns, `name` or `name[unit]`.
+    inputs
+        Of a table the columns, () for none; of an array the inputs (N,) or (N, m).
+    drop, group
+        Columns of a table that are left aside; the column that numbers its trajectories.
+    angles
+        Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
+    sensor_zeros, sensor_scales
+        q = scale · (reading − zero): n numbers, or n for each recording.
+    like
+        Another recording: columns of a table that have its names mean the same.
+
+    Returns
+    -------
+    Trajectories
+        In float64, times in s; coordinates in deg became rad.
 
     Raises
     ------

@@ -102,6 +102,22 @@ def write_atomically(path: PathLike, content: bytes) -> None:
         raise InputError(f"{path}: cannot be written ({reason}); {remedy}") from error
 
 
+def folder_at(path: PathLike) -> Path:
+    """Return this folder, made with its parents if it is missing.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made.
+    """
+    folder = Path(path)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
+    return folder
+
+
 def remove_leftovers(folder: PathLike, names: Iterable[str]) -> None:
     """Remove what a killed writer of these files has left in a folder that nobody else writes them to now."""
     for name in names:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from matplotlib.figure import Figure
 
-from herglotz.data.files import PathLike
+from herglotz.data.files import PathLike, folder_at
 from herglotz.errors import InputError
 from herglotz.plots.animation import save_animation as save_animation
 from herglotz.plots.bands import plot_bands as plot_bands
@@ -59,6 +59,11 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
     form
         png, svg or pdf.
 
+    Returns
+    -------
+    list of Path
+        What was written, one file a figure.
+
     Raises
     ------
     InputError
@@ -76,7 +81,16 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
 
 
 def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
-    """Draw the figures of a run and write them as png, svg or pdf into `folder`, which is made if it is missing.
+    """Draw the figures of a run and write them into `folder`, which is made if it is missing.
+
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    folder
+        Where the files go.
+    form
+        png, svg or pdf.
 
     Returns
     -------
@@ -94,12 +108,7 @@ def save_figures(run: Run, folder: PathLike, form: str = "png") -> list[Path]:
 
 def _saved(drawn: dict[str, Figure], folder: PathLike, form: str) -> list[Path]:
     """Write figures by their names into `folder`, which is made if it is missing."""
-    folder = Path(folder)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}); choose another folder") from error
-    files = [folder / f"{name}.{form}" for name in drawn]
+    files = [folder_at(folder) / f"{name}.{form}" for name in drawn]
     for file, figure in zip(files, drawn.values(), strict=True):
         save_figure(figure, file)
     return files

@@ -33,6 +33,15 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
     where angles follow one length, they hang from a cart. Two lengths of one unit are a point in the plane; other
     lengths are beads side by side, each displaced by its coordinate. Time is stretched to six seconds.
 
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    path
+        The file, which ends in .gif.
+    trajectory
+        Which of `run.data`, from 0.
+
     Raises
     ------
     InputError

@@ -63,9 +63,16 @@ def styled() -> Iterator[None]:
         yield
 
 
+class Picture(Figure):
+    """A figure that a notebook shows, although pyplot, which would register it there, is not used."""
+
+    def _repr_png_(self) -> bytes:
+        return _image(self, "png")
+
+
 def new_figure(width: float, height: float, title: str) -> Figure:
     """Return an empty figure (inches) with a title; without pyplot there is no window and no global list of figures."""
-    figure = Figure(figsize=(width, height), dpi=DPI, layout="constrained")
+    figure = Picture(figsize=(width, height), dpi=DPI, layout="constrained")
     figure.suptitle(title, x=0.01, ha="left", fontsize=11.5, fontweight="bold")
     return figure
 
@@ -81,10 +88,14 @@ def save_figure(figure: Figure, path: PathLike) -> None:
     form = Path(path).suffix.lower().removeprefix(".")
     if form not in FORMATS:
         raise InputError(f"{path}: a figure's name must end in .{', .'.join(FORMATS)}")
+    write_atomically(path, _image(figure, form))
+
+
+def _image(figure: Figure, form: str) -> bytes:
     buffer = io.BytesIO()
     with styled():
         figure.savefig(buffer, format=form, dpi=DPI)
-    write_atomically(path, buffer.getvalue())
+    return buffer.getvalue()
 
 
 def label(ax: Axes, x: float, y: float, text: str, color: str = INK, **options: Any) -> None:

@@ -6,10 +6,12 @@ for (const figure of document.querySelectorAll(".slider")) {
   const ratio = window.devicePixelRatio || 1, width = canvas.clientWidth || 900, height = Math.max(200, 0.36 * width);
   canvas.width = ratio * width; canvas.height = ratio * height; g.scale(ratio, ratio);  // text keeps its size on a phone
   canvas.style.height = `${height}px`;
-  const n = v.t.length, left = 55, right = 10, top = 12, bottom = 32;
+  const n = v.t.length, right = 10, top = 12, bottom = 32, font = "13px system-ui, sans-serif";
   input.max = n - 1;
   const known = v.data.concat(v.model.filter((x) => x !== null));
-  const low = Math.min(...known), high = Math.max(...known), span = high - low || 1;
+  const low = known.reduce((a, b) => Math.min(a, b)), high = known.reduce((a, b) => Math.max(a, b)), span = high - low || 1;
+  g.font = font;
+  const left = 14 + Math.max(...[low, high].map((q) => g.measureText(q.toPrecision(3)).width));  // 1.00e+30 is wide
   const x = (t) => left + ((t - v.t[0]) / (v.t[n - 1] - v.t[0] || 1)) * (width - left - right);
   const y = (q) => top + ((high + 0.05 * span - q) / (1.1 * span)) * (height - top - bottom);
   const line = (from, to, colour) => {
@@ -30,7 +32,7 @@ for (const figure of document.querySelectorAll(".slider")) {
     line(0, Math.min(v.trained, k), "#0072b2");
     if (k > v.trained) line(v.trained, k, "#d55e00");
     g.strokeStyle = "#222"; g.lineWidth = 1; g.beginPath(); g.moveTo(x(v.t[k]), top); g.lineTo(x(v.t[k]), height - bottom); g.stroke();
-    g.fillStyle = "#222"; g.font = "13px system-ui, sans-serif";
+    g.fillStyle = "#222"; g.font = font;
     g.fillText(high.toPrecision(3), 4, y(high) + 4); g.fillText(low.toPrecision(3), 4, y(low) + 4);
     g.fillText(`${v.t[0].toPrecision(4)}`, left, height - 10);
     g.textAlign = "right"; g.fillText(`${v.t[n - 1].toPrecision(4)} ${v.time_unit}`, width - right, height - 10); g.textAlign = "left";

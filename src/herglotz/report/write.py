@@ -12,7 +12,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.data.checks import Labels
 from herglotz.data.column_table import column_rows
-from herglotz.data.files import write_atomically
+from herglotz.data.files import folder_at, write_atomically
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError
 from herglotz.plots import plot_bands, plot_learned, plot_training, plot_trajectory
@@ -53,13 +53,31 @@ print(run.predict("another.csv").rms)"""
 
 @one_thread()
 def write_report(run: Run, folder: str | Path, against: Trajectories | None = None, *, name: str = "RUN") -> list[Path]:
-    """Write report.html, which fetches nothing, and report.md into a folder, made if missing; both paths.
+    """Write report.html and report.md into a folder.
 
-    The model is scored on the recording `against` (`Run.predict`), and commands in the report call the run `name`.
+    Parameters
+    ----------
+    run
+        What `fit` returned.
+    folder
+        Where to write; made if missing.
+    against
+        Another recording, on which the model is scored (`Run.predict`).
+    name
+        What the commands in the report call the run: its folder.
+
+    Returns
+    -------
+    list of Path
+        Both files; the HTML file fetches nothing.
+
+    Raises
+    ------
+    InputError
+        If the folder or a file cannot be written, or `against` has other columns than the run.
     """
     document = describe(run, against, name)
-    folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    folder = folder_at(folder)
     written = {folder / "report.html": as_html(document), folder / "report.md": as_markdown(document)}
     for path, text in written.items():
         write_atomically(path, text.encode())

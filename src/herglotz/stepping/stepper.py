@@ -136,7 +136,7 @@ class Stepper(OneStepMethod):
         Parameters
         ----------
         state, h, u
-            As in `step`.
+            As in `step`: q, p (..., n) and s (...); () or (...); (..., m).
 
         Returns
         -------

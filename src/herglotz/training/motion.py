@@ -50,17 +50,29 @@ class Steppable(Protocol):
 
 @dataclass(frozen=True, repr=False)
 class Motion:
-    """A motion of a model as numpy arrays: K + 1 samples, the start first. Everything after a failed step is NaN."""
+    """A motion of a model as numpy arrays: K + 1 samples, the start first. Everything after a failed step is NaN.
 
-    t: np.ndarray  # (K+1,) time
-    q: np.ndarray  # (..., K+1, n) position
-    p: np.ndarray  # (..., K+1, n) momentum; the first mass is 1
-    s: np.ndarray  # (..., K+1) action
-    status: np.ndarray  # (..., K) of every step, 0 where it was solved (`herglotz.Status`)
+    Parameters
+    ----------
+    t, q, p, s
+        (K+1,) time; (..., K+1, n) position, and momentum, of which the first mass is 1; (..., K+1) action.
+    status
+        (..., K) of every step, 0 where it was solved (`herglotz.Status`).
+    names, units, time_unit
+        Of the coordinates, and of t.
+    beyond
+        What leaves the range of the fit: the model extrapolates there.
+    """
+
+    t: np.ndarray
+    q: np.ndarray
+    p: np.ndarray
+    s: np.ndarray
+    status: np.ndarray
     names: tuple[str, ...]
     units: tuple[str, ...]
     time_unit: str
-    beyond: tuple[Beyond, ...] = ()  # what leaves the range of the fit: the model extrapolates there
+    beyond: tuple[Beyond, ...] = ()
 
     @property
     def ok(self) -> bool:

@@ -82,7 +82,15 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Selection:
-    """The table of the ladder, and the chosen level."""
+    """The table of the ladder, and the chosen level.
+
+    Parameters
+    ----------
+    candidates
+        One a level: its runs, and their errors over the held-out blocks, in units of q.
+    chosen
+        That of them which is kept; `run` is its representative fit.
+    """
 
     candidates: tuple[Candidate, ...]
     chosen: Candidate
@@ -148,6 +156,11 @@ def select(
         As for `fit`.
     **reading
         How other data than trajectories are to be read (`herglotz.data.as_trajectories`).
+
+    Returns
+    -------
+    Selection
+        Every fit with its errors; `run` is the one to keep, and `table()` tells why.
 
     Raises
     ------

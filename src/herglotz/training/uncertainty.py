@@ -36,11 +36,21 @@ from herglotz.training.trajectory_fit import fit_states
 
 @dataclass(frozen=True)
 class Bands:
-    """A prediction with its uncertainty, at every sample of the data."""
+    """A prediction with its uncertainty, at every sample of the data; all in the units of q.
 
-    q: Tensor  # (N, n) free run, in units of q
-    std: Tensor  # (N, n) standard deviation of the model's position
-    sigma: Tensor  # (n,) standard deviation of the noise of a measurement
+    Parameters
+    ----------
+    q
+        (N, n) free run.
+    std
+        (N, n) standard deviation of the model's position.
+    sigma
+        (n,) standard deviation of the noise of a measurement.
+    """
+
+    q: Tensor
+    std: Tensor
+    sigma: Tensor
 
     def interval(self, level: float = 0.9, *, measured: bool = True) -> tuple[Tensor, Tensor]:
         """Lower and upper end of the central interval, (N, n) each; of a measured value, or of the true position."""
@@ -224,7 +234,23 @@ class Laplace:
 
 @one_thread()
 def laplace(run: Run) -> Laplace:
-    """The Gauss–Newton posterior of a run; see `Laplace`."""
+    """The Gauss–Newton posterior of a run: 𝒩(θ̂, (JᵀJ)⁻¹), J the derivatives of residuals over their σ.
+
+    Parameters
+    ----------
+    run
+        A fit whose model follows its data (`metrics["follows_data"]`).
+
+    Returns
+    -------
+    Laplace
+        `bands()` on the data of the run, `predict(data)` on others, `directions()` that the data leave open.
+
+    Raises
+    ------
+    InputError
+        If the trajectories cannot be solved from the run's states.
+    """
     return Laplace(run)
 
 

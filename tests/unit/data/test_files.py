@@ -5,7 +5,7 @@ import signal
 
 import pytest
 
-from herglotz.data.files import read_bytes, remove_leftovers, write_atomically
+from herglotz.data.files import folder_at, read_bytes, remove_leftovers, write_atomically
 from herglotz.errors import InputError
 
 
@@ -62,3 +62,11 @@ def test_a_device_is_said_once():
     # fails if a message stands inside another one
     with pytest.raises(InputError, match=r"^/dev/zero: is a pipe or a device, not a file; save what it says to a file"):
         read_bytes("/dev/zero")
+
+
+def test_a_folder_is_made_or_refused(tmp_path):  # fails if a file in the way is a traceback, or parents are not made
+    assert folder_at(tmp_path / "a" / "b").is_dir()
+    assert folder_at(tmp_path / "a") == tmp_path / "a"
+    (tmp_path / "file").write_text("x")
+    with pytest.raises(InputError, match=r"file/b: cannot be made \(Not a directory\); choose another folder"):
+        folder_at(tmp_path / "file" / "b")

@@ -176,6 +176,11 @@ def test_formats(tmp_path):  # fails if a file holds another format than its nam
         save_figure(figure, tmp_path / "a.jpg")
 
 
+def test_a_notebook_shows_a_figure():  # fails if a kernel prints <Figure ...> instead of the picture
+    png = plot_training(fake_run(steps=12))._repr_png_()  # pyright: ignore[reportAttributeAccessIssue]
+    assert png.startswith(b"\x89PNG")
+
+
 def test_a_folder_that_cannot_be_made(tmp_path):  # fails if an OSError escapes instead of one clear line
     (tmp_path / "file").write_text("")
     with pytest.raises(InputError, match="cannot be made"):
