@@ -4,9 +4,7 @@ from herglotz.mechanics.newton import solve as solve
 from herglotz.stepping.composition import (
     Composition as Composition,
     adjoint_pair as adjoint_pair,
-    kahan_li as kahan_li,
     suzuki as suzuki,
-    yoshida as yoshida,
 )
 from herglotz.stepping.events import Event as Event
 from herglotz.stepping.explain import explain_step as explain_step
