@@ -24,29 +24,17 @@ if TYPE_CHECKING:
 
 # Loaded at first use, so that `herglotz --help` does not wait for torch. (`verify` is a room of the same
 # name, and stays one: `from herglotz.verify import verify`.)
-_HOME = {
-    "Trajectories": "data",
-    "load": "data",
-    "save": "data",
-    "simulate": "data",
-    "InputError": "errors",
-    "compile": "export",
-    "export_pt2": "export",
-    "load_pt2": "export",
-    "partials": "mechanics",
-    "ContactLagrangian": "models",
-    "ModelConfig": "models",
-    "State": "stepping",
-    "Status": "stepping",
-    "Stepper": "stepping",
-    "scene": "scenes",
-    "scene_names": "scenes",
-    "FitConfig": "training",
-    "Run": "training",
-    "fit": "training",
-    "load_run": "training",
-    "save_run": "training",
+_ROOMS = {
+    "data": ("Trajectories", "load", "save", "simulate"),
+    "errors": ("InputError",),
+    "export": ("compile", "export_pt2", "load_pt2"),
+    "mechanics": ("partials",),
+    "models": ("ContactLagrangian", "ModelConfig"),
+    "scenes": ("scene", "scene_names"),
+    "stepping": ("State", "Status", "Stepper"),
+    "training": ("FitConfig", "Run", "fit", "load_run", "save_run"),
 }
+_HOME = {name: room for room, names in _ROOMS.items() for name in names}
 __all__ = [
     "ContactLagrangian",
     "FitConfig",

@@ -5,10 +5,11 @@ from __future__ import annotations
 import types
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import MISSING, fields, is_dataclass
-from typing import Any, Literal, Union, get_args, get_origin, get_type_hints, is_typeddict
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints, is_typeddict
 
 from herglotz.errors import InputError
 
+T = TypeVar("T")
 UNION = (Union, types.UnionType)
 LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, and 10^400 is no float either
 
@@ -45,6 +46,23 @@ def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
             check_entries(alone[0], values[key], f"{where}: {key}", remedy)
         elif not matches(values[key], hint):
             raise InputError(f"{where}: {key} must be {_named(hint)}, got {_shown(values[key])}; {remedy}")
+
+
+def from_plain(cls: type[T], values: dict[str, Any]) -> T:
+    """Build a settings dataclass from what `dataclasses.asdict` and JSON made of it (tuples come back as lists).
+
+    Raises
+    ------
+    InputError
+        If a key is not one of its fields, or a value is not of its type.
+    """
+    unknown = set(values) - {f.name for f in fields(cls)}  # type: ignore[arg-type]
+    if unknown:
+        names = ", ".join(sorted(unknown))
+        raise InputError(f"unknown setting {names} for {cls.__name__}; was it written by another version of herglotz?")
+    check_entries(cls, values, f"the settings of {cls.__name__}", "take what herglotz wrote")
+    plain: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    return cls(**plain)
 
 
 def matches(value: Any, hint: Any) -> bool:

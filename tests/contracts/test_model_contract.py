@@ -22,7 +22,8 @@ from herglotz.mechanics import (
 )
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
-from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.equation import model_equation
+from herglotz.stepping.partials_equation import PartialsEquation
 
 
 def config(n, angles=None, **settings):

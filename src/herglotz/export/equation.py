@@ -13,11 +13,13 @@ import torch
 from torch import Tensor, nn
 
 from herglotz.export.trace import Graph, example_batch, traced
+from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State
-from herglotz.stepping.equation import End, PartialsEquation, Point, StepOfModel, model_equation
+from herglotz.stepping.equation import StepOfModel, model_equation
 from herglotz.stepping.field import Field, FieldOf
 from herglotz.stepping.linearise import eliminate, step_functions, step_jacobian
+from herglotz.stepping.partials_equation import End, PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip
 

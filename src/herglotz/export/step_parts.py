@@ -13,15 +13,17 @@ from torch import Tensor, nn
 from herglotz.export.equation import example, field_like
 from herglotz.export.trace import Graph, traced
 from herglotz.mechanics.legendre import soft_threshold
+from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.models.feature_kinetic import FeatureKinetic
 from herglotz.models.jet import Jet
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.terms import Potential
 from herglotz.stepping import State
-from herglotz.stepping.equation import PartialsEquation, Point, model_equation
+from herglotz.stepping.equation import model_equation
 from herglotz.stepping.explicit import Leapfrog
 from herglotz.stepping.field import Field
+from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.stick_slip import StickSlip, at_rest
 

@@ -173,6 +173,7 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
     if alone:
         return _found_alone(here, not going, iterations)
     x, point, J, delta, merit, residual = here
+    assert isinstance(delta, Tensor)
     return Found(
         x, point, merit, residual, ~going, iterations, healthy=False, floor=floor, J=J, move=delta, mixed=mixed
     )

@@ -11,7 +11,7 @@ from herglotz.models.features import expand, parse
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import check_terms
 from herglotz.models.translations import check_translations
-from herglotz.settings import from_plain
+from herglotz.schema import from_plain
 
 LEVELS = ("conservative", "linear", "affine", "full", "forced")
 

@@ -4,22 +4,20 @@ from herglotz.mechanics.newton import solve as solve
 from herglotz.stepping.composition import (
     Composition as Composition,
     adjoint_pair as adjoint_pair,
-    kahan_li as kahan_li,
     suzuki as suzuki,
-    yoshida as yoshida,
 )
 from herglotz.stepping.events import Event as Event
 from herglotz.stepping.explain import explain_step as explain_step
 from herglotz.stepping.linearise import Linearised as Linearised
 from herglotz.stepping.method import OneStepMethod as OneStepMethod
 from herglotz.stepping.newton import Solution as Solution, solve_step as solve_step
-from herglotz.stepping.state import Status as Status
-from herglotz.stepping.stepper import (
+from herglotz.stepping.state import (
     Crossings as Crossings,
     Rollout as Rollout,
     State as State,
+    Status as Status,
     Step as Step,
     StepError as StepError,
-    Stepper as Stepper,
     step_sizes as step_sizes,
 )
+from herglotz.stepping.stepper import Stepper as Stepper

@@ -111,20 +111,10 @@ class Composition(OneStepMethod):
         return self._single_steps[id(method)](state, h, state.q)[0]
 
 
-def yoshida(method: Method, order: int = 4) -> Composition:
-    """Order 4 with 3 stages or 6 with 7, from a method of order 2 that is its own adjoint.
-
-    Source: H. Yoshida, Phys. Lett. A 150 (1990) 262: the triple jump, and solution A of order 6.
-    """
-    cube = 2.0 ** (1 / 3)
-    outer = {4: (1 / (2 - cube),), 6: (0.784513610477560, 0.235573213359357, -1.17767998417887)}
-    return _symmetric(method, outer, order, "yoshida")
-
-
 def suzuki(method: Method, order: int = 4) -> Composition:
     """Order 4 with 5 stages or 6 with 25, from a method of order 2 that is its own adjoint.
 
-    More stages than Yoshida's and a much smaller error constant: the fractions stay below 1 in size.
+    More stages than Yoshida's triple jump and a much smaller error constant: the fractions stay below 1 in size.
 
     Source: M. Suzuki, Phys. Lett. A 146 (1990) 319.
     """
@@ -137,24 +127,6 @@ def suzuki(method: Method, order: int = 4) -> Composition:
     return Composition([(base, part), (base, part), (base, middle), (base, part), (base, part)], self_adjoint=True)
 
 
-def kahan_li(method: Method, order: int = 6) -> Composition:
-    """Order 6 with 9 stages, from a method of order 2 that is its own adjoint.
-
-    Source: W. Kahan, R.-C. Li, Math. Comp. 66 (1997) 1089, s9odr6a.
-    """
-    outer = {6: (0.39216144400731413928, 0.33259913678935943860, -0.70624617255763935981, 0.082213596293550800230)}
-    return _symmetric(method, outer, order, "kahan_li")
-
-
 def adjoint_pair(method: Method, adjoint: Method) -> Composition:
     """Half a step of a method, then half of its adjoint: its own adjoint, of even order; left and right give 2."""
     return Composition([(method, 0.5), (adjoint, 0.5)])
-
-
-def _symmetric(method: Method, outer: dict[int, tuple[float, ...]], order: int, name: str) -> Composition:
-    """The fractions w_1, …, w_k, 1 − 2Σw, w_k, …, w_1."""
-    if order not in outer:
-        raise InputError(f"{name} has order {' or '.join(map(str, outer))}, got {order}")
-    half = outer[order]
-    middle = 1.0 - 2.0 * sum(half)
-    return Composition([(method, w) for w in (*half, middle, *reversed(half))], self_adjoint=True)

@@ -23,10 +23,8 @@ from herglotz.models import ContactLagrangian
 from herglotz.models.sweep import Sweep, trigonometry
 from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
-from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
+from herglotz.stepping.partials_equation import End
 from herglotz.stepping.state import State
-
-__all__ = ["End", "ModelEquation", "PartialsEquation", "Point", "StepEquation", "StepOfModel", "model_equation"]
 
 
 class _Frame(NamedTuple):

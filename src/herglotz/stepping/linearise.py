@@ -20,7 +20,8 @@ from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.models import ContactLagrangian
-from herglotz.stepping.equation import PartialsEquation, model_equation
+from herglotz.stepping.equation import model_equation
+from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.single_step import driven_by
 from herglotz.stepping.state import State, Step
 

@@ -9,10 +9,11 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Driven, Partials, momentum_plus, momentum_residual, partials
 from herglotz.mechanics.newton import Found, attached
 from herglotz.mechanics.regularity import regularity
-from herglotz.stepping.equation import End, ModelEquation, PartialsEquation, StepEquation, StepOfModel, model_equation
+from herglotz.stepping.equation import ModelEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
 from herglotz.stepping.newton import Increments, find_root, status_of
+from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import State, Status, Step
 
 # Steps below this part of a model's time, typical q over typical v, are solved for Δ: p ~ mΔ/h then would have errors

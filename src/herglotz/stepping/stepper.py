@@ -12,8 +12,6 @@ from herglotz.stepping.linearise import Linearised, linearise
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.single_step import SingleStep, driven_by
 from herglotz.stepping.state import (
-    Crossings,
-    Rollout,
     State,
     Step,
     StepError,
@@ -21,11 +19,8 @@ from herglotz.stepping.state import (
     check_rows,
     check_started,
     check_state,
-    step_sizes,
     throw_failure,
 )
-
-__all__ = ["Crossings", "Rollout", "State", "Step", "StepError", "Stepper", "step_sizes"]
 
 
 class Stepper(OneStepMethod):

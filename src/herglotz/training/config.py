@@ -13,7 +13,7 @@ from herglotz.errors import InputError
 from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import TERMS
-from herglotz.settings import from_plain
+from herglotz.schema import from_plain
 
 OBJECTIVES = ("auto", "residual", "trajectory", "smoothing", "raw")
 OPTIMISERS = ("lm", "adam", "adamw")

@@ -8,7 +8,7 @@ from typing import Any
 
 from herglotz.data.units import size
 from herglotz.errors import InputError
-from herglotz.settings import from_plain
+from herglotz.schema import from_plain
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 

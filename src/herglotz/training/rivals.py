@@ -15,7 +15,7 @@ from typing import Any
 from herglotz.data import Trajectories
 from herglotz.data.oversampling import sparsest
 from herglotz.data.roughness import AT_THE_NOISE, precision
-from herglotz.settings import from_plain
+from herglotz.schema import from_plain
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN

@@ -141,11 +141,12 @@ def left_hamilton_jacobi(subject: Subject, f: Fan, bound: float) -> Check:
 
     H⁻ comes from L_d by Newton solves of s0 + L_d = s_{k+1} and −D1L⁻ = dS^k, not from the flow.
     """
-    assert subject.L_d is not None  # `verify` asks
+    L_d = subject.L_d
+    assert L_d is not None  # `verify` asks
 
     def side(before: GeneratingFunction, after: GeneratingFunction) -> tuple[Tensor, Tensor, Tensor]:
         guess = before.q - 1e-3 * (after.q - before.q)  # slightly wrong, so that the solver has to work
-        H = LeftHamiltonian(subject.L_d, guess)(before.D2, after.q, after.s, subject.h)
+        H = LeftHamiltonian(L_d, guess)(before.D2, after.q, after.s, subject.h)
         residual = left_hamilton_jacobi_residual(after.S, before.S, before.D2, before.q, H)
         return residual, (before.D2 * before.q).sum(-1), H
 

@@ -7,7 +7,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import partials
 from herglotz.mechanics.partials import value
 from herglotz.stepping import State, Stepper
-from herglotz.stepping.composition import yoshida
+from herglotz.stepping.composition import suzuki
 from herglotz.theory import (
     PointSource,
     Quadratic,
@@ -53,7 +53,7 @@ def test_a_forgotten_sum_is_refused(door):
         DOORS[door]()
 
 
-@pytest.mark.parametrize("build", [Stepper, yoshida])
+@pytest.mark.parametrize("build", [Stepper, suzuki])
 def test_a_stepper_in_place_of_its_L_d_is_refused(build):
     # fails if a composition of a Stepper ends in "'Stepper' object is not callable"
     def free(q0, q1, s0, h):
