@@ -237,7 +237,8 @@ class DictionarySearch:
         stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
-        return None if first is None else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
+        lost = first is None or not first.noise < self.spread
+        return None if lost else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
 
     def _longer(self, found: Found) -> Found:
         """The same terms over longer segments, where the model follows the data now."""
@@ -275,9 +276,8 @@ class DictionarySearch:
 
     def _missing(self, found: Found) -> str | None:
         """The term whose absence costs most, where that is more than it may; None where none does."""
-        if set(self.all.names) <= set(found.terms.names) or found.rms <= self.floor:
-            return None  # rounding may be lowered by any term
-        return missing(found, self._problem(found, self.all, found.config.substeps)[1], self.all)
+        none = set(self.all.names) <= set(found.terms.names) or found.rms <= self.floor  # any term lowers rounding
+        return None if none else missing(found, self._problem(found, self.all, found.config.substeps)[1], self.all)
 
     def _pruned(self, found: Found) -> Found:
         """Without the terms that the fit does not lose by, were residuals white noise."""

@@ -98,10 +98,12 @@ class Found:
         return not own <= MARGIN * its
 
     def joined_by(self, more: Found, floor: float) -> bool:
-        """Whether one more term is kept: the criterion that proposed it takes residuals for white noise."""
-        white = not (self.coloured and more.coloured)
+        """Whether one more term stays, which was proposed as if the cost were quadratic and misfits noise."""
         halved = more.rms < self.rms / 2**0.5  # squared; blocks of time are foretold to first order alone
-        return more.rms < self.rms and (white or halved or self.beaten_by(more, floor))
+        if self.coloured and more.coloured:
+            return halved or (more.rms < self.rms and self.beaten_by(more, floor))
+        count = self.fit.problem.data.q.numel()
+        return gain(self.rms, more.rms, count, floor) > math.log(count) / 2
 
     def as_good(self, other: Found, floor: float) -> bool:
         """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""

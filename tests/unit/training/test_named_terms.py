@@ -399,12 +399,15 @@ def test_numbers_with_their_deviations(value, deviation, written):
 @pytest.mark.parametrize(
     ("rms", "coloured", "beaten", "joins"),
     [(0.9, False, False, True), (0.9, True, False, False), (0.9, True, True, True), (0.6, True, False, True),
-     (1.1, False, True, False)],
+     (1.1, False, True, False), (1.1, True, True, False), (0.98, False, True, False)],
 )  # fmt: skip
 def test_a_term_joins_where_it_halves_the_misfit(rms, coloured, beaten, joins):
-    # fails if blocks of time, which are foretold to first order, turn away a term that takes half of the squared misfit
+    # fails if blocks of time, which are foretold to first order, turn away a term that takes half of the squared
+    # misfit; or if one stays that takes less of white noise than the criterion which proposed it had foretold
+    fit = SimpleNamespace(problem=SimpleNamespace(data=SimpleNamespace(q=torch.zeros(60, 1))))
     found, more = (
-        SimpleNamespace(rms=x, coloured=c, beaten_by=lambda *_: beaten) for x, c in ((1, True), (rms, coloured))
+        SimpleNamespace(rms=x, coloured=c, beaten_by=lambda *_: beaten, fit=fit)
+        for x, c in ((1, True), (rms, coloured))
     )
     assert Found.joined_by(found, more, 0.0) is joins  # pyright: ignore
 

@@ -1,5 +1,6 @@
 """Where a search for terms starts, which of its fits stands in for another, and when its steps are halved again."""
 
+import math
 from types import SimpleNamespace
 from typing import Any
 
@@ -147,3 +148,15 @@ def test_student_loses_no_data_that_least_squares_follow(monkeypatch, robust, ke
     chosen = trajectory_fit._without_prior(task, stub(), 1.0, known=True)
     assert chosen is not None
     assert chosen.fit is {"plain": plain, "robust": last}[kept]
+
+
+@pytest.mark.parametrize(("noise", "kept"), [(0.9, True), (1073.0, False), (math.nan, False)])
+def test_a_start_that_follows_nothing_is_none(noise, kept):
+    # fails if terms whose shortest segments miss by a thousand times the motion are grown, in place of another start
+    search: Any = object.__new__(DictionarySearch)
+    first = stub(noise=noise)
+    stages = stub(lengths=[20], fit=lambda *_, **__: first, grow=lambda fit, _: fit)
+    search.config, search.precision, search.spread, search.floor, search.freedom = FitConfig(), 0.1, 1.0, 0.0, None
+    search._stages = lambda *_: stages
+    search._found = lambda terms, stages, fit: fit  # noqa: ARG005
+    assert search._grown(NamedTerms(()), {}, 1, None) is (first if kept else None)
