@@ -47,6 +47,17 @@ class State(NamedTuple):
     p: Tensor  # (..., n) momentum
     s: Tensor  # (...) action variable
 
+    @classmethod
+    def of(cls, x: Tensor) -> State:
+        """The point whose numbers stand side by side, (..., 2n+1)."""
+        n = x.shape[-1] // 2
+        return cls(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
+
+    @property
+    def joined(self) -> Tensor:
+        """All numbers side by side, (..., 2n+1)."""
+        return torch.cat([self.q, self.p, self.s[..., None]], -1)
+
     @property
     def finite(self) -> Tensor:
         """(...) whether all numbers of a sample are finite."""
@@ -108,6 +119,11 @@ class Rollout:
         batch, failed = tuple(self.s.shape[:-1]), int((~self.ok).sum())
         of = f" of a batch {batch}, {failed} failed" if batch else ", failed" if failed else ""
         return f"Rollout({self.status.shape[-1]} steps, q {tuple(self.q.shape)}{of})"
+
+    @property
+    def states(self) -> State:
+        """All states, the start first."""
+        return State(self.q, self.p, self.s)
 
     @property
     def final(self) -> State:

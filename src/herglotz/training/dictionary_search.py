@@ -220,7 +220,7 @@ class DictionarySearch:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
         config = replace(config, sticking=bool(sticking) and terms.dry)
         base = started(self.base, self.data, values, config)
-        task = Task(self.data, base, config, Stages(False, None, "", resume=False))
+        task = Task(self.data, base, config, Stages())
         model = build_model(base, config, "none")
         return SegmentStages(task, with_sticking(model, excess=EXCESS not in values) if config.sticking else model)
 

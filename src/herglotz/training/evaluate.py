@@ -43,8 +43,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
         dropped[~dropped] = ~fitted.used
     states, status = states_everywhere(fitted, data, train.lengths, task.base.model_step)
     metrics, free = _errors(fitted, task, seen, dropped, states)
-    everywhere = torch.cat([states.q, states.p, states.s[:, None]], -1)
-    metrics |= judged(task, seen, fitted, everywhere, free, metrics)
+    metrics |= judged(task, seen, fitted, states.joined, free, metrics)
     metrics |= {
         "extrapolation_status": status,
         "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
@@ -59,8 +58,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
             "python": platform.python_version(),
         },
     }
-    x, n = fitted.states, data.dof
-    box = box_of(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
+    box = box_of(*State.of(fitted.states))
     h = train.typical_step / config.substeps
     return Run(fitted.model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
@@ -79,16 +77,15 @@ def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
 
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:
     """Return states at all training samples; a sample left out of the fit is reached from the sample before."""
-    n, u = train.dof, step_inputs(fitted.model, train)
-    out = fitted.states.new_empty(train.samples, 2 * n + 1)
+    u, out = step_inputs(fitted.model, train), fitted.states.new_empty(train.samples, 2 * train.dof + 1)
     out[~dropped] = fitted.states
     rows = dropped.nonzero()[:, 0]  # never the first of a trajectory
     for run in rows.tensor_split((rows.diff() > 1).nonzero()[:, 0] + 1) if len(rows) else ():
-        x, before = out[run[0] - 1], run - 1
+        before = run - 1
         inputs, h = None if u is None else u[before], train.t[run] - train.t[before]
         with torch.no_grad():
-            found = Stepper(fitted.model).rollout(x[:n], x[n : 2 * n], x[2 * n], h=h, inputs=inputs)
-        out[run] = torch.cat([found.q, found.p, found.s[:, None]], -1)[1:]
+            found = Stepper(fitted.model).rollout(*State.of(out[run[0] - 1]), h=h, inputs=inputs)
+        out[run] = found.states.joined[1:]
     return out
 
 

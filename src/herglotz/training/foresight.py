@@ -161,8 +161,7 @@ class _Ahead:
         if not parts:
             return known
         at = torch.cat(parts)
-        u = None if self.data.u is None else self.data.u[at]
-        rest = replace(self.data, t=self.data.t[at], q=self.data.q[at], u=u, lengths=tuple(map(len, parts)))
+        rest = self.data.rows(at, tuple(map(len, parts)))
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
         out = continued(model, x, grid.h, grid_inputs(model, rest, grid))

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -27,16 +25,16 @@ def states_everywhere(
     A model that follows the data has its free run near them: all steps are then solved at once, from the data. Else one
     after the other.
     """
-    n, ends = data.dof, torch.tensor(data.offsets) + torch.tensor(train_lengths)
-    out = data.q.new_full((data.samples, 2 * n + 1), torch.nan)
+    ends = torch.tensor(data.offsets) + torch.tensor(train_lengths)
+    out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
     trained = torch.arange(data.samples) < ends[data.trajectory.cpu()]
     out[trained] = fitted.states
     if bool(trained.all()):
-        return State(out[:, :n], out[:, n : 2 * n], out[:, 2 * n]), "ok"
+        return State.of(out), "ok"
     found, status = _at_once(fitted, data, out, ends, max_step), "ok"
     if found is None:
         found, status = _stepped(fitted, data, out, ends, max_step)
-    return State(found[:, :n], found[:, n : 2 * n], found[:, 2 * n]), status
+    return State.of(found), status
 
 
 def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> Tensor | None:
@@ -46,8 +44,7 @@ def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_
     lengths = tuple((torch.tensor(data.offsets) + torch.tensor(data.lengths) - ends + 1).tolist())
     if min(lengths) < 2:
         return None
-    u = None if data.u is None else data.u[rows]
-    rest = replace(data, t=data.t[rows], q=data.q[rows], u=u, s=None, p=None, lengths=lengths)
+    rest = data.rows(rows, lengths)
     grid = segment_grid(rest, rest.samples, max_step)
     inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
     nodes = near_data(fitted.model, rest, grid, out[rows[grid.start_sample]], inputs)
@@ -91,9 +88,8 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
         return None if path is None else path.x
 
     def stepped(part: slice) -> Tensor:
-        here, inputs = x[:, -1], None if u is None else u[:, part]
-        out = Stepper(model).rollout(here[:, :n], here[:, n : 2 * n], here[:, 2 * n], h=h[:, part], inputs=inputs)
-        return torch.cat([out.q, out.p, out.s[..., None]], -1)
+        inputs = None if u is None else u[:, part]
+        return Stepper(model).rollout(*State.of(x[:, -1]), h=h[:, part], inputs=inputs).states.joined
 
     with torch.no_grad():
         while k < h.shape[1]:
@@ -106,17 +102,15 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
 
 def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> tuple[Tensor, str]:
     """`out` with the free runs, one step after the other, and "ok" or why it ends; NaN from a failed step on."""
-    n, driven = data.dof, step_inputs(fitted.model, data) is not None
-    stepper, status = Stepper(fitted.model), "ok"
+    stepper, status, driven = Stepper(fitted.model), "ok", step_inputs(fitted.model, data) is not None
     for first, length, end in zip(data.offsets, data.lengths, ends.tolist(), strict=True):
         if end == first + length:
             continue
         h, stops, row, part = _fine_steps(data.t[end - 1 : first + length], max_step)
-        start = out[end - 1]
         inputs = data.inputs_of_steps(end - 1 + row, part) if driven else None
         with torch.no_grad():
-            run = stepper.rollout(start[:n], start[n : 2 * n], start[2 * n], h=h, inputs=inputs)
-        out[end : first + length] = torch.cat([run.q, run.p, run.s[:, None]], -1)[stops]
+            run = stepper.rollout(*State.of(out[end - 1]), h=h, inputs=inputs)
+        out[end : first + length] = run.states.joined[stops]
         if not bool(run.ok.all()):
             status = f"a step failed after t = {float(data.t[end - 1]):g}; nothing is predicted beyond it"
     return out, status

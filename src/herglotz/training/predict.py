@@ -115,7 +115,7 @@ class Prediction:
             return None
         rows = torch.cat([torch.arange(a, a + k) for a, k in spans])
         whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
-        return _rows(whole, rows, tuple(k for _, k in spans))
+        return whole.rows(rows, tuple(k for _, k in spans))
 
     def metrics(self) -> dict[str, Any]:
         """The numbers, for JSON."""
@@ -197,9 +197,7 @@ def predict(
     h = grid.h[inside]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    n = data.dof
-    state = State(states[:, :n], states[:, n : 2 * n], states[:, 2 * n])
-    found = Prediction(data, state, warmup, every, most, outside, zeros[best])
+    found = Prediction(data, State.of(states), warmup, every, most, outside, zeros[best])
     return replace(found, beyond=_beyond(run.box, found))
 
 
@@ -271,7 +269,7 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     chosen = torch.linspace(0, len(found) - 1, min(count, len(found))).round().long().tolist()
     spans = [found[k] for k in chosen]
     rows = torch.cat([torch.arange(a, b) for a, b in spans])
-    return _rows(data, rows, tuple(b - a for a, b in spans))
+    return data.rows(rows, tuple(b - a for a, b in spans))
 
 
 def _warmed_up(run: Trained, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
@@ -279,12 +277,12 @@ def _warmed_up(run: Trained, data: Trajectories, warmup: int) -> tuple[Tensor, f
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma, cost = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6, 0.0
     every = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
-    together = _smoothed(run.model, _rows(data, every.flatten(), (warmup,) * len(data)), sigma, run.h_range[1])
+    together = _smoothed(run.model, data.rows(every.flatten(), (warmup,) * len(data)), sigma, run.h_range[1])
     if together is not None:
         states[every.flatten()], cost = together
         return states, cost
     for rows in every:  # one of them at least has no step near it
-        alone = _smoothed(run.model, _rows(data, rows, (warmup,)), sigma, run.h_range[1])
+        alone = _smoothed(run.model, data.rows(rows, (warmup,)), sigma, run.h_range[1])
         if alone is None:
             cost = math.inf
         else:
@@ -309,9 +307,9 @@ def _smoothed(
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
     """Fill in the states after the warm-up of every trajectory, all of them stepped as one batch; return the grid."""
-    n, spans = data.dof, list(zip(data.offsets, data.lengths, strict=True))
+    spans = list(zip(data.offsets, data.lengths, strict=True))
     rows = torch.cat([torch.arange(a + warmup - 1, a + length) for a, length in spans])
-    rest = _rows(data, rows, tuple(length - warmup + 1 for length in data.lengths))
+    rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)
     start = states[[a + warmup - 1 for a, _ in spans]]
     known = torch.isfinite(start).all(-1).nonzero()[:, 0]
@@ -321,17 +319,9 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     nodes = near_data(stepper.L_d, rest, grid, start, u) if len(known) == len(spans) else None  # type: ignore[arg-type]
     if nodes is None:
         with torch.no_grad():
-            out = stepper.rollout(
-                start[known, :n], start[known, n : 2 * n], start[known, 2 * n], h=grid.h[known],
-                inputs=None if u is None else u[known],
-            )  # fmt: skip
-        nodes = states.new_full((len(spans), grid.longest + 1, 2 * n + 1), torch.nan)
-        nodes[known] = torch.cat([out.q, out.p, out.s[..., None]], -1)
+            inputs = None if u is None else u[known]
+            out = stepper.rollout(*State.of(start[known]), h=grid.h[known], inputs=inputs)
+        nodes = states.new_full((len(spans), grid.longest + 1, states.shape[-1]), torch.nan)
+        nodes[known] = out.states.joined
     states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
     return grid
-
-
-def _rows(data: Trajectories, rows: Tensor, lengths: tuple[int, ...]) -> Trajectories:
-    """These rows of the data, cut into trajectories of these lengths."""
-    known = {name: x[rows] for name in ("t", "q", "s", "p", "u") if (x := getattr(data, name)) is not None}
-    return replace(data, **known, lengths=lengths)

@@ -143,7 +143,7 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
 
     Beside it that of windows of 20 steps, which chaotic motion does not leave.
     """
-    inner, silent = replace(config, train_fraction=INNER), Stages(False, None, "", resume=False)
+    inner, silent = replace(config, train_fraction=INNER), Stages()
     inside = look(seen.train.thinned(every), inner, silent, replace(plan, zeros=()))  # which `seen` has taken off
     task = Task(inside.kept, inside.base, inside.settings, silent, hurried=True)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)

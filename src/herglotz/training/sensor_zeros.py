@@ -111,7 +111,7 @@ def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | N
     own = seen.kept.trajectory[together.problem.grid.sample] == of.reference
     before = _rms(together.problem.misfit(together.path)[own])
     apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
-    first = look(data[of.reference], config, Stages(False, None, "", resume=False))
+    first = look(data[of.reference], config, Stages())
     found = of.best(first, alone)
     if found.z.any() and found.rms <= MARGIN * together.noise:
         return apart.of(found)
@@ -152,13 +152,13 @@ class ZerosOf:
         assert seen.found is not None
         assert seen.found.sigma is not None
         self.data, self.freedom = seen.kept, FREEDOM if seen.outliers else None
-        self.task = Task(seen.kept, seen.base, seen.settings, Stages(False, None, "", resume=False))
+        self.task = Task(seen.kept, seen.base, seen.settings, Stages())
         self.sigma = max(seen.found.sigma, FLOOR * self.task.size)
         self.reference = reference_of(self.data)
 
     def fit(self, data: Trajectories) -> TrajectoryFit | None:
         """The shortest segments of these recordings; None where the model cannot follow them."""
-        task = replace(self.task, data=data, stages=Stages(False, None, "", resume=False))
+        task = replace(self.task, data=data, stages=Stages())
         stages = SegmentStages(task, build_model(task.base, task.config, "none"))
         return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=_smooth(data))
 

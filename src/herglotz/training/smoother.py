@@ -65,7 +65,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     found, std = problem.states(x), data.q.new_zeros(data.samples, 2 * n + 1)
     _, matrix, _ = problem.normal_equations(x, held=True)
     std[:, :d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
-    return Smoothed(*(State(y[:, :n], y[:, n : 2 * n], y[:, 2 * n]) for y in (found, std)))
+    return Smoothed(*(State.of(y) for y in (found, std)))
 
 
 def smoothing_start(problem: SmoothingProblem, model: ContactLagrangian) -> Tensor:

@@ -88,7 +88,12 @@ class Stages:
     """
 
     def __init__(
-        self, progress: Progress, checkpoint: Path | None, key: str, resume: bool, log: TensorboardLog | None = None
+        self,
+        progress: Progress = False,
+        checkpoint: Path | None = None,
+        key: str = "",
+        resume: bool = False,
+        log: TensorboardLog | None = None,
     ):
         self.log = log if is_first() else None
         self.lines = progress in ("lines", "iterations") and is_first()

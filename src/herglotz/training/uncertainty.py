@@ -94,8 +94,7 @@ class Laplace:
         rows = leading_rows(data, run.train_lengths)
         out = torch.zeros(data.samples, dtype=torch.bool)
         out[run.metrics.get("outlier_samples", [])] = True
-        states = torch.cat([run.states.q, run.states.p, run.states.s[:, None]], -1)[rows]
-        train, out = _first(data, run.train_lengths), out[rows]
+        states, train, out = run.states.joined[rows], data.rows(rows, run.train_lengths), out[rows]
         if run.config.robust != "off":
             lone = spikes(train)
             train, out, states = without(train, lone), out[~lone], states[~lone]
@@ -107,7 +106,7 @@ class Laplace:
             raise InputError(f"the run's metrics have sigma {self.sigma:g}, and it must be a size > 0; fit again")
         departure = run.metrics.get("departure") or run.decided.departures[-1]
         self.prior = prior_of(run.model, self.base, departure)
-        self.problem, self.path = self._solved(train, _starts(run), ~out, guess=states)
+        self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
         _, A, _ = self.problem.normal_equations(x)
@@ -150,8 +149,9 @@ class Laplace:
             raise InputError(f"{where}: angles {data.angles}, but the run's are {self.run.data.angles}")
         if not 3 <= seen < min(data.lengths):
             raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
-        head = _first(data, (seen,) * len(data))
-        task = Task(head, self.base, replace(self.run.decided, iterations=1), Stages(False, None, "", resume=False))
+        lengths = (seen,) * len(data)
+        head = data.rows(leading_rows(data, lengths), lengths)
+        task = Task(head, self.base, replace(self.run.decided, iterations=1), Stages())
         found = fit_states(task, self.run.model, self.sigma)
         if found is None or found.problem.grid.segments > len(data):
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
@@ -275,20 +275,6 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
     q, std = torch.stack([b.q for b in bands]), torch.stack([b.std for b in bands])
     sigma = torch.stack([b.sigma for b in bands]).square().mean(0).sqrt()
     return Bands(q.mean(0), (std.square().mean(0) + q.var(0)).sqrt(), sigma)
-
-
-def _first(data: Trajectories, lengths: tuple[int, ...]) -> Trajectories:
-    """The leading samples of each trajectory."""
-    index = leading_rows(data, lengths)
-    u = None if data.u is None else data.u[index]
-    return replace(data, t=data.t[index], q=data.q[index], s=None, p=None, u=u, lengths=lengths)
-
-
-def _starts(run: Run) -> Tensor:
-    """Start states of the trajectories, (B, 2n+1)."""
-    first = list(run.data.offsets)
-    q, p, s = (x[first] for x in run.states)
-    return torch.cat([q, p, s[:, None]], -1)
 
 
 def determined(effective: float, every: int) -> str:

@@ -25,7 +25,7 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.spikes import without
 from herglotz.data.units import common_unit, size
-from herglotz.stepping import Stepper
+from herglotz.stepping import State, Stepper
 from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
@@ -47,19 +47,17 @@ STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a w
 
 def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories) -> Tensor:
     """Errors of free runs over windows of 20 recorded steps from states (N, 2n+1) at the samples, (N', n)."""
-    grid, n = segment_grid(data, FIRST_SEGMENT, task.base.model_step), data.dof
-    x = states[grid.start_sample]
+    grid = segment_grid(data, FIRST_SEGMENT, task.base.model_step)
+    start, u = State.of(states[grid.start_sample]), grid_inputs(fitted.model, data, grid)
     with torch.no_grad():
-        out = Stepper(fitted.model).rollout(
-            x[:, :n], x[:, n : 2 * n], x[:, 2 * n], h=grid.h, inputs=grid_inputs(fitted.model, data, grid)
-        )
+        out = Stepper(fitted.model).rollout(*start, h=grid.h, inputs=u)
     return out.q.flatten(0, 1)[grid.node] - data.q[grid.sample]
 
 
 def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:
     """Such errors where the fit has not been, from states that are fitted there; inf where a step fails."""
-    silent, config = Stages(False, None, "", resume=False), replace(task.config, iterations=STATE_ITERATIONS)
-    stages = SegmentStages(replace(task, data=data, config=config, stages=silent), fitted.model, frozen=True)
+    config = replace(task.config, iterations=STATE_ITERATIONS)
+    stages = SegmentStages(replace(task, data=data, config=config, stages=Stages()), fitted.model, frozen=True)
     found = stages.fit(stages.lengths[0], fitted.sigma, FREEDOM if task.config.robust != "off" else None, None)
     if found is None:
         return data.q.new_full((1, data.dof), torch.inf)

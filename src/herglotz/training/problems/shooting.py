@@ -20,7 +20,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import Stepper
+from herglotz.stepping import State, Stepper
 from herglotz.training.distributed import everywhere
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
@@ -329,13 +329,10 @@ class ShootingProblem(StatesProblem):
 
     def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
         """Solve by stepping, when there is no nearby trajectory to start from."""
-        n = self.n
-        stepper = Stepper(self.parameters.at(theta))
-        out = stepper.rollout(start[:, :n], start[:, n : 2 * n], start[:, 2 * n], h=self.grid.h, inputs=self.u)
+        out = Stepper(self.parameters.at(theta)).rollout(*State.of(start), h=self.grid.h, inputs=self.u)
         if not bool(out.ok.all()):
             return None
-        guess = torch.cat([out.q, out.p, out.s[..., None]], -1)
-        return solve_path(self.parameters, theta, start, self.grid.h, guess, tol, u=self.u)
+        return solve_path(self.parameters, theta, start, self.grid.h, out.states.joined, tol, u=self.u)
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
