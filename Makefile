@@ -30,7 +30,10 @@ endef
 	@touch .venv/runtime $@
 
 demo: .venv/runtime
-	MPLBACKEND=Agg $(PY) train/demo.py
+	$(ENV) $(PY) -m herglotz fit data/demo_pendulum.csv --out runs/demo
+	$(ENV) $(PY) -m herglotz export runs/demo --out runs/demo/stepper.pt2
+	$(ENV) $(PY) -m herglotz verify runs/demo
+	$(ENV) $(PY) -m herglotz verify runs/demo/stepper.pt2
 
 # The documentation site, in build/site; `make tutorials` executes the scripts of its tutorials again (minutes).
 docs: .venv/site

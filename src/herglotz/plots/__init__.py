@@ -42,6 +42,7 @@ FIGURES = {
 }
 # Of S^k, which a model with forces does not have: identities that hold to rounding.
 IDENTITIES = {"momentum_vs_dS": plot_momentum_vs_generating_function, "hj_residual": plot_hamilton_jacobi_residual}
+NAMED = {**FIGURES, **IDENTITIES}
 
 
 def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None, form: str = "png") -> list[Path]:

@@ -11,12 +11,11 @@ import math
 import textwrap
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import parse_drag
 from herglotz.models.feature_potential import baseline_is_named
@@ -25,22 +24,8 @@ from herglotz.models.jet import coordinates
 from herglotz.models.terms import Kinetic
 from herglotz.models.translations import across_in_words
 from herglotz.training.equation_words import drag_in_words, feature_in_words, number, raised, slope, unit_of
+from herglotz.training.fitted_run import FittedRun
 from herglotz.training.parameter_vector import ParameterVector
-
-
-class Run(Protocol):
-    """What an equation is read off: `herglotz.training.Run`."""
-
-    @property
-    def model(self) -> ContactLagrangian:
-        """The trained model."""
-        ...
-
-    @property
-    def data(self) -> Trajectories:
-        """With the names and units of the coordinates."""
-        ...
-
 
 WIDTH = 78  # two blanks stand before each line on screen
 TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
@@ -107,7 +92,7 @@ class Equation:
         return cls(terms, tuple(values["lefts"]), values["units"], values["network"])
 
 
-def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
+def equation_of(run: FittedRun, covariance: Tensor | None = None) -> Equation:
     """The equation of a run's model, in the data's units; the first mass is 1.
 
     Parameters
@@ -143,7 +128,7 @@ def equation_of(run: Run, covariance: Tensor | None = None) -> Equation:
 Part = tuple[str, int, float]  # parameter, entry, factor
 
 
-def _lefts(run: Run) -> list[str]:
+def _lefts(run: FittedRun) -> list[str]:
     if not _newtonian(run.model):
         return ["L", *(f"force on {name}" for name in run.data.names)]
     kinetic, names = run.model.kinetic, run.data.names
@@ -151,7 +136,7 @@ def _lefts(run: Run) -> list[str]:
     return [f"{m.removeprefix('1 ')}{name}″" for m, name in zip(mass, names, strict=True)]
 
 
-def _kinetic(run: Run) -> list[Term]:
+def _kinetic(run: FittedRun) -> list[Term]:
     """½ vᵀ M v with the constant M that named products of speeds add to, where L is printed as one function."""
     kinetic = getattr(run.model.kinetic, "base", run.model.kinetic)
     if _newtonian(run.model) or not isinstance(kinetic, Kinetic) or not run.model.config.baseline:
@@ -165,7 +150,7 @@ def _kinetic(run: Run) -> list[Term]:
     ]
 
 
-def _relative_springs(run: Run) -> list[Term]:
+def _relative_springs(run: FittedRun) -> list[Term]:
     """−½ k (Pq)² − b (Pq) of a model with translations, whose baseline acts on the projected position."""
     V, sums = run.model.potential, {}
     forms = [] if V.across is None else across_in_words(V.across, run.data.names)
@@ -182,7 +167,7 @@ def _newtonian(model: ContactLagrangian) -> bool:
     return made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
 
 
-def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
+def _parts(run: FittedRun) -> Iterator[tuple[str, str, str, list[Part]]]:
     """Left side, text, unit and parameters of each term."""
     data, config = run.data, run.model.config
     lefts, newton = _lefts(run), _newtonian(run.model)
@@ -202,7 +187,7 @@ def _parts(run: Run) -> Iterator[tuple[str, str, str, list[Part]]]:
         yield "L", feature_in_words(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
 
 
-def _springs(run: Run, i: int, angle: bool) -> list[tuple[int, tuple[str, int, float]]]:
+def _springs(run: FittedRun, i: int, angle: bool) -> list[tuple[int, tuple[str, int, float]]]:
     """The power of a coordinate in its stiffness and its tilt, with the parameter of each, its entry and a factor."""
     config, coefficient = run.model.config, "potential.features.sum.coefficient"
     if any(name == "potential.stiffness" for name, _ in run.model.named_parameters()):
@@ -213,7 +198,7 @@ def _springs(run: Run, i: int, angle: bool) -> list[tuple[int, tuple[str, int, f
 
 
 def _friction(
-    run: Run, left: str, i: int, name: str, unit: str, newton: bool
+    run: FittedRun, left: str, i: int, name: str, unit: str, newton: bool
 ) -> Iterator[tuple[str, str, str, list[Part]]]:
     config, named, time = run.model.config, dict(run.model.named_parameters()), run.data.time_unit
     parts = []
@@ -243,7 +228,7 @@ def _friction(
             yield left, _input(run, j), "", [("friction.input_map", at, 1.0)]
 
 
-def _input(run: Run, j: int) -> str:
+def _input(run: FittedRun, j: int) -> str:
     """The input less what its sensor shows where nothing acts."""
     what, friction = run.data.input_labels[j][0], run.model.friction
     zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
@@ -251,7 +236,7 @@ def _input(run: Run, j: int) -> str:
 
 
 def _baseline(
-    run: Run, lefts: list[str], newton: bool, i: int, name: str, angle: bool, power: int, part: Part
+    run: FittedRun, lefts: list[str], newton: bool, i: int, name: str, angle: bool, power: int, part: Part
 ) -> tuple[str, str, str, list[Part]]:
     """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
     unit, time = run.data.units[i], run.data.time_unit
@@ -266,7 +251,7 @@ def _baseline(
 
 
 def _feature(
-    run: Run, lefts: list[str], newton: bool, text: str, at: tuple[str, int]
+    run: FittedRun, lefts: list[str], newton: bool, text: str, at: tuple[str, int]
 ) -> Iterator[tuple[str, str, str, list[Part]]]:
     """A feature of the potential: its force on each coordinate, or its part of L."""
     names, units, time = run.data.names, run.data.units, run.data.time_unit
@@ -280,7 +265,7 @@ def _feature(
                 yield lefts[i], what, unit_of(units[i], power, time, 2), [(*at, -by)]
 
 
-def network_of(run: Run) -> str | None:
+def network_of(run: FittedRun) -> str | None:
     """What networks add, in words; None without."""
     model, config = run.model, run.model.config
     parts = []

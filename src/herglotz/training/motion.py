@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,38 +14,14 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.driving import driven, even_times, input_recording
-from herglotz.data.holds import Arrival
 from herglotz.data.waves import waves
 from herglotz.errors import InputError
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State
 from herglotz.threads import one_thread
-from herglotz.training.config import FitConfig
+from herglotz.training.fitted_run import FittedRun
 from herglotz.training.recorded_range import Beyond, other_steps, quantities_outside, warning
 
 Numbers = float | Sequence | np.ndarray | Tensor
-
-
-class Steppable(Protocol):
-    """The attributes of a run that `free_motion` uses."""
-
-    @property
-    def stepper(self) -> Stepper: ...  # noqa: D102
-    @property
-    def data(self) -> Trajectories: ...  # noqa: D102
-    @property
-    def config(self) -> FitConfig: ...  # noqa: D102
-    @property
-    def arrival(self) -> Arrival: ...  # noqa: D102
-    @property
-    def h(self) -> float: ...  # noqa: D102
-    @property
-    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
-    @property
-    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
-
-    def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
-        """State and time at the last training sample of a trajectory."""
-        ...
 
 
 @dataclass(frozen=True, repr=False)
@@ -88,7 +64,7 @@ class Motion:
 
 @one_thread()
 def free_motion(
-    run: Steppable,
+    run: FittedRun,
     steps: int,
     *,
     q0: Numbers | None = None,
@@ -118,7 +94,7 @@ def free_motion(
     return Motion(*arrays, names=run.data.names, units=run.data.units, time_unit=run.data.time_unit, beyond=left)
 
 
-def _given(run: Steppable, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:
+def _given(run: FittedRun, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tuple[State, float]:
     like, n = run.last_fitted()[0].q, run.data.dof
     q, p = (torch.atleast_1d(torch.as_tensor(x, dtype=like.dtype)) for x in (q0, p0))
     if q.shape[-1] != n or p.shape != q.shape:
@@ -128,7 +104,7 @@ def _given(run: Steppable, q0: Numbers, p0: Numbers, s0: Numbers | None) -> tupl
 
 
 def _inputs(
-    run: Steppable, inputs: Any, span: tuple[float, int, float | None], recording: tuple[int, bool]
+    run: FittedRun, inputs: Any, span: tuple[float, int, float | None], recording: tuple[int, bool]
 ) -> tuple[Tensor | None, Tensor]:
     """Inputs (K, m) and times (K + 1,): recorded ones at their own times, others step by step or held."""
     (time, steps, h), (trajectory, from_first) = span, recording

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,37 +19,16 @@ from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
-from herglotz.training.config import FitConfig
+from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import near_data
 from herglotz.training.inputs import grid_inputs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid
-from herglotz.training.problems.least_squares import StatesOnly
-from herglotz.training.problems.smoothing import DAMPING, SmoothingProblem
+from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
-from herglotz.training.smoother import smoothing_start
-from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
+from herglotz.training.smoother import smoothed_states
 
 WARMUP = 20  # samples from which the state is estimated
 BELIEVED = 0.1  # noise of a radian of motion over that of the data, as of steps in `smooth`: states follow the model
-
-
-class Trained(Protocol):
-    """The attributes of a run that `predict` uses."""
-
-    @property
-    def model(self) -> ContactLagrangian: ...  # noqa: D102
-    @property
-    def data(self) -> Trajectories: ...  # noqa: D102
-    @property
-    def config(self) -> FitConfig: ...  # noqa: D102
-    @property
-    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
-    @property
-    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
-    @property
-    def stepper(self) -> Stepper: ...  # noqa: D102
-    @property
-    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
 
 
 @dataclass(frozen=True, repr=False)
@@ -138,9 +117,14 @@ class Prediction:
 
 @one_thread()
 def predict(
-    run: Trained, data: Trajectories, *, warmup: int = WARMUP, windows: int | None = None, horizon: float | None = None,
+    run: FittedRun,
+    data: Trajectories,
+    *,
+    warmup: int = WARMUP,
+    windows: int | None = None,
+    horizon: float | None = None,
     same_zeros: bool = False,
-) -> Prediction:  # fmt: skip
+) -> Prediction:
     """Score a run on another recording.
 
     The state at sample `warmup` of each trajectory is smoothed from the samples up to it, with the model held. From
@@ -209,20 +193,20 @@ def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyo
     )
 
 
-def arrival_of(run: Trained) -> Arrival:
+def arrival_of(run: FittedRun) -> Arrival:
     """What happened to the inputs of the fit before they acted; other recordings that say nothing are alike."""
     plan = run.metrics.get("plan") or {}
     return Arrival(plan.get("hold") or run.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
 
 
-def zeros_of(run: Trained) -> list[tuple[float, ...]]:
+def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
     """The zeros of the sensors in the recordings of the fit, each once, those of the reference first."""
     zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
     every = dict.fromkeys(tuple(zeros[i : i + n]) for i in range(0, len(zeros), n))
     return [(), *(zero for zero in every if any(zero))]
 
 
-def _of_the_run(run: Trained, data: Trajectories) -> Trajectories:
+def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
     """The coordinates of the run among those of the data, by name; a single one may be called otherwise."""
     wanted, where = run.data, data.source or "data"
     if data.dof == wanted.dof == 1:
@@ -272,7 +256,7 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     return data.rows(rows, tuple(b - a for a, b in spans))
 
 
-def _warmed_up(run: Trained, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
+def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
     """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
     sigma, cost = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6, 0.0
@@ -296,13 +280,10 @@ def _smoothed(
     """States at every sample of warm-ups, (N, 2n+1), the model held, and ½|r|²; None where it has no step near them."""
     turn = max_step * max(v / x for v, x in zip(model.config.speed, model.config.scale, strict=True))
     process = BELIEVED * min(1.0, turn) ** 0.5  # a random force adds as much in many short steps as in a long one
-    problem = SmoothingProblem(
-        model, data, segment_grid(data, data.samples, max_step), sigma=sigma, process=process
-    )  # fmt: skip
-    x = smoothing_start(problem, model)
-    states = StatesOnly(problem, x[: problem.P])
-    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
-    return None if result.reason == "not_finite" else (problem.states(states.full(result.x)), result.cost)
+    grid = segment_grid(data, data.samples, max_step)
+    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
+    found = smoothed_states(problem)
+    return None if found is None else (problem.states(found[0]), found[1])
 
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:

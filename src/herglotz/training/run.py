@@ -14,7 +14,7 @@ from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.anything import split_options
 from herglotz.data.holds import Arrival
 from herglotz.data.trajectories import GAP
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.mechanics import Driven
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
@@ -135,13 +135,10 @@ class Run:
         InputError
             If h is not positive, or the model takes inputs.
         """
-        if not h > 0:
-            raise InputError(f"h must be > 0, got {h:g}")
-        low, high = self.h_range
-        if low <= h <= high:
+        refuse({f"h must be > 0, got {h:g}": not h > 0})
+        if self.h_range[0] <= h <= self.h_range[1]:
             return self.stepper
-        single = self.states.q.dtype == torch.float32
-        return FractionalStepper(self.continuous, tolerance=1e-3 if single else 1e-6)
+        return FractionalStepper(self.continuous, tolerance=1e-3 if self.states.q.dtype == torch.float32 else 1e-6)
 
     def energy(self, state: State) -> Tensor:
         """The energy H̃(q, p, s) of the model at states; dH̃/dt = −(∂H̃/∂s) H̃.
@@ -270,11 +267,13 @@ class Run:
         InputError
             If there is no figure of that name.
         """
-        return _front().plot(self, name)
+        known = _above("plots").NAMED
+        refuse({f"there is no figure {name!r}; choose one of {', '.join(known)}": name not in known})
+        return known[name](self)
 
     def save(self, folder: str | Path) -> None:
         """Write the run into a folder, made if missing, as `save_run` does; `herglotz.load_run` reads it."""
-        import_module("herglotz.training.run_folder").save_run(self, folder)  # which knows runs
+        _above("training.run_folder").save_run(self, folder)
 
     def export(self, path: str | Path, kind: str | None = None, **settings: Any) -> Path:
         """Write one file that steps without this package (`herglotz.export.export_run`).
@@ -298,18 +297,18 @@ class Run:
         InputError
             If the kind is not known, or the extra that writes it is missing.
         """
-        return _front().export(self, path, kind, **settings)
+        return _above("export").export_run(self, path, kind, **settings)
 
     def verify(self, **settings: Any) -> Any:
         """Measure every identity; `print(run.verify().table())` (`herglotz.verify.verify`)."""
-        return _front().verify(self, **settings)
+        return _above("verify").verify(self, **settings)
 
     def symmetries(self, **settings: Any) -> Any:
         """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
 
         A symmetry is one within the error of the run's own free run (`herglotz.verify.symmetries`).
         """
-        return _front().symmetries(self, **settings)
+        return _above("verify").symmetries(self, **settings)
 
     def report(self, folder: str | Path, against: Any = None) -> list[Path]:
         """Write report.html, which fetches nothing, and its twin report.md.
@@ -331,7 +330,8 @@ class Run:
         InputError
             If the recording cannot be read, or is not of the same coordinates.
         """
-        return _front().report(self, folder, against)
+        other = None if against is None else as_trajectories(against, like=self.data)
+        return _above("report").write_report(self, folder, other, name=str(folder))
 
     def summary(self) -> str:
         """What was reached, in a few lines."""
@@ -344,6 +344,6 @@ class Run:
         return as_html(self)
 
 
-def _front() -> Any:
-    """The module that knows the rooms above this one; loaded when a run is asked for something of theirs."""
-    return import_module("herglotz.front")
+def _above(module: str) -> Any:
+    """A module that knows runs; loaded when a run is asked for something of it."""
+    return import_module(f"herglotz.{module}")

@@ -53,28 +53,36 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     check_positive("sigma", sigma)
     check_positive("process", process)
     data = data.unwrapped()
-    grid = segment_grid(data, data.samples, GAP * data.typical_step)
-    problem = SmoothingProblem(model, data, grid, sigma=sigma, process=process)
-    x, n, d = smoothing_start(problem, model), data.dof, problem.d
-    states = StatesOnly(problem, x[: problem.P])
-    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
-    if result.reason == "not_finite":
+    problem = SmoothingProblem(
+        model, data, segment_grid(data, data.samples, GAP * data.typical_step), sigma=sigma, process=process
+    )
+    solved = smoothed_states(problem)
+    if solved is None:
         where = data.source or "data"
         raise InputError(f"{where}: the model has no step near these data, so nothing can be smoothed; fit it again")
-    x = states.full(result.x)
-    found, std = problem.states(x), data.q.new_zeros(data.samples, 2 * n + 1)
+    x, _ = solved
+    found = problem.states(x)
+    std = torch.zeros_like(found)
     _, matrix, _ = problem.normal_equations(x, held=True)
-    std[:, :d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
+    std[:, : problem.d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
     return Smoothed(*(State.of(y) for y in (found, std)))
 
 
-def smoothing_start(problem: SmoothingProblem, model: ContactLagrangian) -> Tensor:
+def smoothed_states(problem: SmoothingProblem) -> tuple[Tensor, float] | None:
+    """All unknowns with the states smoothed, the model held, and ½|r|²; None where it has no step near the data."""
+    x = smoothing_start(problem)
+    states = StatesOnly(problem, x[: problem.P])
+    result = levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING)
+    return None if result.reason == "not_finite" else (states.full(result.x), result.cost)
+
+
+def smoothing_start(problem: SmoothingProblem) -> Tensor:
     """Unknowns that smoothing starts from: straight lines between samples, or the model's own motion near them.
 
     A joint that set-valued friction holds stands still whatever its momentum is, so that a search which starts with
     defects cannot mend them there; the motion from a start state has none.
     """
-    x, data = problem.start(), problem.data
+    x, data, model = problem.start(), problem.data, problem.parameters.model
     if model.friction is None or not model.friction.dry:
         return x
     local = local_polynomials(data)

@@ -4,34 +4,18 @@ from __future__ import annotations
 
 from html import escape
 from textwrap import fill
-from typing import Any, Protocol
+from typing import Any
 
-from herglotz.data import Trajectories
 from herglotz.data.units import as_recorded, common_unit, size, span
-from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation
+from herglotz.training.fitted_run import FittedRun
 from herglotz.training.recorded_range import range_in_words
 
 MOST_FEATURES, COLUMNS = 5, 80
 MOST_NAMED = 4  # coordinates; of a chain of masses the order says which is which
 
 
-class Judged(Protocol):
-    """The attributes of a run that are told."""
-
-    @property
-    def decided(self) -> FitConfig: ...  # noqa: D102
-    @property
-    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
-    @property
-    def data(self) -> Trajectories: ...  # noqa: D102
-    @property
-    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
-    @property
-    def train_lengths(self) -> tuple[int, ...]: ...  # noqa: D102
-
-
-def rows(run: Judged) -> list[tuple[str, str]]:
+def rows(run: FittedRun) -> list[tuple[str, str]]:
     """Names and values of what was reached, those that the run has."""
     m, data = run.metrics, run.data
     unit, degrees = common_unit(data.units), bool(data.degrees)  # as the file had them
@@ -53,7 +37,7 @@ def rows(run: Judged) -> list[tuple[str, str]]:
     return [(name, value) for name, value in found if value]
 
 
-def summary(run: Judged) -> str:
+def summary(run: FittedRun) -> str:
     """A few lines for people, the verdict last."""
     table = rows(run)
     width = max(len(name) for name, _ in table)
@@ -67,13 +51,13 @@ def summary(run: Judged) -> str:
     return "\n".join([*lines, fill(f"Verdict: {run.metrics.get('verdict', 'not judged')}", COLUMNS)])
 
 
-def one_line(run: Judged) -> str:
+def one_line(run: FittedRun) -> str:
     """The run in one line of 80 characters or little more."""
     names, verdict = ", ".join(run.data.names), run.metrics.get("verdict", "not judged").split(":")[0]
     return f"Run({run.decided.level} level, {names} of {run.data.source or 'data'}; {verdict})"
 
 
-def as_html(run: Judged) -> str:
+def as_html(run: FittedRun) -> str:
     """A small table for notebooks."""
     cells = [*rows(run), ("verdict", run.metrics.get("verdict", "not judged"))]
     body = "".join(
@@ -95,7 +79,7 @@ def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
     return features_in_words(features) + (f"  ({', '.join(told)})" if told else "")
 
 
-def model_card(run: Judged, h_range: tuple[float, float]) -> str:
+def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
     """What a reader of an exported file should know: summary, verdict, and the range that the model was fitted to."""
     steps, positions = span(h_range, run.data.time_unit), range_in_words(run.box, run.data)
     return "\n".join([

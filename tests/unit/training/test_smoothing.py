@@ -150,7 +150,7 @@ def test_a_held_joint_is_smoothed_from_a_motion(seed):
     # samples over σ is 10; measured over four seeds 4 to 18, and from straight lines 7, 18, 335 and 36
     model, data = _held_axis(seed)
     problem = SmoothingProblem(model, data, segment_grid(data, 20, 0.03), sigma=0.02, process=0.1)
-    x = smoothing_start(problem, model)
+    x = smoothing_start(problem)
     states = StatesOnly(problem, x[: problem.P])
     assert levenberg_marquardt(states, x[problem.P :], rtol=1e-10, patience=1, damping=DAMPING).cost < 20
 

@@ -16,7 +16,6 @@ from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.robust import loss, root_weights
-from herglotz.training.solvers.levenberg_marquardt import memory_of, remind
 
 SOME = 64  # steps of the data that say how large the masses are
 
@@ -123,14 +122,6 @@ class StatesOnly:
     def full(self, states: Tensor) -> Tensor:
         """All unknowns of the problem."""
         return torch.cat([self.theta, states])
-
-    def memory(self) -> dict[str, Any]:
-        """Of the problem."""
-        return memory_of(self.problem)
-
-    def recall(self, memory: dict[str, Any]) -> None:
-        """Inverse of `memory`."""
-        remind(self.problem, memory)
 
     def cost(self, x: Tensor) -> Tensor:
         """Of all unknowns; only the states differ from call to call."""

@@ -6,14 +6,11 @@ symmetry says where 0 is.
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.solvers.levenberg_marquardt import memory_of, remind
 
 
 def reference_of(data: Trajectories) -> int:
@@ -38,14 +35,6 @@ class WithZeros:
             own = torch.where(own < reference, own, own - 1).where(own != reference, -1)
         self.problem, self.which, self.held = problem, own[data.trajectory], held
         self.count = (len(data) - (held is None)) * problem.n
-
-    def memory(self) -> dict[str, Any]:
-        """Of the problem."""
-        return memory_of(self.problem)
-
-    def recall(self, memory: dict[str, Any]) -> None:
-        """Inverse of `memory`."""
-        remind(self.problem, memory)
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|² with q + z − y as the residuals of the data."""

@@ -55,14 +55,15 @@ class Progress(Protocol):
 
 
 def memory_of(problem: Any) -> dict[str, Any]:
-    """What a problem remembers of its last evaluation and later ones start from; {} of most."""
-    return problem.memory() if hasattr(problem, "memory") else {}
+    """What a problem, or the one inside it, remembers of its last evaluation and later ones start from; {} of most."""
+    inner = getattr(problem, "problem", problem)
+    return inner.memory() if hasattr(inner, "memory") else {}
 
 
 def remind(problem: Any, memory: dict[str, Any]) -> None:
     """Inverse of `memory_of`."""
     if memory:
-        problem.recall(memory)
+        getattr(problem, "problem", problem).recall(memory)
 
 
 @dataclass

@@ -1,0 +1,39 @@
+"""What equation, summary, motion and prediction read off a `Run`, which imports all of them."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+from herglotz.data import Trajectories
+from herglotz.data.holds import Arrival
+from herglotz.models import ContactLagrangian
+from herglotz.stepping import State, Stepper
+from herglotz.training.config import FitConfig
+
+
+class FittedRun(Protocol):
+    """The attributes of `herglotz.training.Run` that are told and stepped."""
+
+    @property
+    def model(self) -> ContactLagrangian: ...  # noqa: D102
+    @property
+    def config(self) -> FitConfig: ...  # noqa: D102
+    @property
+    def decided(self) -> FitConfig: ...  # noqa: D102
+    @property
+    def metrics(self) -> dict[str, Any]: ...  # noqa: D102
+    @property
+    def data(self) -> Trajectories: ...  # noqa: D102
+    @property
+    def train_lengths(self) -> tuple[int, ...]: ...  # noqa: D102
+    @property
+    def h(self) -> float: ...  # noqa: D102
+    @property
+    def h_range(self) -> tuple[float, float]: ...  # noqa: D102
+    @property
+    def box(self) -> dict[str, list[float]]: ...  # noqa: D102
+    @property
+    def arrival(self) -> Arrival: ...  # noqa: D102
+    @property
+    def stepper(self) -> Stepper: ...  # noqa: D102
+    def last_fitted(self, trajectory: int = 0) -> tuple[State, float]: ...  # noqa: D102
