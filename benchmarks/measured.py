@@ -1,7 +1,7 @@
 """Noise, outliers, motors, bands and measured data, seed by seed: `python benchmarks/measured.py [--seeds 5]`.
 
 Writes results/measured.json and .md, and coverage.png. Settings are the defaults unless a set says otherwise
-(measured_sets.py and machine_sets.py say what each is). Sets that are absent are skipped
+(measured_sets.py says what each is). Sets that are absent are skipped
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
 run alone. Seconds of one core for each seed: noise 13, one_trajectory 5, outliers 25, disturbed 25, real_pendulum 20,
 air_track 18, driven_pendulum 110, coverage_simulated 27, coverage_real about 90,
@@ -21,7 +21,7 @@ from typing import Any
 import torch
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks import harness, machine_sets, measured_sets as sets
+from benchmarks import harness, measured_sets as sets
 from herglotz.plots import style
 
 COVERED = (0.80, 0.97)  # share of samples inside a band of nominal 0.9 that counts as kept
@@ -52,10 +52,10 @@ ROWS: dict[str, tuple[tuple[str, ...], Callable[..., dict[str, Any]]]] = {
     "real_pendulum": ((sets.PENDULUM,), sets.extrapolation(sets.PENDULUM)),
     "air_track": ((sets.AIR_TRACK,), sets.extrapolation(sets.AIR_TRACK)),
     "driven_pendulum": (sets.DFKI, sets.driven_pendulum),
-    "motor_axis": ((machine_sets.MOTOR_AXIS,), machine_sets.motor_axis),
-    "duffing_circuit": ((machine_sets.DUFFING_CIRCUIT,), machine_sets.duffing_circuit),
-    "two_joints": ((machine_sets.TWO_JOINTS,), machine_sets.two_joints),
-    "two_motors": (machine_sets.TWO_MOTORS, machine_sets.two_motors),
+    "motor_axis": ((sets.MOTOR_AXIS,), sets.motor_axis),
+    "duffing_circuit": ((sets.DUFFING_CIRCUIT,), sets.duffing_circuit),
+    "two_joints": ((sets.TWO_JOINTS,), sets.two_joints),
+    "two_motors": (sets.TWO_MOTORS, sets.two_motors),
     "coverage_simulated": ((), sets.coverage_simulated),
     "coverage_real": ((sets.PENDULUM,), sets.coverage_real),
 }

@@ -73,7 +73,7 @@ def _read(path: Path) -> tuple[FitConfig, dict[str, Any]]:
     """The settings in a run's config.json, and how its data were read."""
     from herglotz.data.files import read_bytes
     from herglotz.training import FitConfig
-    from herglotz.training.reading import reading_in
+    from herglotz.training.run_folder import reading_in
 
     file = path / "config.json" if path.is_dir() else path
     content = read_bytes(file)

@@ -61,9 +61,10 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     return LocalPolynomials(width, degree, coefficients, half, middle, rows)
 
 
-def smoothed(data: Trajectories, local: LocalPolynomials) -> Trajectories:
-    """The same recordings with positions on the local polynomials."""
-    return replace(data, q=local.at(0.0).to(data.q))
+def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:
+    """The recordings with positions on local polynomials, by default their own; as they are where they have none."""
+    local = local or local_polynomials(data)
+    return data if local is None else replace(data, q=local.at(0.0).to(data.q))
 
 
 def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples, Tensor | None]:

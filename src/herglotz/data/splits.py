@@ -1,9 +1,8 @@
-"""Training and test parts of a set of trajectories, as rows of their concatenation."""
+"""Parts of a set of trajectories, as rows of their concatenation: training and test, and every m-th sample."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -45,24 +44,10 @@ def time_split(
     return (torch.cat(train), cuts), (torch.cat(test), rest)
 
 
-class Concatenation(Protocol):
-    """Trajectories stored one after the other."""
-
-    @property
-    def t(self) -> Tensor:
-        """Time, (N,)."""
-        ...
-
-    @property
-    def lengths(self) -> tuple[int, ...]:
-        """Samples of each trajectory."""
-        ...
-
-
-def leading_rows(data: Concatenation, lengths: Sequence[int]) -> Tensor:
-    """Rows of the first `lengths[b]` samples of every trajectory b."""
-    spans = [torch.arange(first, first + k) for first, k in zip(offsets_of(data.lengths), lengths, strict=True)]
-    return torch.cat(spans).to(data.t.device)
+def leading_rows(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
+    """Rows of the first `lengths[b]` samples of every trajectory b, which has `of[b]`."""
+    spans = [torch.arange(first, first + k) for first, k in zip(offsets_of(of), lengths, strict=True)]
+    return torch.cat(spans)
 
 
 def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
@@ -79,3 +64,33 @@ def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
         rows.append(torch.arange(start, start + count))
         kept.append(count)
     return torch.cat(rows), tuple(kept)
+
+
+def every_mth(lengths: Sequence[int], every: int) -> Tensor:
+    """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
+
+    Raises
+    ------
+    InputError
+        If `every` is not a whole number >= 1.
+    """
+    if isinstance(every, bool) or not isinstance(every, int) or every < 1:
+        raise InputError(f"every must be a whole number >= 1, got {every!r}")
+    return torch.cat([torch.arange(length) % every == 0 for length in lengths])
+
+
+def inputs_of_kept(
+    t: Tensor,  # (N,) time
+    u: Tensor,  # (N, m) inputs; each acts from its sample to the next
+    lengths: Sequence[int],  # samples of each trajectory
+    kept: Tensor,  # (N,) bool
+) -> Tensor:
+    """Return the time-weighted mean of u over the step that starts at each kept sample, (kept, m)."""
+    h = torch.cat([t.diff(), t.new_zeros(1)])
+    h[torch.tensor(lengths).cumsum(0) - 1] = 0  # no step starts at the last sample of a trajectory
+    h = h * torch.cat([part.cumsum(0) > 0 for part in kept.split(tuple(lengths))])  # nor before the first one kept
+    step = (kept.cumsum(0) - 1).clamp_min(0)
+    time = h.new_zeros(int(step[-1]) + 1).index_add(0, step, h)
+    impulse = u.new_zeros(len(time), u.shape[1]).index_add(0, step, u * h[:, None])
+    mean = impulse / time.clamp_min(torch.finfo(h.dtype).tiny)[:, None]
+    return torch.where(time[:, None] > 0, mean, u[kept])

@@ -13,10 +13,9 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of, unnamed
-from herglotz.data.column_table import column_table
+from herglotz.data.csv_columns import column_table
 from herglotz.data.holds import Arrival, check_arrival, held
-from herglotz.data.splits import liveliest_rows, time_split
-from herglotz.data.thinning import every_mth, inputs_of_kept
+from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
 from herglotz.errors import InputError, refuse
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -15,9 +16,8 @@ from herglotz.data.windows import Triples
 from herglotz.errors import InputError
 from herglotz.least_squares import least_squares
 from herglotz.models.translations import projection
-from herglotz.training.problems.robust import FREEDOM, root_weights, scale_of
+from herglotz.training.problems.robust import robust_fit, scale_of
 
-ROUNDS = 10  # iterations of re-weighting for Student's t
 JITTER = 1.05  # a step up to this factor longer than the typical one is crossed in as many model steps
 PULLED = 3.0  # ratio of the least-squares misfit to that of Student's t above which outliers pull least squares
 NEGLIGIBLE = 1e-3  # a misfit of the bulk below this share of the RMS acceleration means rest or exact data
@@ -71,7 +71,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     InputError
         If nothing moves.
     """
-    max_step, t, v, a, columns = differences(data, drag)
+    t, v, a, columns, max_step = differences(data, drag)
     n = data.dof
     m = 0 if data.u is None else data.u.shape[1]
     q = data.q
@@ -125,7 +125,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     All needed: accelerations jump from sample to sample (a smooth motion has h|a| < |v| down to six samples a period),
     and least squares miss their bulk, by more than rounding, three times as far as Student's t does.
     """
-    _, t, v, a, columns = differences(data, drag)
+    t, v, a, columns, _ = differences(data, drag)
     size = float(a.square().mean().sqrt())
     jumps = float((a * (t.h0 + t.h1)[:, None] / 2).square().mean().sqrt()) > float(v.square().mean().sqrt())
     if not jumps:
@@ -136,8 +136,18 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
     return plain > max(PULLED * robust, NEGLIGIBLE * size)
 
 
-def differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor, Tensor, Tensor]:
-    """Return longest step, triples (T), velocities (T, n), accelerations (T, n), and their columns (T, n, k)."""
+class Differences(NamedTuple):
+    """A linear model of the accelerations, by differences of three samples each."""
+
+    triples: Triples
+    v: Tensor  # (T, n) velocities
+    a: Tensor  # (T, n) accelerations
+    columns: Tensor  # (T, n, k) of the coefficients
+    max_step: float  # longest step
+
+
+def differences(data: Trajectories, drag: bool = False) -> Differences:
+    """Velocities and accelerations, and the columns that `estimate_baseline` fits to these."""
     max_step = GAP * data.typical_step  # longer ones are gaps: crossed in several model steps
     t = data.triples(max_step)
     if len(t) == 0:
@@ -157,16 +167,12 @@ def differences(data: Trajectories, drag: bool) -> tuple[float, Triples, Tensor,
     if drag:
         half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
         columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
-    return max_step, t, v, a, columns
+    return Differences(t, v, a, columns, max_step)
 
 
 def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:
     """Return the solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which rows are no outliers, (T,) bool."""
     rows, right = A.reshape(-1, A.shape[-1]), a.reshape(-1, 1)
-    x = least_squares(rows, right)
-    for _ in range(ROUNDS):
-        r = rows @ x - right
-        by = root_weights(r / max(scale_of(r), torch.finfo(r.dtype).tiny), FREEDOM)
-        x = least_squares(by * rows, by * right)
+    x = robust_fit(rows, right)
     r = rows @ x - right
     return x[:, 0].tolist(), r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)

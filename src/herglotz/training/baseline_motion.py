@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -28,24 +28,12 @@ STARTS = 256  # number of triples for each coordinate
 
 @dataclass(frozen=True)
 class BaselineMotion:
-    """The baseline's equation of motion with parameters fitted to triples of positions.
+    """The baseline's equation of motion with parameters fitted to triples of positions."""
 
-    Parameters
-    ----------
-    angles
-        (n,) bool.
-    parameters
-        (3, n): k, b and the one rate γ, repeated.
-    substeps
-        Runge–Kutta steps a step of the data.
-    error
-        RMS of the predicted third position over the data's triples, in units of q.
-    """
-
-    angles: Tensor
-    parameters: Tensor
-    substeps: int
-    error: float
+    angles: Tensor  # (n,) bool
+    parameters: Tensor  # (3, n): k, b and the one rate γ, repeated
+    substeps: int  # Runge–Kutta steps a step of the data
+    error: float = math.inf  # RMS of the predicted third position over the data's triples, in units of q
 
     def triples(self, data: Trajectories, base: Baseline) -> Triples:
         """Return triples from quasi-random states in the range of the data and a little beyond."""
@@ -55,7 +43,7 @@ class BaselineMotion:
         q1, v1 = (torch.stack([one[k][:count] for one in columns], -1) for k in (0, 1))
         like = torch.arange(count, device=q1.device) * len(recorded) // max(count, 1)
         h0, h1 = recorded.h0[like], recorded.h1[like]
-        q0, q2 = (_flow(self.angles, q1, v1, self.parameters, h, self.substeps)[0] for h in (-h0, h1))
+        q0, q2 = (self._flow(q1, v1, h)[0] for h in (-h0, h1))
         return Triples(q0, q1, q2, h0, h1, recorded.trajectory[like], recorded.index[like])
 
     def _states(self, i: int, recorded: Triples) -> tuple[Tensor, Tensor]:
@@ -75,6 +63,51 @@ class BaselineMotion:
         k, b, _ = self.parameters[:, i]
         return v.square() / 2 + (b * q.sin() - k * q.cos() if self.angles[i] else k * q.square() / 2 + b * q)
 
+    def linearised(self, t: Triples, v: Tensor) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
+        """Errors r of q2 (T, n), their slopes in k, b and γ (3, T, n), and the velocity v at q1 after a step of these.
+
+        The velocity that leads back to q0 is eliminated.
+        """
+        before, back = self._flow(t.q1, v, -t.h0, slopes=True)
+        after, on = self._flow(t.q1, v, t.h1, slopes=True)
+        missed = t.q0 - before
+        gain = on[0] / back[0]
+
+        def v_of(step: Tensor) -> Tensor:
+            return v + (missed - (back[1:] * step[:, None]).sum(0)) / back[0]
+
+        return after - t.q2 + gain * missed, on[1:] - gain * back[1:], v_of
+
+    def _flow(self, q: Tensor, v: Tensor, h: Tensor, slopes: bool = False) -> tuple[Tensor, Tensor]:
+        """Position (T, n) a time h (T,) later, by Runge–Kutta of order 4; slopes in v, k, b and γ, (4, T, n), or none.
+
+        Coordinates do not act on one another: each has its own four slopes.
+        """
+        (k, b, rate), angles, d = self.parameters, self.angles, (h / self.substeps)[:, None]
+
+        def a(q: Tensor, v: Tensor) -> Tensor:
+            sin, cos = torch.where(angles, q[0].sin(), q[0]), torch.where(angles, q[0].cos(), 1.0)
+            own = (-k * sin - b * cos - rate * v[0])[None]
+            if not slopes:
+                return own
+            stiffness = torch.where(angles, k * cos - b * sin, k)
+            direct = torch.stack([torch.zeros_like(sin), sin, cos, v[0]])
+            return torch.cat([own, -stiffness * q[1:] - rate * v[1:] - direct])
+
+        still = q.new_zeros(4 * slopes, *q.shape)
+        first = torch.cat([torch.ones_like(v)[None], still[1:]]) if slopes else still
+        q, v = torch.cat([q[None], still]), torch.cat([v[None], first])
+        for _ in range(self.substeps):
+            a1 = a(q, v)
+            v2 = v + d / 2 * a1
+            a2 = a(q + d / 2 * v, v2)
+            v3 = v + d / 2 * a2
+            a3 = a(q + d / 2 * v2, v3)
+            v4 = v + d * a3
+            a4 = a(q + d * v3, v4)
+            q, v = q + d / 6 * (v + 2 * v2 + 2 * v3 + v4), v + d / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
+        return q[0], q[1:]
+
 
 def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> BaselineMotion | None:
     """Fit by least squares to the triples of the data; return None where the remaining error exceeds `worst`."""
@@ -85,12 +118,13 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
     substeps = math.ceil(float(torch.maximum(t.h0, t.h1).max()) * fastest / TURN)
     v, best = _slopes(t), None
     for k in range(ROUNDS):
-        r, columns, v_of = _linearised(angles, t, v, parameters, substeps)
+        motion = BaselineMotion(angles, parameters, substeps)
+        r, columns, v_of = motion.linearised(t, v)
         error = float(r.square().mean().sqrt())
         lost = not (math.isfinite(error) and bool(torch.isfinite(columns).all()))
         if lost or (best is not None and k > 3 and error > 0.5 * best.error):
             break
-        best = BaselineMotion(angles, parameters, substeps, error)
+        best = replace(motion, error=error)
         A = torch.cat([torch.diag_embed(columns[0]), torch.diag_embed(columns[1]), columns[2][..., None]], -1)
         x = least_squares(A.flatten(0, 1).cpu(), -r.reshape(-1, 1).cpu())[:, 0].to(r)
         step = torch.stack([x[:n], x[n : 2 * n], x[2 * n].expand(n)])
@@ -100,55 +134,3 @@ def fit_baseline_motion(data: Trajectories, base: Baseline, worst: float) -> Bas
 
 def _slopes(t: Triples) -> Tensor:
     return (t.q2 - t.q0) / (t.h0 + t.h1)[:, None]
-
-
-def _linearised(
-    angles: Tensor, t: Triples, v: Tensor, parameters: Tensor, substeps: int
-) -> tuple[Tensor, Tensor, Callable[[Tensor], Tensor]]:
-    """Errors r of q2 (T, n), their slopes in k, b and γ (3, T, n), and the velocity v at q1 after a step of these.
-
-    The velocity that leads back to q0 is eliminated.
-    """
-    before, back = _flow(angles, t.q1, v, parameters, -t.h0, substeps, slopes=True)
-    after, on = _flow(angles, t.q1, v, parameters, t.h1, substeps, slopes=True)
-    missed = t.q0 - before
-    gain = on[0] / back[0]
-
-    def v_of(step: Tensor) -> Tensor:
-        return v + (missed - (back[1:] * step[:, None]).sum(0)) / back[0]
-
-    return after - t.q2 + gain * missed, on[1:] - gain * back[1:], v_of
-
-
-def _flow(
-    angles: Tensor, q: Tensor, v: Tensor, parameters: Tensor, h: Tensor, substeps: int, slopes: bool = False
-) -> tuple[Tensor, Tensor]:
-    """Position (T, n) a time h (T,) later, by Runge–Kutta of order 4; its slopes in v, k, b and γ, (4, T, n), or none.
-
-    Coordinates do not act on one another: each has its own four slopes.
-    """
-    k, b, rate = parameters
-    d = (h / substeps)[:, None]
-
-    def a(q: Tensor, v: Tensor) -> Tensor:
-        sin, cos = torch.where(angles, q[0].sin(), q[0]), torch.where(angles, q[0].cos(), 1.0)
-        own = (-k * sin - b * cos - rate * v[0])[None]
-        if not slopes:
-            return own
-        stiffness = torch.where(angles, k * cos - b * sin, k)
-        direct = torch.stack([torch.zeros_like(sin), sin, cos, v[0]])
-        return torch.cat([own, -stiffness * q[1:] - rate * v[1:] - direct])
-
-    still = q.new_zeros(4 * slopes, *q.shape)
-    first = torch.cat([torch.ones_like(v)[None], still[1:]]) if slopes else still
-    q, v = torch.cat([q[None], still]), torch.cat([v[None], first])
-    for _ in range(substeps):
-        a1 = a(q, v)
-        v2 = v + d / 2 * a1
-        a2 = a(q + d / 2 * v, v2)
-        v3 = v + d / 2 * a2
-        a3 = a(q + d / 2 * v2, v3)
-        v4 = v + d * a3
-        a4 = a(q + d * v3, v4)
-        q, v = q + d / 6 * (v + 2 * v2 + 2 * v3 + v4), v + d / 6 * (a1 + 2 * a2 + 2 * a3 + a4)
-    return q[0], q[1:]

@@ -9,7 +9,7 @@ from typing import Any
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models import LEVELS
 from herglotz.models.network import ACTIVATIONS
 from herglotz.models.term import TERMS
@@ -176,46 +176,42 @@ class FitConfig:
     absent: tuple[str, ...] = ()
 
     def __post_init__(self):
-        for name, choices in CHOICES.items():
-            if (value := getattr(self, name)) not in choices:
-                raise InputError(f"unknown {name} '{value}'; choose one of {', '.join(choices)}")
-        for name in ("restarts", "iterations", "substeps"):
-            if (value := getattr(self, name)) is not None and value < 1:
-                raise InputError(f"{name} must be >= 1, got {value}")
-        if not 0 < self.train_fraction <= 1:
-            raise InputError(f"train fraction must be in (0, 1], got {self.train_fraction:g}")
-        if not self.departures or min(self.departures) <= 0:
-            raise InputError(f"departures must be one or more positive numbers, got {self.departures}")
-        self._check_objective()
-        self._check_forces()
-        self._check_batch()
-        self._check_device()
-
-    def _check_objective(self) -> None:
-        if self.supervision != "q" and self.objective not in ("auto", "residual"):
-            raise InputError(
-                f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', "
-                f"not '{self.objective}'"
-            )
-        if self.optimiser != "lm" and self.objective not in ("residual", "raw"):
-            raise InputError(
-                f"{self.optimiser} fits the objectives residual and raw, not {self.objective!r}; use the optimiser lm"
-            )
-        if self.substeps > 1 and self.objective not in ("trajectory", "smoothing"):
-            raise InputError(
-                f"substeps are of trajectory fitting, not of the objective {self.objective!r}; set it to 'trajectory'"
-            )
-
-    def _check_forces(self) -> None:
-        if self.sticking and self.objective not in ("auto", "trajectory"):
-            raise InputError(f"sticking friction is fitted to trajectories; leave objective='{self.objective}' out")
+        own = {name: getattr(self, name) for name in (*CHOICES, "restarts", "iterations", "substeps")}
+        refuse({
+            f"unknown {name} '{own[name]}'; choose one of {', '.join(choices)}": own[name] not in choices
+            for name, choices in CHOICES.items()
+        })  # fmt: skip
+        refuse({
+            f"{name} must be >= 1, got {value}": value is not None and value < 1
+            for name, value in own.items() if name not in CHOICES
+        })  # fmt: skip
         forces = self.coulomb or self.sticking or self.input_map or self.drag
-        if forces and self.level not in ("forced", "auto"):
-            raise InputError(
-                f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'"
-            )
-        if self.input_map and not self.use_inputs:
-            raise InputError("input_map is given but use_inputs is False; leave one of them out")
+        objective, adaptive = self.objective, self.optimiser != "lm"
+        refuse({
+            f"train fraction must be in (0, 1], got {self.train_fraction:g}": not 0 < self.train_fraction <= 1,
+            f"departures must be one or more positive numbers, got {self.departures}":
+                not self.departures or min(self.departures) <= 0,
+            f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', not "
+            f"'{objective}'": self.supervision != "q" and objective not in ("auto", "residual"),
+            f"{self.optimiser} fits the objectives residual and raw, not {objective!r}; use the optimiser lm":
+                adaptive and objective not in ("residual", "raw"),
+            f"substeps are of trajectory fitting, not of the objective {objective!r}; set it to 'trajectory'":
+                self.substeps > 1 and objective not in ("trajectory", "smoothing"),
+            f"sticking friction is fitted to trajectories; leave objective='{objective}' out":
+                self.sticking and objective not in ("auto", "trajectory"),
+            f"coulomb, sticking, drag and input_map are forces; set level='forced', not '{self.level}'":
+                forces and self.level not in ("forced", "auto"),
+            "input_map is given but use_inputs is False; leave one of them out":
+                self.input_map and not self.use_inputs,
+        })  # fmt: skip
+        if self.batch is not None:
+            refuse({
+                f"batch must be >= 1, got {self.batch}": self.batch < 1,
+                "batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out": not adaptive,
+                f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and "
+                "set supervision='qs'": self.level in ("affine", "full") and self.supervision == "q",
+            })  # fmt: skip
+        self._check_device()
 
     def _check_device(self) -> None:
         try:
@@ -224,19 +220,6 @@ class FitConfig:
             raise InputError(f"unknown device '{self.device}'; use cpu or cuda") from None
         if device.type == "cuda" and not torch.cuda.is_available():
             raise InputError("device cuda was asked for but PyTorch finds no GPU; use cpu")
-
-    def _check_batch(self) -> None:
-        if self.batch is None:
-            return
-        if self.batch < 1:
-            raise InputError(f"batch must be >= 1, got {self.batch}")
-        if self.optimiser == "lm":
-            raise InputError("batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out")
-        if self.level in ("affine", "full") and self.supervision == "q":
-            raise InputError(
-                f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and "
-                "set supervision='qs'"
-            )
 
     def resolved(self, data: Trajectories) -> FitConfig:
         """The settings of a fit to these data, with the level decided.
@@ -253,16 +236,13 @@ class FitConfig:
             config = replace(self, level=level, coulomb=self.coulomb or driven)
         if self.sticking:
             config = replace(config, coulomb=True)
-        if driven and config.level != "forced":
-            raise InputError(
-                f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "
-                "or use_inputs=False to leave them out"
-            )
-        inputs = data.u.shape[1] if driven and data.u is not None else 0
-        if self.input_map and len(self.input_map) != data.dof * inputs:
-            raise InputError(
-                f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {len(self.input_map)}"
-            )
+        inputs, count = data.u.shape[1] if driven and data.u is not None else 0, len(self.input_map)
+        refuse({
+            f"{where}: holds inputs u, which the level '{config.level}' cannot take; set level='forced' or 'auto', "
+            "or use_inputs=False to leave them out": driven and config.level != "forced",
+            f"{where}: input_map needs n · m = {data.dof} · {inputs} numbers, row by row; got {count}":
+                count not in (0, data.dof * inputs),
+        })  # fmt: skip
         return config
 
     def has_forces(self) -> bool:

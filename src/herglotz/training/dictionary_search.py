@@ -18,8 +18,7 @@ from dataclasses import replace
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import AT_THE_NOISE, coarse, precision
+from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, sparsest
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig

@@ -6,14 +6,12 @@ two models, the sign of each velocity. Blocks of time that the regression has no
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.least_squares import least_squares
-from herglotz.training.baseline import differences
+from herglotz.training.baseline import Differences, differences
 
 BLOCKS = 10  # of time, each predicted from the others
 # The mean of log(error without / error with) over blocks. Measured: 0.23 to 2.1 (3.2 to 14 standard errors) on an axis
@@ -23,33 +21,25 @@ WORTH = 0.1
 CLEARLY = 2.0  # standard errors over blocks
 
 
-class Terms(NamedTuple):
-    """A linear model of the accelerations at the samples between two steps."""
-
-    a: Tensor  # (T, n)
-    columns: Tensor  # (T, n, k)
-    v: Tensor  # (T, n) velocities
-
-
-def acceleration_terms(data: Trajectories) -> Terms:
+def acceleration_terms(data: Trajectories) -> Differences:
     """Stiffness, tilt, damping and inputs as `estimate_baseline` has them, and a little more of each coordinate's own.
 
     Each coordinate has its own second harmonics (angles) or powers (lengths), viscous and quadratic friction.
     """
-    _, t, v, a, columns = differences(data, False)
-    more = []
+    found = differences(data)
+    t, v, a, more = found.triples, found.v, found.a, []
     for i, angle in enumerate(data.angles):
         q, w = t.q1[:, i], v[:, i]
         own = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
         place = torch.zeros(data.dof, 1, dtype=a.dtype, device=a.device)
         place[i] = 1
         more.append(torch.stack([*own, w, w * w.abs()], -1)[:, None] * place)
-    return Terms(a, torch.cat([columns, *more], -1), v)
+    return found._replace(columns=torch.cat([found.columns, *more], -1))
 
 
 def friction_holds(train: Trajectories) -> tuple[bool, str]:
     """Whether dry friction is found in these data, and the numbers that say so."""
-    a, columns, v = acceleration_terms(train)
+    _, v, a, columns, _ = acceleration_terms(train)
     without, _ = _held_out(columns, a)
     with_sign, x = _held_out(torch.cat([columns, torch.diag_embed(v.sign())], -1), a)
     gain = (without / with_sign.clamp_min(torch.finfo(with_sign.dtype).tiny)).log()

@@ -18,11 +18,11 @@ from herglotz.data.splits import leading_rows
 from herglotz.stepping import State, Stepper
 from herglotz.training.config import FitConfig
 from herglotz.training.free_run import states_everywhere
-from herglotz.training.inputs import step_inputs
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.plan import Plan
+from herglotz.training.problems.grid import step_inputs
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.supervised import SupervisedProblem
 from herglotz.training.recorded_range import box_of
@@ -46,7 +46,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
     metrics |= judged(task, seen, fitted, states.joined, free, metrics)
     metrics |= {
         "extrapolation_status": status,
-        "outlier_samples": leading_rows(data, train.lengths)[dropped].tolist(),
+        "outlier_samples": leading_rows(data.lengths, train.lengths)[dropped.cpu()].tolist(),
         "seed": config.seed,
         "level": config.level,
         "plan": plan.to_dict(),

@@ -6,11 +6,10 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.least_squares import least_squares
 from herglotz.mechanics import legendre_minus, legendre_plus
 from herglotz.models import ContactLagrangian
-from herglotz.training.inputs import step_inputs
-from herglotz.training.problems.robust import FREEDOM, MAD, root_weights
+from herglotz.training.problems.grid import step_inputs
+from herglotz.training.problems.robust import robust_fit
 from herglotz.training.problems.shooting import ShootingProblem
 
 START = 8  # samples that a robust start state is estimated from
@@ -60,14 +59,8 @@ def _begin(data: Trajectories, rows: Tensor) -> tuple[Tensor, Tensor]:
         return first, second
     near = rows[here, None] + torch.arange(START, device=rows.device)
     x = data.t[near] - data.t[rows[here]][:, None]
-    A = torch.stack([x**k for k in range(4)], -1)[:, None]  # (S, 1, START, 4)
     q = data.q[near].mT[..., None]  # (S, n, START, 1)
-    c = least_squares(A.expand(*q.shape[:2], -1, -1), q)
-    for _ in range(10):
-        r = A @ c - q
-        scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(q.dtype).tiny)
-        by = root_weights(r / scale, FREEDOM)
-        c = least_squares(by * A, by * q)
-    values = (A @ c)[..., 0]
+    A = torch.stack([x**k for k in range(4)], -1)[:, None].expand(*q.shape[:2], -1, -1)
+    values = (A @ robust_fit(A, q))[..., 0]
     first[here], second[here] = values[..., 0], values[..., 1]
     return first, second

@@ -28,12 +28,10 @@ from herglotz.training.evaluate import evaluate
 from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
-from herglotz.training.reading import reading_told
 from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
-from herglotz.training.run_folder import FILES, LOG, MANIFEST
+from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
-from herglotz.training.task import Task
 from herglotz.training.tensorboard import tensorboard_log
 from herglotz.training.uncertainty import laplace
 
@@ -132,7 +130,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         if plan is None and seen.found is not None and (seen.found.doubt or (config.find_zeros and seen.found.apart)):
             seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
-        task = Task(seen.kept, seen.base, seen.settings, stages)
+        task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
     run.metrics["equation"] = _equation(run, plan, ROUNDING * task.exact).as_dict()
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)

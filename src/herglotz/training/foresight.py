@@ -22,7 +22,6 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
 from herglotz.training.free_run import continued
-from herglotz.training.inputs import grid_inputs
 from herglotz.training.look import Look
 from herglotz.training.named_terms import (
     DRY,
@@ -37,7 +36,7 @@ from herglotz.training.named_terms import (
 )
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid
+from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
 from herglotz.training.problems.prior import NETWORKS, prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
@@ -164,7 +163,7 @@ class _Ahead:
         rest = self.data.rows(at, tuple(map(len, parts)))
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
-        out = continued(model, x, grid.h, grid_inputs(model, rest, grid))
+        out = continued(model, x, grid.h, step_inputs(model, rest, grid))
         known[at[grid.sample]] = out.flatten(0, 1)[grid.node]  # not what pads the shorter runs
         return known if bool(torch.isfinite(known).all()) else None
 
@@ -181,14 +180,9 @@ def _with_absent_terms(
 ) -> tuple[ContactLagrangian, Baseline, dict[str, list[int]]]:
     """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
-    plain = not any(name.startswith(NETWORKS) for name in parameters.names) and c.objective == "trajectory"
-    told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
-    if not plain or c.level not in ("linear", "forced") or told or data.dof > MOST:
-        return model, task.base, {}
-    every, own = candidates(data, c.translations), NamedTerms(c.features, c.drag, c.coulomb)
-    pushed = NamedTerms((), tuple(name for name in loads(data, one_way=True) if name in own.drag))
-    every = replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
-    if not set(own.names) <= set(every.names):
+    own = NamedTerms(c.features, c.drag, c.coulomb)
+    every = _offered(task, own, parameters)
+    if every is None or not set(own.names) <= set(every.names):
         return model, task.base, {}
     values = values_of(parameters, parameters.get(), c, data.angles)
     full = replace(settings_of(every, data, c, c.order, c.substeps), sticking=c.sticking)
@@ -198,6 +192,18 @@ def _with_absent_terms(
     numbers = ParameterVector(more)
     at = {name: where for name, where in places(numbers, every).items() if name not in own.names}
     return more, base, at | {name: [i] for i, name in enumerate(numbers.numbers) if name in c.absent}
+
+
+def _offered(task: Task, own: NamedTerms, parameters: ParameterVector) -> NamedTerms | None:
+    """The candidates of a search for a model of these named terms alone; None where no search would give the model."""
+    c, data = task.config, task.data
+    told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
+    network = any(name.startswith(NETWORKS) for name in parameters.names)
+    if network or told or c.objective != "trajectory" or c.level not in ("linear", "forced") or data.dof > MOST:
+        return None
+    every = candidates(data, c.translations)
+    pushed = NamedTerms((), tuple(name for name in loads(data, one_way=True) if name in own.drag))
+    return replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
 
 
 def _summary(A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]]) -> Foresight:

@@ -9,10 +9,9 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
 from herglotz.training.first_states import states_of_pairs
-from herglotz.training.inputs import step_inputs
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import SegmentGrid, segment_grid, substeps
+from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs, substeps
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import solve_path
 
@@ -67,7 +66,8 @@ def near_data(
         problem.guess_from_states(states_of_pairs(model, data))
         assert problem.path is not None
         tol = 64 * torch.finfo(start.dtype).eps
-        path = solve_path(problem.parameters, problem.parameters.get(), start, grid.h, problem.path.x, tol, u=u)
+        L_d = problem.parameters.at(problem.parameters.get(), u)
+        path = solve_path(L_d, start, grid.h, problem.path.x, tol)
     return None if path is None or not bool(torch.isfinite(path.x).all()) else path.x
 
 
@@ -84,7 +84,8 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
         guess = x[:, -1:].repeat(1, h[:, part].shape[1] + 1, 1)
         v = (x[:, -1, :n] - x[:, -2, :n]) / h[:, k - 1 : k]
         guess[:, 1:, :n] += v[:, None] * h[:, part].cumsum(1)[..., None]
-        path = solve_path(parameters, theta, x[:, -1], h[:, part], guess, tol, u=None if u is None else u[:, part])
+        L_d = parameters.at(theta, None if u is None else u[:, part])
+        path = solve_path(L_d, x[:, -1], h[:, part], guess, tol)
         return None if path is None else path.x
 
     def stepped(part: slice) -> Tensor:

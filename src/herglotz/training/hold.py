@@ -19,7 +19,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.actuator import InputPieces, acting
 from herglotz.data.holds import HOLDS, Arrival
-from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.smoothing import smoothed
 from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
@@ -155,10 +155,9 @@ class Accelerations:
 
     def __init__(self, data: Trajectories):
         data = replace(data, u=None)
-        local = local_polynomials(data)
-        _, triples, _, a, _ = differences(data, False)
-        terms = acceleration_terms(smooth := data if local is None else smoothed(data, local))
-        q = differences(smooth, False)[1].q1
+        triples, _, a, _, _ = differences(data)
+        terms = acceleration_terms(smoothed(data))
+        q = terms.triples.q1
         self.index, self.balance = triples.index, data.balance[:, None]
         self.rows, self.factor = _windows(triples, data)
         turning = [q[:, i] for i, angle in enumerate(data.angles) if angle and data.dof > 1]

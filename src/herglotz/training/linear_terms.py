@@ -17,7 +17,7 @@ from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_start import LinearFit, NamedForces
-from herglotz.training.named_terms import DRAG, DRY, MOVING, STILL, NamedTerms, own_terms
+from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, holders, own_terms
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
@@ -88,6 +88,7 @@ class LinearTerms:
     def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials):
         self.data, self.base, self.all = data, base, every
         self.own = own_terms(data.angles)
+        self.held = holders([x for x in every.features if x not in self.own], every.drag)
         self.overlap = max(1.0, local.width / 2)
         self.fit = self._problem(local)
 
@@ -132,7 +133,7 @@ class LinearTerms:
             rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
         forces = NamedForces(self.all.drag, self.base.speed if self.all.dry else (), u)
-        return LinearFit.of(self.data.angles, (*self._still, *self._moving), t, self.data.balance, forces)
+        return LinearFit.of(self.data.angles, (*self.held[STILL], *self.held[MOVING]), t, self.data.balance, forces)
 
     def _pruned(self, of: NamedTerms, columns: Tensor, x: Tensor, r: Tensor) -> tuple[NamedTerms, Tensor, Tensor]:
         """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
@@ -159,25 +160,15 @@ class LinearTerms:
 
     def _named(self, start: dict[str, Tensor]) -> dict:
         """Starting values by the name of a term or of a parameter."""
-        values: dict = {name: tuple(v.tolist()) for name, v in start.items()}
-        for parameter, names in ((STILL, self._still), (MOVING, self._moving), (DRAG, self.all.drag)):
-            values |= zip(names, values.pop(parameter, ()), strict=True)
+        values = by_term(start, self.held)
         return values | {term: by * values.pop(parameter)[0] for term, (parameter, by) in self.own.items()}
-
-    @property
-    def _still(self) -> list[str]:
-        return [x for x in self.all.features if "v" not in x and x not in self.own]
-
-    @property
-    def _moving(self) -> list[str]:
-        return [x for x in self.all.features if "v" in x]
 
     def _columns(self, of: NamedTerms) -> Tensor:
         """Columns of a family, and all masses, springs and friction of joints; none between lengths, or `apart`."""
         i, j = pairs(self.data.dof, torch.device("cpu"))
         joints = any(self.data.angles) and not of.apart
         diagonal = iter((i == j).tolist())
-        order = {STILL: iter(self._still), MOVING: iter(self._moving), DRAG: iter(self.all.drag)}
+        order = {parameter: iter(names) for parameter, names in self.held.items()}
 
         def used(name: str) -> bool:
             if name == "mass":
@@ -192,7 +183,7 @@ class LinearTerms:
 
     def _linear_places(self, columns: Tensor) -> dict[str, list[int]]:
         """Columns of each term among those that are used, the first mass not counted."""
-        order = {STILL: iter(self._still), MOVING: iter(self._moving), DRAG: iter(self.all.drag)}
+        order = {parameter: iter(names) for parameter, names in self.held.items()}
         own = {parameter: term for term, (parameter, _) in self.own.items()}
         names = [next(order[x]) if x in order else own.get(x, x) for x in self.fit.names]
         left = [name for name, used in zip(names, columns.tolist(), strict=True) if used][1:]

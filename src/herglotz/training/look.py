@@ -76,10 +76,21 @@ class Look:
     noise: float  # RMS residual of polynomials through nine samples, in units of q: the noise, or more
     settings: FitConfig  # the user's, with the level and the structure that the data call for
     base: Baseline  # sizes and starting values
-    structure: str | None  # what was found about the terms, in words; None: it was not asked
-    found: Structure | None  # named terms that whole trajectories were fitted with
-    baseline_motion: tuple[Triples, float] | None  # where the baseline explains exact data: its motions, their error
-    probe: Probe | None  # None: the objective is known without it
+    structure: str | None = None  # what was found about the terms, in words; None: it was not asked
+    found: Structure | None = None  # named terms that whole trajectories were fitted with
+    # Where the baseline explains exact data: its motions, their error.
+    baseline_motion: tuple[Triples, float] | None = None
+    probe: Probe | None = None  # None: the objective is known without it
+
+    def task(self, stages: Stages) -> Task:
+        """What the stages of a fit to these data share."""
+        return Task(self.kept, self.base, self.settings, stages)
+
+    @property
+    def leaves_objective(self) -> bool:
+        """Whether the objective hangs on the noise, which a probe measures."""
+        c = self.settings
+        return c.objective == "auto" and c.supervision == "q" and self.baseline_motion is None and not c.sticking
 
 
 def look(
@@ -108,40 +119,19 @@ def look(
     settings, why_friction = _with_friction(kept, settings, user_settings, plan)
     base = estimate_baseline(kept, outliers=outliers, drag=drag, substeps=settings.substeps)
     base = across_translations(base, kept, settings.translations, outliers=outliers)
-    task = Task(kept, base, settings, stages)
-    terms = _Terms(settings, plan.started(base)) if plan is not None else _terms(task, user_settings, outliers, named)
-    task = replace(task, base=terms.base, config=terms.settings)
-    if plan is not None and plan.network == "covered":
-        terms = replace(terms, motion=_baseline_motion(task))
-    probe = _probe(task) if (terms.leaves_objective if plan is None else plan.continues_probe) else None
-    return Look(
-        data=data, train=train, unseen=unseen, kept=kept, spikes=dropped, outliers=outliers, arrival=arrival,
-        why_arrival=why_arrival, zeros=zeros, apart="" if zeros else terms.apart, friction=why_friction,
-        noise=roughness(kept), settings=terms.settings, base=terms.base, structure=terms.structure,
-        found=terms.found, baseline_motion=terms.motion, probe=probe,
+    seen = Look(
+        data, train, unseen, kept, dropped, outliers, arrival, why_arrival, zeros, apart="", friction=why_friction,
+        noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class _Terms:
-    """What the terms of the model are to be."""
-
-    settings: FitConfig
-    base: Baseline
-    structure: str | None = None
-    found: Structure | None = None
-    motion: tuple[Triples, float] | None = None
-
-    @property
-    def apart(self) -> str:
-        """What keeps recordings from being followed together, as far as the search for terms shows it."""
-        return MAY_DIFFER if self.found is not None and self.found.apart else ""
-
-    @property
-    def leaves_objective(self) -> bool:
-        """Whether the objective hangs on the noise, which a probe measures."""
-        c = self.settings
-        return c.objective == "auto" and c.supervision == "q" and self.motion is None and not c.sticking
+    if plan is None:
+        seen = _with_terms(seen, user_settings, stages, named)
+    else:
+        seen = replace(seen, base=plan.started(base))
+        if plan.network == "covered":
+            seen = replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
+    if seen.leaves_objective if plan is None else plan.continues_probe:
+        seen = replace(seen, probe=_probe(seen.task(stages)))
+    return seen
 
 
 def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arrival, dict[str, str]]:
@@ -155,35 +145,36 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
 
 
-def _terms(task: Task, user_settings: FitConfig, outliers: bool, named: bool) -> _Terms:
+def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: bool) -> Look:
     """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
-    kept, base, settings, stages = task.data, task.base, task.config, task.stages
-    terms = _Terms(settings, base)
+    kept, base, settings, first = seen.kept, seen.base, seen.settings, seen
     if structure_is_free(kept, user_settings):
         of = kept_structure("structure", lambda: structured(kept, base, settings), base, settings, stages)
-        terms = _Terms(of.config, of.base, of.reason)
+        seen = replace(seen, settings=of.config, base=of.base, structure=of.reason)
     elif settings.features:
-        terms = _Terms(settings, start_of_features(kept, base, settings))
-    terms = replace(terms, motion=_baseline_motion(replace(task, base=terms.base, config=terms.settings)))
-    exact = bool(terms.settings.features) and terms.settings.objective == "residual"
+        seen = replace(seen, base=start_of_features(kept, base, settings))
+    seen = replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
     if not named or not terms_are_free(kept, user_settings):
-        return terms
-    return _searched(task, user_settings, terms, outliers, exact)
+        return seen
+    return _searched(first, user_settings, stages, seen)
 
 
-def _searched(task: Task, user_settings: FitConfig, terms: _Terms, outliers: bool, exact: bool) -> _Terms:
-    """Named terms that follow whole trajectories, or `terms` where these explain exact data and those do not."""
-    kept, base, settings, stages = task.data, task.base, task.config, task.stages
+def _searched(first: Look, user_settings: FitConfig, stages: Stages, seen: Look) -> Look:
+    """Named terms that follow whole trajectories, or as `seen` where that explains exact data and those do not."""
+    kept, base, settings = first.kept, first.base, first.settings
+    exact = bool(seen.settings.features) and seen.settings.objective == "residual"
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
-    first, plain = base, replace(settings, sticking=settings.sticking or user_settings.sticking)
-    found = kept_structure("terms", lambda: search(kept, first, plain, outliers=outliers), base, settings, stages)
-    at_one_step = not (_fine(terms.base) or kept.irregular)  # a network may learn what the rule misses at this step
-    if exact or (terms.motion is not None and at_one_step):
+    plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
+    find = lambda: search(kept, base, plain, outliers=first.outliers)  # noqa: E731
+    found = kept_structure("terms", find, base, settings, stages)
+    at_one_step = not (_fine(seen.base) or kept.irregular)  # a network may learn what the rule misses at this step
+    if exact or (seen.baseline_motion is not None and at_one_step):
         spread = float((kept.q - kept.q.mean(0)).square().mean().sqrt())
         if found.sigma is None or found.sigma > SURE * spread:
-            return terms
-    terms = replace(terms, structure=found.reason, found=found)
-    return terms if found.sigma is None else replace(terms, settings=found.config, base=found.base, motion=None)
+            return seen
+    apart = MAY_DIFFER if found.apart and not seen.zeros else ""
+    seen = replace(seen, structure=found.reason, found=found, apart=apart)
+    return seen if found.sigma is None else replace(seen, settings=found.config, base=found.base, baseline_motion=None)
 
 
 def _with_friction(

@@ -243,10 +243,23 @@ def started(
     return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
 
 
+def holders(features: Sequence[str], drag: Sequence[str] = ()) -> dict[str, list[str]]:
+    """The terms whose coefficients each of three parameters holds, in its order."""
+    still, moving = ([x for x in features if ("v" in x) == moves] for moves in (False, True))
+    return {STILL: still, MOVING: moving, DRAG: list(drag)}
+
+
+def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> dict:
+    """Values of parameters as plain numbers, those of coefficients by the names of their terms (`holders`)."""
+    values: dict = {name: tuple(x.reshape(-1).tolist()) for name, x in start.items()}
+    for parameter, names in held.items():
+        values |= zip(names, values.pop(parameter, ()), strict=True)
+    return values
+
+
 def _coefficients(values: Mapping[str, float | tuple[float, ...]], of: FitConfig) -> dict[str, tuple[float, ...]]:
     """Those of the terms of a model of these settings, by the parameter that holds them."""
-    still, moving = [x for x in of.features if "v" not in x], [x for x in of.features if "v" in x]
-    kinds = ((STILL, still), (MOVING, moving), (DRAG, of.drag))
+    kinds = holders(of.features, of.drag).items()
     return {parameter: tuple(float(values.get(x, 0.0)) for x in names) for parameter, names in kinds}  # type: ignore[arg-type]
 
 
@@ -270,18 +283,12 @@ def _parameters(of: FitConfig, moving: bool):
 
 def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles: Sequence[bool]):
     """Values by the name of a term or, as a tuple, of a parameter."""
-    named = {name: tuple(x.reshape(-1).tolist()) for name, x in parameters.unflatten(theta).items()}
-    values: dict[str, float | tuple[float, ...]] = {}
-    still, n = named.pop(STILL, ()), len(angles)
+    named, n = parameters.unflatten(theta), len(angles)
     if baseline_is_named(of):  # −k, b of each angle; k/2, b of the others
-        own, still = still[: 2 * n], still[2 * n :]
-        turn = [-1.0 if angle else 2.0 for angle in angles]
-        values["potential.stiffness"] = tuple(k * by for k, by in zip(own[::2], turn, strict=True))
-        values["potential.tilt"] = own[1::2]
-    values |= zip([x for x in of.features if "v" not in x], still, strict=True)
-    values |= zip([x for x in of.features if "v" in x], named.pop(MOVING, ()), strict=True)
-    values |= zip(of.drag, named.pop(DRAG, ()), strict=True)
-    return values | named
+        own, named[STILL] = named[STILL][: 2 * n], named[STILL][2 * n :]
+        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in angles])
+        named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
+    return by_term(named, holders(of.features, of.drag))
 
 
 def shapes_of_dry(parameters: ParameterVector) -> Tensor:
@@ -291,10 +298,9 @@ def shapes_of_dry(parameters: ParameterVector) -> Tensor:
 
 def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    still = parameters.index(STILL).tolist()
-    at = dict(zip([x for x in terms.features if "v" not in x], ([i] for i in still), strict=True))
-    at |= zip([x for x in terms.features if "v" in x], ([i] for i in parameters.index(MOVING).tolist()), strict=True)
-    at |= zip(terms.drag, ([i] for i in parameters.index(DRAG).tolist()), strict=True)
+    at: dict[str, list[int]] = {}
+    for parameter, names in holders(terms.features, terms.drag).items():
+        at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
     if terms.dry:
         at[DRY] = parameters.index(DRY).tolist()
     return at

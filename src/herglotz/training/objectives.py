@@ -9,6 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
+from herglotz.training.cross_validation import Chosen
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.look import PROBE, Look
 from herglotz.training.one_step_fit import NOISE_OF_R, best_restart, fit_one_step, one_step_problem
@@ -17,7 +18,7 @@ from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import OneStep
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
-from herglotz.training.smoothing_fit import fit_smoothing
+from herglotz.training.smoothing_fit import SmoothingFit, fit_smoothing
 from herglotz.training.task import Task, with_sticking
 from herglotz.training.trajectory_fit import TrajectoryFit, fit_states, fit_trajectories
 
@@ -75,18 +76,9 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     found = fit_trajectories(task.thinned(every), model, sigma, known=plan.fitted_before)
     fit = found and (found.fit if every == 1 else _through_all(found.fit, task, every))
     if found is None or fit is None:  # the model keeps the parameters of the one-step fit
-        notes = {"reason": "the model cannot follow the data over 20 steps", "follows_data": False}
-        return Fitted(model, states_of_pairs(model, task.data), "trajectory", sigma, notes)
+        return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
     problem = fit.problem
-    problem.parameters.set(fit.theta)
-    notes = {
-        "departure": found.departure,
-        "held_out_rms": _plain(found.held_out),
-        "reason": fit.result.reason,
-        "robust": problem.freedom is not None,
-        "segment_steps": problem.grid.longest,
-        "follows_data": True,
-    }
+    notes = _chosen(found, fit) | {"segment_steps": problem.grid.longest, "follows_data": True}
     return Fitted(model, fit.states(), "trajectory", problem.sigma, notes, problem.used)
 
 
@@ -95,18 +87,9 @@ def fit_by_smoothing(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: ARG
     model, sigma = _one_step_start(task, plan)
     found = fit_smoothing(task, model, sigma)
     if found is None:
-        notes = {"reason": "the model has no step near the data", "follows_data": False}
-        return Fitted(model, states_of_pairs(model, task.data), "smoothing", sigma, notes)
+        return _lost(task, model, "smoothing", sigma, "the model has no step near the data")
     fit, problem = found.fit, found.fit.problem
-    problem.parameters.set(fit.theta)
-    notes = {
-        "departure": found.departure,
-        "held_out_rms": _plain(found.held_out),
-        "reason": fit.result.reason,
-        "robust": problem.freedom is not None,
-        "follows_data": fit.follows_data(),
-        "process": problem.process,
-    }
+    notes = _chosen(found, fit) | {"follows_data": fit.follows_data(), "process": problem.process}
     return Fitted(model, problem.states(fit.x), "smoothing", problem.sigma, notes)
 
 
@@ -117,9 +100,7 @@ def _through_all(fit: TrajectoryFit, task: Task, every: int) -> TrajectoryFit | 
     problem = ShootingProblem(
         old.parameters.model, task.data, grid, sigma=old.sigma, prior=old.prior, freedom=old.freedom
     )
-    problem.guess_from(old, fit.path)
-    assert problem.path is not None
-    path = problem.solve(problem.pack(fit.theta, problem.path.x[:, 0, : problem.d]))
+    path = problem.solve(problem.pack(fit.theta, problem.guess_from(old, fit.path)))
     return None if path is None else replace(fit, problem=problem, path=path)
 
 
@@ -139,6 +120,15 @@ def _one_step_start(task: Task, plan: Plan) -> tuple[ContactLagrangian, float]:
     return model, plan.sigma or rms / NOISE_OF_R
 
 
-def _plain(held_out: dict[float, Tensor]) -> dict[str, float]:
-    """RMS over the folds, by prior strength."""
-    return {f"{k:g}": float(v.square().mean().sqrt()) for k, v in held_out.items()}
+def _lost(task: Task, model: ContactLagrangian, objective: str, sigma: float, why: str) -> Fitted:
+    """The recorded positions in place of states, for a model that follows none of them."""
+    states = states_of_pairs(model, task.data)
+    return Fitted(model, states, objective, sigma, {"reason": why, "follows_data": False})
+
+
+def _chosen(found: Chosen, fit: TrajectoryFit | SmoothingFit) -> dict[str, Any]:
+    """What is told of the strength of the prior, held-out RMS by strength, and the end; the model gets its numbers."""
+    fit.problem.parameters.set(fit.theta)
+    held_out = {f"{k:g}": float(v.square().mean().sqrt()) for k, v in found.held_out.items()}
+    notes = {"departure": found.departure, "held_out_rms": held_out, "reason": fit.result.reason}
+    return notes | {"robust": fit.problem.freedom is not None}

@@ -21,8 +21,7 @@ from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import near_data
-from herglotz.training.inputs import grid_inputs
-from herglotz.training.problems.grid import SegmentGrid, segment_grid
+from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
 from herglotz.training.smoother import smoothed_states
@@ -296,7 +295,7 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     known = torch.isfinite(start).all(-1).nonzero()[:, 0]
     if not len(known):
         return grid
-    u = grid_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
+    u = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
     nodes = near_data(stepper.L_d, rest, grid, start, u) if len(known) == len(spans) else None  # type: ignore[arg-type]
     if nodes is None:
         with torch.no_grad():

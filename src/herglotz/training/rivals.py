@@ -13,8 +13,7 @@ from dataclasses import asdict, replace
 from typing import Any
 
 from herglotz.data import Trajectories
-from herglotz.data.oversampling import sparsest
-from herglotz.data.roughness import AT_THE_NOISE, precision
+from herglotz.data.roughness import AT_THE_NOISE, precision, sparsest
 from herglotz.schema import from_plain
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig

@@ -5,24 +5,25 @@ from __future__ import annotations
 import csv
 import hashlib
 import json
+from collections.abc import Mapping, Sequence
 from io import BytesIO, StringIO
 from pathlib import Path
-from typing import Any, TypedDict
+from typing import Any, Literal, TypedDict, get_type_hints
 
+import numpy as np
 import torch
 from torch import Tensor
 
 import herglotz
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.npz_format import npz_bytes, trajectories_of
-from herglotz.errors import InputError
+from herglotz.errors import InputError, refuse
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.schema import check_entries
+from herglotz.schema import check_entries, matches
 from herglotz.stepping import State
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation
 from herglotz.training.plan import Plan
-from herglotz.training.reading import REMEDY, reading_in
 from herglotz.training.run import Run
 
 FORMAT = 1  # of the folder; a change that older versions cannot read raises it
@@ -240,3 +241,49 @@ def _json(path: Path, content: bytes) -> dict[str, Any]:
     if not isinstance(values, dict):
         raise InputError(f"{path}: must hold named entries, got a {type(values).__name__}; {REMEDY}")
     return values
+
+
+REMEDY = "fit again, or restore the folder as `herglotz fit` wrote it"
+
+
+class Reading(TypedDict, total=False):
+    """Options of `herglotz.data.load` by their names, then what `herglotz fit` makes of the recording."""
+
+    time: str
+    group: str
+    coordinates: str | list[str]
+    inputs: str | list[str]
+    drop: str | list[str]
+    angles: str | list[str]
+    sensor_zeros: list[float]
+    sensor_scales: list[float]
+    hold: Literal["zero", "first", "smooth"]
+    every: int
+
+
+def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
+    """Take what config.json says of reading the data out of its settings; {} where the user said nothing.
+
+    Raises
+    ------
+    InputError
+        If an entry is not known, or of another type than the flag of its name.
+    """
+    reading = settings.pop("reading", {})
+    check_entries(Reading, reading, f"{where}: reading", REMEDY)
+    unknown = ", ".join(sorted(set(reading) - set(Reading.__annotations__)))
+    refuse({f"{where}: reading has no {unknown}; {REMEDY}": unknown})
+    return reading
+
+
+def reading_told(options: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+    """The options of `as_trajectories` that a file could be read with: names and numbers, no arrays of times.
+
+    `names` are the coordinates that were read: those that `angles=True` means.
+    """
+    plain = {name: list(x) if np.ndim(x) == 1 else x for name, x in options.items()}
+    if isinstance(angles := plain.get("angles"), bool):
+        plain["angles"] = list(names) if angles else []
+    for sensor in {"sensor_zeros", "sensor_scales"} & plain.keys():
+        plain[sensor] = [float(x) for x in np.atleast_1d(plain[sensor])]
+    return {name: plain[name] for name, hint in get_type_hints(Reading).items() if matches(plain.get(name), hint)}

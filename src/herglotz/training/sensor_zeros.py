@@ -27,7 +27,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.sensors import measured
-from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.smoothing import smoothed
 from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import DragFeature, parse_drag
@@ -46,7 +46,7 @@ from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros, reference_of
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
-from herglotz.training.task import Task, build_model
+from herglotz.training.task import build_model
 from herglotz.training.trajectory_fit import FIRST_SEGMENT, FLOOR, STAGE, SegmentStages, TrajectoryFit
 
 ALONE = 0.8  # times the misfit together: a recording that misses no more where it is fitted alone differs from others
@@ -152,7 +152,7 @@ class ZerosOf:
         assert seen.found is not None
         assert seen.found.sigma is not None
         self.data, self.freedom = seen.kept, FREEDOM if seen.outliers else None
-        self.task = Task(seen.kept, seen.base, seen.settings, Stages())
+        self.task = seen.task(Stages())
         self.sigma = max(seen.found.sigma, FLOOR * self.task.size)
         self.reference = reference_of(self.data)
 
@@ -160,7 +160,7 @@ class ZerosOf:
         """The shortest segments of these recordings; None where the model cannot follow them."""
         task = replace(self.task, data=data, stages=Stages())
         stages = SegmentStages(task, build_model(task.base, task.config, "none"))
-        return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=_smooth(data))
+        return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=smoothed(data))
 
     def best(self, first: Look, alone: TrajectoryFit) -> FoundZeros:
         """By the terms of the reference alone, at a look at it, or by those of all recordings, fitted to it alone."""
@@ -203,7 +203,7 @@ class ZerosOf:
             model, data, segment_grid(data, FIRST_SEGMENT, base.model_step), sigma=self.sigma,
             prior=prior_of(model, base, None), freedom=self.freedom,
         )  # fmt: skip
-        theta, smooth = problem.parameters.get(), _smooth(data)
+        theta, smooth = problem.parameters.get(), smoothed(data)
         theta[[] if held is None else held] = 0.0
         problem.guess_from_states(states_of_pairs(model, smooth))
         x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
@@ -246,14 +246,9 @@ def _rms(x: Tensor) -> float:
     return float(x.square().mean().sqrt())
 
 
-def _smooth(data: Trajectories) -> Trajectories:
-    local = local_polynomials(data)
-    return data if local is None else smoothed(data, local)
-
-
 def _by_steps(model: ContactLagrangian, data: Trajectories, max_step: float) -> Tensor:
     """The zeros (n,) of one recording with which the model misses its steps least, the nearest to 0 of good ones."""
-    smooth = _smooth(data)
+    smooth = smoothed(data)
 
     def errors(z: Tensor) -> Tensor:
         problem = ResidualProblem(model, replace(smooth, q=smooth.q - z), max_step=max_step)

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.checks import check_positive
-from herglotz.data.smoothing import local_polynomials, smoothed
+from herglotz.data.smoothing import smoothed
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
@@ -85,10 +85,9 @@ def smoothing_start(problem: SmoothingProblem) -> Tensor:
     x, data, model = problem.start(), problem.data, problem.parameters.model
     if model.friction is None or not model.friction.dry:
         return x
-    local = local_polynomials(data)
     shooting = ShootingProblem(model, data, problem.grid, sigma=problem.sigma)
     theta = shooting.parameters.get()
-    states = first_states(shooting, theta, None if local is None else smoothed(data, local))
+    states = first_states(shooting, theta, smoothed(data))
     found = levenberg_marquardt(StatesOnly(shooting, theta), states.flatten())
     path = shooting.solve(shooting.pack(theta, found.x))
     return x if path is None else torch.cat([theta, path.x[..., : problem.d].flatten()])

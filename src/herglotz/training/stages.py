@@ -144,8 +144,8 @@ class Stages:
         name += self.label
         stored = self.done.get(name)
         if stored is not None and stored["done"]:
-            kept = {key: stored[key] for key in ("cost", "reason", "iterations", "history", "memory")}
-            result = OptimiserResult(stored["x"].to(x), **kept)
+            result = OptimiserResult(**{k: v for k, v in stored.items() if k != "done"})
+            result.x = result.x.to(x)
             remind(problem, result.memory)
         else:
             self.bar.total = self.bar.n + total  # most stages end before their bound
@@ -164,22 +164,11 @@ class Stages:
                 count, seconds = result.iterations, time.monotonic() - began
                 took = f"{count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s"
                 print(f"{name}: {took}", file=sys.stderr, flush=True)
-            self._store(name, result)
+            self.done[name] = {**vars(result), "x": result.x.detach().cpu(), "done": True}
+            self._write()
         start = len(self.history)
         self.history += [{"stage": name, "iteration": start + i, "cost": cost} for i, cost in enumerate(result.history)]
         return result
-
-    def _store(self, name: str, r: OptimiserResult) -> None:
-        self.done[name] = {
-            "x": r.x.detach().cpu(),
-            "cost": r.cost,
-            "reason": r.reason,
-            "iterations": r.iterations,
-            "history": r.history,
-            "memory": r.memory,
-            "done": True,
-        }
-        self._write()
 
     def _write(self) -> None:
         if self.checkpoint is not None and is_first():

@@ -30,7 +30,7 @@ from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
 from herglotz.training.linear_start import LinearFit
-from herglotz.training.named_terms import distances
+from herglotz.training.named_terms import MOVING, NamedTerms, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -51,8 +51,8 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
 TOLD = ("reason", "sigma", "doubt", "apart", "every")  # of `Structure`, as a checkpoint has it
-KINETIC, POTENTIAL = "kinetic.sum.coefficient", "potential.features.sum.coefficient"
-COUPLING = "coupling.viscous"
+
+COUPLING, VISCOUS = "coupling.viscous", "friction.viscous"
 
 
 class Structure(NamedTuple):
@@ -154,12 +154,13 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
         return without("it gives no positive mass")
     if joints and not _mass_turns(fit):
         return without("a mass that depends on the angles predicts held-out steps no better")
-    first = _with(base, {name: tuple(values.tolist()) for name, values in start.items()}, names)
     rich = replace(config, level="forced", coupled=joints, diagonal=not joints, features=names, order=4)
-    found, kept, rms = _short_fit(data.thinned(every), first, rich, every * base.max_step)
-    if not (_moving(kept) if joints else kept):
+    first = started(base, data, by_term(start, holders(names)), rich)
+    values, kept, rms = _short_fit(data.thinned(every), first, rich, every * base.max_step)
+    if not (holders(kept)[MOVING] if joints else kept):
         return without("the data need none of its features" + (" of the mass" if joints else ""))
     rich = replace(rich, features=kept)
+    found = started(base, data, values, rich)
     words = f"{len(kept)} of {len(names)} features explain the steps to {rms / size:.1e} of the motion's size"
     if rms > NOISY * size:
         noise = NOISE_OF_R * roughness(data)
@@ -193,12 +194,11 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
-    has = {
-        COUPLING: config.coupled, "friction.viscous": config.level == "forced",
-        "kinetic.base.off_diagonal": not config.diagonal,
-    }  # fmt: skip
-    values = {name: tuple(x.tolist()) for name, x in start.items() if has.get(name, True)}
-    return replace(_with(base, values, names), rate=base.rate)
+    joints = any(data.angles)  # others have no mass and no friction between them in the linear problem
+    start = {name: x for name, x in start.items() if joints or name not in ("kinetic.base.off_diagonal", COUPLING)}
+    found = started(base, data, by_term(start, holders(names)), replace(config, features=names))
+    viscous = {VISCOUS: tuple(start[VISCOUS].tolist())} if config.level == "forced" else {}
+    return replace(found, rate=base.rate, start={**found.start, **viscous})
 
 
 def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit, Tensor] | None:
@@ -219,11 +219,6 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
     return None if best is None else best[1:]
 
 
-def _moving(features: Sequence[str]) -> list[str]:
-    """Those with velocities, which join the kinetic term."""
-    return [name for name in features if "v" in name]
-
-
 def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
     """The columns that these coordinates may have, (F,) bool: joints all, others no mass or friction between them.
 
@@ -239,7 +234,7 @@ def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
 
 def _mass_turns(fit: LinearFit) -> bool:
     """Whether the data show that the mass depends on the angles."""
-    constant = torch.tensor([name != KINETIC for name in fit.names])
+    constant = torch.tensor([name != MOVING for name in fit.names])
     poor, good = of_first(_held_out(fit, constant), _held_out(fit, torch.ones_like(constant)))
     return simplest_not_beaten({0.0: poor, 1.0: good}) == 1.0
 
@@ -253,8 +248,8 @@ def _held_out(fit: LinearFit, columns: Tensor) -> Tensor:
 
 def _short_fit(
     data: Trajectories, base: Baseline, config: FitConfig, max_step: float
-) -> tuple[Baseline, tuple[str, ...], float]:
-    """Starting values, the features that stay and the one-step error of a short fit of order 4."""
+) -> tuple[dict, tuple[str, ...], float]:
+    """Values by term or parameter, the features that stay and the one-step error of a short fit of order 4."""
     model = build_model(base, config, "potential")
     prior = prior_of(model, base, None)
     most = ROWS * prior.start.numel() // data.dof
@@ -262,35 +257,8 @@ def _short_fit(
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    still = problem.parameters.index(POTENTIAL)
-    moving = problem.parameters.index(KINETIC) if KINETIC in problem.parameters.names else still[:0]
-    features = [name for name in config.features if "v" not in name] + _moving(config.features)
-    named = dict(zip([*still.tolist(), *moving.tolist()], features, strict=True))
+    named = {i: name for name, (i,) in places(problem.parameters, NamedTerms(config.features)).items()}
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
-    kept, x = prune(relative, result.x, torch.cat([still, moving]), math.log(r.numel()))
-    names = (*problem.parameters.names, "potential.stiffness", "potential.tilt")
-    values = {name: tuple(x[problem.parameters.index(name)].tolist()) for name in names}
-    turn = [-1.0 if angle else 2.0 for angle in data.angles]  # −k of each angle, k/2 of the others
-    values["potential.stiffness"] = tuple(k * by for k, by in zip(values["potential.stiffness"], turn, strict=True))
-    stay = set(kept.tolist())
-    for name, where in ((KINETIC, moving), (POTENTIAL, still)):
-        values[name] = tuple(float(x[i]) for i in where.tolist() if i in stay)
-    left = tuple(named[i] for i in kept.tolist())
-    return _with(base, values, left), left, float(r.square().mean().sqrt())
-
-
-def _with(base: Baseline, values: dict[str, tuple[float, ...]], features: tuple[str, ...]) -> Baseline:
-    """The baseline with these starting values by parameter; its own three under their names.
-
-    Without features of the velocity the constant mass has its parameters at another place.
-    """
-    own = ("potential.stiffness", "potential.tilt", "damping.rate")
-    rest = {name: x for name, x in values.items() if x and name not in own}
-    if not any(base.angles):
-        rest = {name: x for name, x in rest.items() if name not in ("kinetic.base.off_diagonal", COUPLING)}
-    if not _moving(features):
-        rest = {name.replace("kinetic.base.", "kinetic."): x for name, x in rest.items()}
-    return replace(
-        base, stiffness=values["potential.stiffness"], tilt=values["potential.tilt"],
-        rate=values.get("damping.rate", (0.0,))[0], start=rest,
-    )  # fmt: skip
+    kept, x = prune(relative, result.x, torch.tensor(list(named)), math.log(r.numel()))
+    values = values_of(problem.parameters, x, config, data.angles)
+    return values, tuple(named[i] for i in kept.tolist()), float(r.square().mean().sqrt())

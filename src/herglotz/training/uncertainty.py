@@ -91,7 +91,7 @@ class Laplace:
     def __init__(self, run: Run):
         self.run = run
         data = run.data.unwrapped()
-        rows = leading_rows(data, run.train_lengths)
+        rows = leading_rows(data.lengths, run.train_lengths)
         out = torch.zeros(data.samples, dtype=torch.bool)
         out[run.metrics.get("outlier_samples", [])] = True
         states, train, out = run.states.joined[rows], data.rows(rows, run.train_lengths), out[rows]
@@ -150,7 +150,7 @@ class Laplace:
         if not 3 <= seen < min(data.lengths):
             raise InputError(f"{where}: seen must be from 3 to {min(data.lengths) - 1} samples, got {seen}")
         lengths = (seen,) * len(data)
-        head = data.rows(leading_rows(data, lengths), lengths)
+        head = data.rows(leading_rows(data.lengths, lengths), lengths)
         task = Task(head, self.base, replace(self.run.decided, iterations=1), Stages())
         found = fit_states(task, self.run.model, self.sigma)
         if found is None or found.problem.grid.segments > len(data):

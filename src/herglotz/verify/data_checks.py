@@ -16,8 +16,7 @@ from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.stepping import State, solve
 from herglotz.training import Run
-from herglotz.training.inputs import grid_inputs, step_inputs
-from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.verify.dissipation import WINDOW, dissipation
 from herglotz.verify.report import Check
 
@@ -100,7 +99,7 @@ def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
     if not all(bool(torch.isfinite(x).all()) for x in states):
         return math.inf
     with torch.no_grad():
-        u = grid_inputs(run.model, run.data, grid)
+        u = step_inputs(run.model, run.data, grid)
         inputs = None if u is None else u.to(states[0].dtype)
         out = run.stepper.rollout(*states, h=grid.h.to(states[0].dtype), inputs=inputs)
     error = out.q.flatten(0, 1)[grid.node].to(q.dtype) - q[grid.sample]

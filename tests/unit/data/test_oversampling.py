@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.oversampling import SMOOTH, _missed, sparsest
+from herglotz.data.roughness import SMOOTH, _missed, sparsest
 
 
 def sines(samples, a_period, noise=0.0, lengths=None):

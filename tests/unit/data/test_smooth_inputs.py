@@ -8,7 +8,7 @@ import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.checks import Labels
-from herglotz.data.column_table import column_table
+from herglotz.data.csv_columns import column_table
 from herglotz.data.seal import ONNX_ENTRY, SIZE, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
 from herglotz.data.smoothing import _quality, local_polynomials, smooth_triples
 from herglotz.data.splits import RUN, liveliest_rows

@@ -24,8 +24,7 @@ from herglotz.training import (
     save_run,
     select,
 )
-from herglotz.training.inputs import step_inputs
-from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.grid import segment_grid, step_inputs
 from herglotz.verify import verify
 
 SIZES: dict[str, Any] = {"scale": (1.5,), "speed": (1.5,), "stiffness": (1.0,), "tilt": (0.0,)}

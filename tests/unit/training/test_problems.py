@@ -239,7 +239,7 @@ def test_lifted_solution_is_the_stepped_one():
         theta, states = problem.unpack(x)
         start = torch.cat([states, states.new_zeros(len(states), 3 - states.shape[1])], -1)
         rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
-        path = solve_path(problem.parameters, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
+        path = solve_path(problem.parameters.at(theta), start, problem.grid.h, rough, 1e-12, sweeps=30)
         with torch.no_grad():
             stepper = Stepper(problem.parameters.at(theta))
             out = stepper.rollout(start[:, :1], start[:, 1:2], start[:, 2], h=problem.grid.h)
@@ -254,12 +254,12 @@ def test_the_last_defect_is_not_looked_at(monkeypatch):
     theta, states = problem.unpack(x)
     start = problem.with_s(states)
     rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
-    exact = solve_path(problem.parameters, theta, start, problem.grid.h, rough, 1e-12, sweeps=30)
+    exact = solve_path(problem.parameters.at(theta), start, problem.grid.h, rough, 1e-12, sweeps=30)
     assert exact is not None
     swept, steps = [], lifted_newton.linear_steps
     monkeypatch.setattr(lifted_newton, "linear_steps", lambda *x: swept.append(1) or steps(*x))
     near = exact.x * (1 + 1e-9)
-    path = solve_path(problem.parameters, theta, start, problem.grid.h, near, 1e-12, sweeps=30)
+    path = solve_path(problem.parameters.at(theta), start, problem.grid.h, near, 1e-12, sweeps=30)
     assert path is not None
     assert len(swept) == 1
     torch.testing.assert_close(path.x, exact.x, rtol=1e-12, atol=1e-12)
@@ -279,10 +279,10 @@ def test_linear_sweeps_give_the_path_that_solved_steps_give(level, monkeypatch):
     theta, states = problem.unpack(x)
     start = problem.with_s(states)
     rough = start[:, None].expand(-1, problem.grid.h.shape[1] + 1, -1)
-    given = problem.parameters, theta, start, problem.grid.h, rough, 1e-12
-    swept = solve_path(*given, sweeps=30, u=problem.u)
+    given = problem.parameters.at(theta, problem.u), start, problem.grid.h, rough, 1e-12
+    swept = solve_path(*given, sweeps=30)
     monkeypatch.setattr(lifted_newton, "linear_steps", lambda *_: None)
-    solved = solve_path(*given, sweeps=30, u=problem.u)
+    solved = solve_path(*given, sweeps=30)
     assert swept is not None
     assert solved is not None
     torch.testing.assert_close(swept.x, solved.x, rtol=1e-9, atol=1e-11)

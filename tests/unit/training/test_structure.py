@@ -20,9 +20,9 @@ from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.linear_start import LinearFit
+from herglotz.training.named_terms import MOVING
 from herglotz.training.pruning import prune
 from herglotz.training.structure import (
-    KINETIC,
     dictionary,
     explains_steps,
     start_of_features,
@@ -67,8 +67,8 @@ def test_one_linear_problem_finds_the_double_pendulum(gaps):
     assert start is not None
     assert float(start["kinetic.base.log_diagonal"].exp().square()) == pytest.approx(0.5, abs=0.05)  # m₂₂ of m₁₁
     moving = [name for name in names if "v" in name]
-    assert float(start[KINETIC][moving.index("cos(q1 - q2) v1 v2")]) == pytest.approx(0.5, abs=0.05)
-    plain = found.solve(torch.tensor([name != KINETIC for name in found.names]))
+    assert float(start[MOVING][moving.index("cos(q1 - q2) v1 v2")]) == pytest.approx(0.5, abs=0.05)
+    plain = found.solve(torch.tensor([name != MOVING for name in found.names]))
     assert float(found.errors(x).norm()) < 1e-2 * float(found.errors(plain).norm())
 
 
@@ -203,7 +203,7 @@ def test_a_magnetic_field_is_found():
     data = simulate(charged, trajectories=8, steps=60, h=0.02, seed=0)
     config, base, *_ = structured(data, estimate_baseline(data), FitConfig().resolved(data))
     assert config.features == ("r^-1", "q1 v2 - q2 v1")
-    assert base.start[KINETIC][0] == pytest.approx(0.4, rel=1e-4)  # of K: half the field
+    assert base.start[MOVING][0] == pytest.approx(0.4, rel=1e-4)  # of K: half the field
     assert base.start["potential.features.sum.coefficient"][-1] == pytest.approx(-1.0, rel=1e-4)
     assert base.start["friction.viscous"] == pytest.approx((0.05, 0.05), rel=1e-2)
 

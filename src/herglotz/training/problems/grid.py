@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.errors import InputError
+from herglotz.models import ContactLagrangian
 
 FIRST_SEGMENT = 20  # recorded steps; later stages double it
 
@@ -50,6 +52,30 @@ class SegmentGrid:
     def start_trajectory(self, data: Trajectories) -> Tensor:
         """Trajectory of every segment, (S,)."""
         return data.trajectory[self.start_sample]
+
+
+def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
+    """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).
+
+    None for a model that takes none. Between samples inputs do what the `hold` of the data says
+    (`herglotz.data.holds`), by default nothing. The last one of a trajectory acts on no step.
+
+    Raises
+    ------
+    InputError
+        If the model takes inputs and the data hold none, or another number of them.
+    """
+    if not model.inputs:
+        return None
+    where = data.source or "data"
+    if data.u is None:
+        raise InputError(
+            f"{where}: the model is driven by {model.inputs} input(s), and none of these columns is one; name them: "
+            "--inputs NAMES (inputs= in Python)"
+        )
+    if data.u.shape[1] != model.inputs:
+        raise InputError(f"{where}: {data.u.shape[1]} input(s) u are recorded, the model takes {model.inputs}")
+    return data.inputs_of_steps() if grid is None else data.inputs_of_steps(grid.row, grid.part)
 
 
 def segment_lengths(data: Trajectories) -> list[int]:

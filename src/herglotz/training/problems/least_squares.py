@@ -11,9 +11,8 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.mechanics import mixed_hessian, partials
 from herglotz.models import ContactLagrangian
-from herglotz.training.inputs import grid_inputs, step_inputs
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.problems.grid import SegmentGrid, step_inputs
 from herglotz.training.problems.prior import Prior
 from herglotz.training.problems.robust import loss, root_weights
 
@@ -83,7 +82,7 @@ class StatesProblem(LeastSquares, ABC):
         super().__init__(model, data, **settings)
         self.grid = grid
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
-        self.u = grid_inputs(model, data, grid)  # (S, K, m)
+        self.u = step_inputs(model, data, grid)  # (S, K, m)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
         self.mass = self._masses(model)  # (n,) in the units of p over those of v

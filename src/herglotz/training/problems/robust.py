@@ -14,6 +14,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from herglotz.least_squares import least_squares
+
 FREEDOM = 4.0  # ν: 96 % of the normal distribution's efficiency where the residuals are normal
 TAIL = 5.0  # residuals beyond so many robust standard deviations are outliers: 6e-7 of normal ones are
 SHARE = 3e-3  # share of outliers above which residuals count as heavy-tailed,
@@ -32,6 +34,17 @@ def loss(r: Tensor, freedom: float | None) -> Tensor:
 def root_weights(r: Tensor, freedom: float | None) -> Tensor:
     """√w(r): multiplies rows of J and r; 1 without a `freedom`."""
     return torch.ones_like(r) if freedom is None else ((freedom + 1) / (freedom + r.square())).sqrt()
+
+
+def robust_fit(A: Tensor, b: Tensor, rounds: int = 10) -> Tensor:
+    """X of A x ≈ b by Student's t instead of least squares, by re-weighting; A (..., m, k), b (..., m, 1)."""
+    x = least_squares(A, b)
+    for _ in range(rounds):
+        r = A @ x - b
+        scale = MAD * r.abs().median(-2, keepdim=True).values.clamp_min(torch.finfo(r.dtype).tiny)
+        by = root_weights(r / scale, FREEDOM)
+        x = least_squares(by * A, by * b)
+    return x
 
 
 def scale_of(r: Tensor) -> float:

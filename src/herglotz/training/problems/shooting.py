@@ -117,14 +117,16 @@ class ShootingProblem(StatesProblem):
         if self._solved is not None and torch.equal(self._solved[0], x):
             return self._solved[1]  # an accepted step has been solved for its cost
         theta, states = self.unpack(x)
-        start = self.with_s(states)
+        start, L_d = self.with_s(states), self.parameters.at(theta, self.u)
         tol = 1e3 * torch.finfo(x.dtype).eps
         with torch.no_grad():
             path = None
             if self.path is not None:
-                path = solve_path(self.parameters, theta, start, self.grid.h, self._guess(x, self.path), tol, u=self.u)
-            if path is None and (self.path is None or self.patient):
-                path = self._step_through(theta, start, tol)
+                path = solve_path(L_d, start, self.grid.h, self._guess(x, self.path), tol)
+            if path is None and (self.path is None or self.patient):  # no trajectory near by to start from
+                out = Stepper(L_d).rollout(*State.of(start), h=self.grid.h, inputs=self.u)
+                if bool(out.ok.all()):
+                    path = solve_path(L_d, start, self.grid.h, out.states.joined, tol)
         self._solved = x.clone(), path
         return path
 
@@ -205,8 +207,10 @@ class ShootingProblem(StatesProblem):
             rows[self.grid.start_sample] = first
         return path.x[..., : self.d].flatten(0, 1)[rows[samples]]
 
-    def guess_from(self, other: ShootingProblem, path: Path) -> None:
+    def guess_from(self, other: ShootingProblem, path: Path) -> Tensor:
         """Start the next solve from a path over other segments, samples or model steps, linear between its nodes.
+
+        Returns the states (S, d) that it has where segments start.
 
         Without one the next solve steps through the trajectories, one small step after the other.
         """
@@ -224,6 +228,7 @@ class ShootingProblem(StatesProblem):
             share = torch.where(gap > 0, (new[own] - t[at - 1]) / torch.where(gap > 0, gap, 1.0), 1.0)[..., None]
             x[own] = known[at - 1] + share.clamp(0, 1) * (known[at] - known[at - 1])
         self.path = Path(x, path.A)
+        return x[:, 0, : self.d]
 
     def guess_from_states(self, states: Tensor) -> None:
         """Start the next solve from states (N, 2n+1) at the samples, with cubics between them (Hermite's)."""
@@ -327,13 +332,6 @@ class ShootingProblem(StatesProblem):
         A[columns[:, None], columns[None, :]] += J.T @ J
         b[columns] += J.T @ r
 
-    def _step_through(self, theta: Tensor, start: Tensor, tol: float) -> Path | None:
-        """Solve by stepping, when there is no nearby trajectory to start from."""
-        out = Stepper(self.parameters.at(theta)).rollout(*State.of(start), h=self.grid.h, inputs=self.u)
-        if not bool(out.ok.all()):
-            return None
-        return solve_path(self.parameters, theta, start, self.grid.h, out.states.joined, tol, u=self.u)
-
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
@@ -341,7 +339,7 @@ class ShootingProblem(StatesProblem):
         q1, A = path.x[:, 1:, : self.n], path.A[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
-            B = parameter_derivatives(self.parameters, theta, path.x, q1, A, self.grid.h, self.u)
+            B = parameter_derivatives(self.parameters.at(theta, self.u), path.x, q1, A, self.grid.h)
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
         return linear_recurrence(A, torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)

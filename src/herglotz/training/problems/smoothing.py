@@ -129,7 +129,8 @@ class SmoothingProblem(StatesProblem):
             gradient[:, 0, -1] += self._anchor(states) / self.action
         if not held:
             q1 = y[..., : self.n]
-            B = parameter_derivatives(self.parameters, theta, self.with_s(states), q1, A, self.grid.h, self.u)
+            L_d = self.parameters.at(theta, self.u)
+            B = parameter_derivatives(L_d, self.with_s(states), q1, A, self.grid.h)
             WB = weight * B
             corner, top = torch.einsum("skdp,skdr->pr", B, WB), torch.einsum("skdp,skd->p", B, weighted)
             border[:, :-1] += A.mT @ WB

@@ -25,7 +25,7 @@ from herglotz.stepping import Status, solve, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
-from herglotz.training.parameter_vector import FixedModel, ParameterVector
+from herglotz.training.parameter_vector import FixedModel
 
 NEAR = 1e-7  # defects whose next ones need not be looked at where quadratic convergence makes them rounding
 CURVED = 1e4  # taken for the next defect over the square of the first, which no earlier one tells
@@ -41,17 +41,15 @@ class Path:
 
 
 def solve_path(
-    parameters: ParameterVector,
-    theta: Tensor,  # (P,)
+    L_d: FixedModel,  # at the inputs of every step, where it takes any
     start: Tensor,  # (S, 2n+1) first states
     h: Tensor,  # (S, K)
     guess: Tensor,  # (S, K+1, 2n+1)
     tol: float,
     sweeps: int = 12,
-    u: Tensor | None = None,  # (S, K, m) input of every step
 ) -> Path | None:
     """The trajectories from `start`, or None where the sweeps do not converge."""
-    L_d, n = parameters.at(theta, u), (start.shape[-1] - 1) // 2
+    n = (start.shape[-1] - 1) // 2
     if not L_d.capabilities.sticking or n == 1:
         path = _swept(linear_steps, L_d, start, h, guess, tol, sweeps)
         if path is not None:
@@ -155,25 +153,23 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
 
 
 def parameter_derivatives(
-    parameters: ParameterVector,
-    theta: Tensor,  # (P,)
+    L_d: FixedModel,  # at the inputs of every step, where it takes any
     x: Tensor,  # (S, K+1, 2n+1) states that the steps start from; the last is not used
     q1: Tensor,  # (S, K, n) positions that they lead to
     A: Tensor,  # (S, K, d, d) DΦ̃ there, d = 2n or, with s, 2n + 1
     h: Tensor,  # (S, K)
-    u: Tensor | None = None,  # (S, K, m)
 ) -> Tensor:
     """∂Φ̃(x_k)/∂θ of every step, (S, K, d, P), by the implicit-function theorem.
 
     With F = D1 L_d + c p0 = 0, dq1/dθ = −J⁻¹ ∂F/∂θ; p1 and s1 follow. θ acts through F as c p0 does: −J⁻¹, and what
     follows from it, are the columns of DΦ̃ that belong to p0, over c.
     """
-    (S, K, n), d = q1.shape, A.shape[-1]
+    (S, K, n), d, theta, u = q1.shape, A.shape[-1], L_d.theta, L_d.u
     x, ends, steps = x[:, :-1].flatten(0, 1), q1.flatten(0, 1), h.flatten()
     by_push, inputs = A[..., n : 2 * n].flatten(0, 1), None if u is None else u.flatten(0, 1)
 
     def step_functions(theta: Tensor, x: Tensor, q1: Tensor, h: Tensor, u: Tensor | None) -> tuple[Tensor, Tensor]:
-        P = parameters.partials(theta, x[:n], q1, x[2 * n], h, 1, u)
+        P = L_d.parameters.partials(theta, x[:n], q1, x[2 * n], h, 1, u)
         made = torch.cat([momentum_residual(P, x[n : 2 * n]), momentum_plus(P), P.L[None]])
         return made[:d], P.c
 
