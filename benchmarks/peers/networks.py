@@ -179,16 +179,7 @@ def fit_rates(
 ) -> Flow:
     """Least squares of (q̇, ẏ) against the data's rates, each divided by its spread.
 
-    Parameters
-    ----------
-    rates
-        The model.
-    parameters
-        What it is trained by.
-    samples, generator, budget
-        See `networks.train`.
-    momentum
-        Whether y is the momentum; else the velocity, where q̇ = v by construction and only v̇ is fitted.
+    y is the `momentum`, or else the velocity, where q̇ = v by construction and only v̇ is fitted.
     """
     parameters, motion = list(parameters), samples.motion()
     y, y_rate = (motion.p, motion.f) if momentum else (motion.v, motion.a)

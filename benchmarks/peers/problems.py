@@ -33,45 +33,24 @@ Metrics = dict[str, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """One data set.
+    """One data set."""
 
-    Parameters
-    ----------
-    title
-        What it is and what is measured.
-    samples
-        (seed, exact) → what a peer is given.
-    judge
-        (predictor, exact) → `rms`, `median`, `failures`, `rollouts`, `decay`, and what else there is.
-    simulated
-        Whether exact velocities exist.
-    relative
-        Whether the second coordinate of a double pendulum is the angle between its arms.
-    dof
-        Number of coordinates.
-    own
-        seed → metrics and parameters of ours, where it is judged by the free run from its own fitted states.
-    """
-
-    title: str
-    samples: Callable[[int, bool], Samples]
-    judge: Callable[[Predictor, bool], Metrics]
-    simulated: bool = True
-    relative: bool = False
+    title: str  # what it is and what is measured
+    samples: Callable[[int, bool], Samples]  # (seed, exact) → what a peer is given
+    judge: Callable[[Predictor, bool], Metrics]  # (predictor, exact) → `rms`, `median`, `failures`, …
+    simulated: bool = True  # whether exact velocities exist
+    relative: bool = False  # whether the second coordinate of a double pendulum is the angle between its arms
     dof: int = 1
+    # Seed → metrics and parameters of ours, where it is judged by the free run from its own fitted states.
     own: Callable[[int], tuple[Metrics, int]] | None = None
 
 
-def errors(found: Tensor, truth: Tensor, energy: Callable[[Tensor], Tensor] | None) -> Metrics:
-    """RMS over the rollouts that end, median over all, and the error of the energy relative to its start.
-
-    Parameters
-    ----------
-    found, truth
-        (B, K, n); the first two positions are given, not predicted.
-    energy
-        Positions (B, K, n) → (B, K−2), by central differences: the same function for both.
-    """
+def errors(
+    found: Tensor,  # (B, K, n); the first two positions are given, not predicted
+    truth: Tensor,  # (B, K, n)
+    energy: Callable[[Tensor], Tensor] | None,  # positions (B, K, n) → (B, K−2), by central differences
+) -> Metrics:
+    """RMS over the rollouts that end, median over all, and the error of the energy relative to its start."""
     e = (found - truth)[:, 2:]
     size = e.abs().flatten(1).amax(1)
     good = torch.isfinite(size) & (size < LOST)

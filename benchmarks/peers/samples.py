@@ -28,31 +28,14 @@ class Motion:
 
 @dataclass(frozen=True)
 class Samples:
-    """Trajectories of one system, sampled every h.
+    """Trajectories of one system, sampled every h."""
 
-    Parameters
-    ----------
-    q
-        Positions of each trajectory, (K_i, n).
-    h
-        The step.
-    angles
-        Which coordinates are 2π-periodic.
-    noisy
-        Whether the positions carry noise: differences are then taken of a smoothed motion.
-    exact
-        Exact velocities, momenta and their rates at the samples of each trajectory; None where positions only are
-        given.
-    gaps
-        Where trajectories were cut at missing samples: the recording on one grid, NaN where missing, (K, n).
-    """
-
-    q: tuple[Tensor, ...]
+    q: tuple[Tensor, ...]  # positions of each trajectory, (K_i, n)
     h: float
-    angles: tuple[bool, ...]
-    noisy: bool = False
-    exact: tuple[Motion, ...] | None = None
-    gaps: Tensor | None = None
+    angles: tuple[bool, ...]  # which coordinates are 2π-periodic
+    noisy: bool = False  # whether the positions carry noise: differences are then taken of a smoothed motion
+    exact: tuple[Motion, ...] | None = None  # at the samples of each trajectory; None where positions only are given
+    gaps: Tensor | None = None  # (K, n) where trajectories were cut: the recording on one grid, NaN where missing
 
     @property
     def dof(self) -> int:

@@ -28,21 +28,15 @@ ANGLES = {"spring": False, "axis": False, "chain": False, "pendulum": True, "pen
 class Mechanism:
     """A kind of mechanism with its numbers.
 
-    Parameters
-    ----------
-    kind
-        "spring" (polynomial potential), "pendulum" (trigonometric potential), "axis" (no potential), "chain" (masses
-        between two walls), "pendulums" (coupled by torsion), "double_pendulum" or "cart_pole".
-    n
-        Number of coordinates.
-    values
-        Numbers by name; those of coordinate i end in i. `d` viscous, `a` quadratic, `c` dry friction, `e` and `w` the
-        excess and the width of Stribeck friction c + e exp(−(v/w)²), `z` drag z (q² − 1) v, `o` a constant force,
-        `b` the gain of the input, which acts on coordinate 0.
+    Those of coordinate i end in i: `d` viscous, `a` quadratic, `c` dry friction, `e` and `w` the excess and the width
+    of Stribeck friction c + e exp(−(v/w)²), `z` drag z (q² − 1) v, `o` a constant force; `b` is the gain of the input,
+    which acts on coordinate 0.
     """
 
+    # "spring" (polynomial potential), "pendulum" (trigonometric potential), "axis" (no potential), "chain" (masses
+    # between two walls), "pendulums" (coupled by torsion), "double_pendulum" or "cart_pole".
     kind: str
-    n: int
+    n: int  # number of coordinates
     values: Values
 
     @property
@@ -163,25 +157,14 @@ FINE = 2 * np.pi / 500  # longest fine step, in natural units
 BISECTIONS = 50  # of the time of an event, in a fine step
 
 
-def exact_motion(of: Mechanism, q0: Array, v0: Array, t: Array, u: Array) -> tuple[Array, Array]:
-    """Positions and velocities at the times t.
-
-    Parameters
-    ----------
-    of
-        The mechanism.
-    q0, v0
-        (B, n) initial states.
-    t
-        (N,) times, shared by the batch, increasing.
-    u
-        (B, N) input of the step that starts at each time.
-
-    Returns
-    -------
-    tuple of ndarray
-        (B, N, n) twice.
-    """
+def exact_motion(
+    of: Mechanism,
+    q0: Array,  # (B, n)
+    v0: Array,  # (B, n)
+    t: Array,  # (N,) times, shared by the batch, increasing
+    u: Array,  # (B, N) input of the step that starts at each time
+) -> tuple[Array, Array]:
+    """Positions and velocities at the times t, (B, N, n) each."""
     q, v = q0.copy(), v0.copy()
     mode = _modes(of, q, v, u[:, 0], np.sign(v))
     qs, vs = [q], [v]

@@ -185,8 +185,13 @@ class FitConfig:
             f"{name} must be >= 1, got {value}": value is not None and value < 1
             for name, value in own.items() if name not in CHOICES
         })  # fmt: skip
+        self._check_together()
+        self._check_batch()
+        self._check_device()
+
+    def _check_together(self) -> None:
         forces = self.coulomb or self.sticking or self.input_map or self.drag
-        objective, adaptive = self.objective, self.optimiser != "lm"
+        objective = self.objective
         refuse({
             f"train fraction must be in (0, 1], got {self.train_fraction:g}": not 0 < self.train_fraction <= 1,
             f"departures must be one or more positive numbers, got {self.departures}":
@@ -194,7 +199,7 @@ class FitConfig:
             f"supervision '{self.supervision}' is of the one-step objective; set objective='residual', not "
             f"'{objective}'": self.supervision != "q" and objective not in ("auto", "residual"),
             f"{self.optimiser} fits the objectives residual and raw, not {objective!r}; use the optimiser lm":
-                adaptive and objective not in ("residual", "raw"),
+                self.optimiser != "lm" and objective not in ("residual", "raw"),
             f"substeps are of trajectory fitting, not of the objective {objective!r}; set it to 'trajectory'":
                 self.substeps > 1 and objective not in ("trajectory", "smoothing"),
             f"sticking friction is fitted to trajectories; leave objective='{objective}' out":
@@ -204,14 +209,17 @@ class FitConfig:
             "input_map is given but use_inputs is False; leave one of them out":
                 self.input_map and not self.use_inputs,
         })  # fmt: skip
-        if self.batch is not None:
-            refuse({
-                f"batch must be >= 1, got {self.batch}": self.batch < 1,
-                "batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out": not adaptive,
-                f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and "
-                "set supervision='qs'": self.level in ("affine", "full") and self.supervision == "q",
-            })  # fmt: skip
-        self._check_device()
+
+    def _check_batch(self) -> None:
+        if self.batch is None:
+            return
+        lm, carries_s = self.optimiser == "lm", self.level in ("affine", "full") and self.supervision == "q"
+        refuse({
+            f"batch must be >= 1, got {self.batch}": self.batch < 1,
+            "batch is of adam and adamw; lm takes all rows: set the optimiser, or leave batch out": lm,
+            f"batch: the level '{self.level}' carries s along whole trajectories; leave batch out, or record s and set "
+            "supervision='qs'": carries_s,
+        })  # fmt: skip
 
     def _check_device(self) -> None:
         try:

@@ -95,16 +95,11 @@ class Equation:
 def equation_of(run: FittedRun, covariance: Tensor | None = None) -> Equation:
     """The equation of a run's model, in the data's units; the first mass is 1.
 
-    Parameters
-    ----------
-    run
-        A finished fit.
-    covariance
-        (P, P) of the numbers that were fitted (`herglotz.training.laplace`), for standard deviations.
+    Standard deviations come from the `covariance`, (P, P), of the numbers that were fitted (`training.laplace`).
     """
     spread, terms = covariance, []
     at = {entry: k for k, entry in enumerate(ParameterVector(run.model).entries)}
-    for left, what, unit, parts in _parts(run):
+    for left, what, unit, parts in _Reader(run).parts():
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
         deviation = None
         if spread is not None:
@@ -126,6 +121,7 @@ def equation_of(run: FittedRun, covariance: Tensor | None = None) -> Equation:
 
 
 Part = tuple[str, int, float]  # parameter, entry, factor
+Line = tuple[str, str, str, list[Part]]  # left side, text, unit and parameters of a term
 
 
 def _lefts(run: FittedRun) -> list[str]:
@@ -167,102 +163,93 @@ def _newtonian(model: ContactLagrangian) -> bool:
     return made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
 
 
-def _parts(run: FittedRun) -> Iterator[tuple[str, str, str, list[Part]]]:
-    """Left side, text, unit and parameters of each term."""
-    data, config = run.data, run.model.config
-    lefts, newton = _lefts(run), _newtonian(run.model)
-    for i, (name, unit) in enumerate(zip(data.names, data.units, strict=True)):
-        left = lefts[i] if newton else lefts[i + 1]
-        yield from _friction(run, left, i, name, unit, newton)
-    n = config.dof
-    for i, (name, angle) in enumerate(zip(data.names, data.angles, strict=True)):
-        for power, place in _springs(run, i, angle):
-            yield _baseline(run, lefts, newton, i, name, angle, power, place)
-    texts = expand(config.features, config.angles)
-    offset = 2 * n if baseline_is_named(config) else 0
-    still = [text for text in texts if not parse(text, config.angles)[0].velocities]
-    for g, text in enumerate(still):
-        yield from _feature(run, lefts, newton, text, ("potential.features.sum.coefficient", offset + g))
-    for g, text in enumerate(text for text in texts if text not in still):
-        yield "L", feature_in_words(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
+class _Reader:
+    """The terms of a run's model: left side, text, unit and parameters of each."""
 
+    def __init__(self, run: FittedRun):
+        self.run, self.data, self.config, self.time = run, run.data, run.model.config, run.data.time_unit
+        self.lefts, self.newton = _lefts(run), _newtonian(run.model)
+        self.named = dict(run.model.named_parameters())
 
-def _springs(run: FittedRun, i: int, angle: bool) -> list[tuple[int, tuple[str, int, float]]]:
-    """The power of a coordinate in its stiffness and its tilt, with the parameter of each, its entry and a factor."""
-    config, coefficient = run.model.config, "potential.features.sum.coefficient"
-    if any(name == "potential.stiffness" for name, _ in run.model.named_parameters()):
-        return [(2, ("potential.stiffness", i, 1.0)), (1, ("potential.tilt", i, 1.0))]
-    if baseline_is_named(config):  # −k, b of an angle; k/2, b of a length
-        return [(2, (coefficient, 2 * i, -1.0 if angle else 2.0)), (1, (coefficient, 2 * i + 1, 1.0))]
-    return []
+    def parts(self) -> Iterator[Line]:
+        """Those of every term."""
+        data, config = self.data, self.config
+        for i in range(config.dof):
+            yield from self._friction(i, self.lefts[i if self.newton else i + 1])
+        for i, angle in enumerate(data.angles):
+            for power, place in self._springs(i, angle):
+                yield self._baseline(i, power, place)
+        texts = expand(config.features, config.angles)
+        offset = 2 * config.dof if baseline_is_named(config) else 0
+        still = [text for text in texts if not parse(text, config.angles)[0].velocities]
+        for g, text in enumerate(still):
+            yield from self._feature(text, ("potential.features.sum.coefficient", offset + g))
+        for g, text in enumerate(text for text in texts if text not in still):
+            yield "L", feature_in_words(text, data.names), "", [("kinetic.sum.coefficient", g, 1.0)]
 
+    def _springs(self, i: int, angle: bool) -> list[tuple[int, Part]]:
+        """The power of a coordinate in its stiffness and its tilt, with the part of each."""
+        coefficient = "potential.features.sum.coefficient"
+        if "potential.stiffness" in self.named:
+            return [(2, ("potential.stiffness", i, 1.0)), (1, ("potential.tilt", i, 1.0))]
+        if baseline_is_named(self.config):  # −k, b of an angle; k/2, b of a length
+            return [(2, (coefficient, 2 * i, -1.0 if angle else 2.0)), (1, (coefficient, 2 * i + 1, 1.0))]
+        return []
 
-def _friction(
-    run: FittedRun, left: str, i: int, name: str, unit: str, newton: bool
-) -> Iterator[tuple[str, str, str, list[Part]]]:
-    config, named, time = run.model.config, dict(run.model.named_parameters()), run.data.time_unit
-    parts = []
-    if "damping.rate" in named and newton:  # the contact form damps every momentum alike
-        parts.append(("damping.rate", 0, -float(run.model.kinetic.mass().detach()[i, i])))  # type: ignore[operator]
-    elif "damping.rate" in named and i == 0:
-        yield "L", "s", unit_of("1", 0, time, 1), [("damping.rate", 0, -1.0)]
-    parts += [("friction.viscous", i, -1.0)] if "friction.viscous" in named else []
-    if parts:
-        yield left, f"{name}′", unit_of(unit, 0, time, 1), parts
-    for g, text in enumerate(config.drag):
-        f = parse_drag(text, config.angles)
-        if f.air or i in (f.on, f.of):
-            what, by = drag_in_words(f, i, run.data.names), 1.0 if f.of == i else -1.0
-            size = unit_of(unit, 1 - f.a - f.b - f.c, time, 2 - f.b - f.c)
-            yield left, what, size, [("drag.coefficient", g, by)]
-    if config.coulomb:
-        yield left, f"sgn({name}′)", unit_of(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
-        friction = run.model.friction
-        assert friction is not None  # dry friction is part of it
-        width = (friction.sharpest + friction.log_stribeck.exp()).detach()
-        shape = f"exp(−({name}′/{float(width[i]):.3g})²) sgn({name}′)"
-        yield left, shape, unit_of(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
-    if "friction.input_map" in named:
-        for j in range(config.inputs):
-            at = i * config.inputs + j
-            yield left, _input(run, j), "", [("friction.input_map", at, 1.0)]
+    def _friction(self, i: int, left: str) -> Iterator[Line]:
+        run, config, named, time = self.run, self.config, self.named, self.time
+        name, unit, parts = self.data.names[i], self.data.units[i], []
+        if "damping.rate" in named and self.newton:  # the contact form damps every momentum alike
+            parts.append(("damping.rate", 0, -float(run.model.kinetic.mass().detach()[i, i])))  # type: ignore[operator]
+        elif "damping.rate" in named and i == 0:
+            yield "L", "s", unit_of("1", 0, time, 1), [("damping.rate", 0, -1.0)]
+        parts += [("friction.viscous", i, -1.0)] if "friction.viscous" in named else []
+        if parts:
+            yield left, f"{name}′", unit_of(unit, 0, time, 1), parts
+        for g, text in enumerate(config.drag):
+            f = parse_drag(text, config.angles)
+            if f.air or i in (f.on, f.of):
+                what, by = drag_in_words(f, i, self.data.names), 1.0 if f.of == i else -1.0
+                size = unit_of(unit, 1 - f.a - f.b - f.c, time, 2 - f.b - f.c)
+                yield left, what, size, [("drag.coefficient", g, by)]
+        if config.coulomb:
+            yield left, f"sgn({name}′)", unit_of(unit, 1, time, 2), [("friction.coulomb", i, -1.0)]
+            friction = run.model.friction
+            assert friction is not None  # dry friction is part of it
+            width = (friction.sharpest + friction.log_stribeck.exp()).detach()
+            shape = f"exp(−({name}′/{float(width[i]):.3g})²) sgn({name}′)"
+            yield left, shape, unit_of(unit, 1, time, 2), [("friction.breakaway", i, -1.0)]
+        for j in range(config.inputs if "friction.input_map" in named else 0):
+            yield left, self._input(j), "", [("friction.input_map", i * config.inputs + j, 1.0)]
 
+    def _input(self, j: int) -> str:
+        """The input less what its sensor shows where nothing acts."""
+        what, friction = self.data.input_labels[j][0], self.run.model.friction
+        zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
+        return f"({what} {'−' if zero > 0 else '+'} {abs(zero):.3g})" if zero else what
 
-def _input(run: FittedRun, j: int) -> str:
-    """The input less what its sensor shows where nothing acts."""
-    what, friction = run.data.input_labels[j][0], run.model.friction
-    zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
-    return f"({what} {'−' if zero > 0 else '+'} {abs(zero):.3g})" if zero else what
+    def _baseline(self, i: int, power: int, part: Part) -> Line:
+        """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
+        name, angle, (parameter, entry, by) = self.data.names[i], self.data.angles[i], part
+        if self.newton:
+            what = (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else "")
+            size = unit_of(self.data.units[i], 1 if angle else 2 - power, self.time, 2)
+            return self.lefts[i], what, size, [(parameter, entry, -by)]
+        what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else raised(name, power)
+        factor = (by if power == 2 else -by) if angle else (-by / 2 if power == 2 else -by)
+        return "L", what, "", [(parameter, entry, factor)]
 
-
-def _baseline(
-    run: FittedRun, lefts: list[str], newton: bool, i: int, name: str, angle: bool, power: int, part: Part
-) -> tuple[str, str, str, list[Part]]:
-    """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
-    unit, time = run.data.units[i], run.data.time_unit
-    parameter, entry, by = part
-    if newton:
-        what = (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else "")
-        size = unit_of(unit, 1 if angle else 2 - power, time, 2)
-        return lefts[i], what, size, [(parameter, entry, -by)]
-    what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else raised(name, power)
-    factor = (by if power == 2 else -by) if angle else (-by / 2 if power == 2 else -by)
-    return "L", what, "", [(parameter, entry, factor)]
-
-
-def _feature(
-    run: FittedRun, lefts: list[str], newton: bool, text: str, at: tuple[str, int]
-) -> Iterator[tuple[str, str, str, list[Part]]]:
-    """A feature of the potential: its force on each coordinate, or its part of L."""
-    names, units, time = run.data.names, run.data.units, run.data.time_unit
-    if not newton:
-        yield "L", feature_in_words(text, names), "", [(*at, -1.0)]
-        return
-    for i in range(len(names)):
-        for product in parse(text, run.model.config.angles):
-            if product.function == "radius" or product.form[i]:
-                what, by, power = slope(product, i, names)
-                yield lefts[i], what, unit_of(units[i], power, time, 2), [(*at, -by)]
+    def _feature(self, text: str, at: tuple[str, int]) -> Iterator[Line]:
+        """A feature of the potential: its force on each coordinate, or its part of L."""
+        names, units = self.data.names, self.data.units
+        if not self.newton:
+            yield "L", feature_in_words(text, names), "", [(*at, -1.0)]
+            return
+        for i in range(len(names)):
+            for product in parse(text, self.config.angles):
+                if product.function == "radius" or product.form[i]:
+                    what, by, power = slope(product, i, names)
+                    yield self.lefts[i], what, unit_of(units[i], power, self.time, 2), [(*at, -by)]
 
 
 def network_of(run: FittedRun) -> str | None:

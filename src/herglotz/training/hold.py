@@ -45,12 +45,7 @@ RANK = 1e-9  # of the largest singular value: columns below it repeat others
 def with_arrival(data: Trajectories, train: Trajectories) -> tuple[Trajectories, Arrival, dict[str, str]]:
     """The data with their inputs as they act, how recorded inputs arrive, and the reasons.
 
-    Parameters
-    ----------
-    data
-        All samples; what they do not say is what explains the steps of `train`.
-    train
-        The part of the data that a fit may see.
+    What the data do not say is what explains the steps of `train`, the part of them that a fit may see.
     """
     said = data.arrival
     if data.u is None:

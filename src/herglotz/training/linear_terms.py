@@ -73,17 +73,7 @@ def _better(first: LinearStart, other: LinearStart) -> bool:
 
 
 class LinearTerms:
-    """Terms and starting values from smoothed positions.
-
-    Parameters
-    ----------
-    data, base
-        What is trained on, and the first look at it.
-    every
-        The candidates of all families.
-    local
-        The polynomials around each sample.
-    """
+    """Terms and starting values from smoothed positions: `every` holds the candidates of all families."""
 
     def __init__(self, data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials):
         self.data, self.base, self.all = data, base, every

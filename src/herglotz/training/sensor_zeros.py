@@ -95,12 +95,7 @@ class Apart:
 def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | None:
     """What keeps recordings from being followed together; None where nothing does, or there is one alone.
 
-    Parameters
-    ----------
-    data, config
-        All recordings, and the user's settings.
-    seen
-        The look at them, with the named terms that follow them best.
+    `seen` is the look at all of them, with the named terms that follow them best.
     """
     if len(data) == 1 or seen.found is None or seen.found.sigma is None:
         return None

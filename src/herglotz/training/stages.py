@@ -70,30 +70,17 @@ class Stages:
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
     and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
-    bits as one that was not interrupted.
-
-    Parameters
-    ----------
-    progress
-        Show one bar over all stages, whose remaining time is at most that of the stages begun; None shows it on a
-        terminal only; "lines" prints one line on stderr after every stage, "iterations" one after every iteration too.
-    checkpoint
-        File to write, or None.
-    key
-        Identifies data and settings; a checkpoint of another fit is refused.
-    resume
-        Read the checkpoint if there is one.
-    log
-        Is told the cost of every iteration, as it is reached.
+    bits as one that was not interrupted. One bar over all stages shows their progress, whose remaining time is at most
+    that of the stages begun.
     """
 
     def __init__(
         self,
-        progress: Progress = False,
-        checkpoint: Path | None = None,
-        key: str = "",
-        resume: bool = False,
-        log: TensorboardLog | None = None,
+        progress: Progress = False,  # None: on a terminal only; "lines", "iterations": a line on stderr after each
+        checkpoint: Path | None = None,  # file to write
+        key: str = "",  # identifies data and settings; a checkpoint of another fit is refused
+        resume: bool = False,  # read the checkpoint if there is one
+        log: TensorboardLog | None = None,  # is told the cost of every iteration, as it is reached
     ):
         self.log = log if is_first() else None
         self.lines = progress in ("lines", "iterations") and is_first()

@@ -129,17 +129,7 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
-    """Settings and starting values with the structure that the data show; unchanged where they show none.
-
-    Parameters
-    ----------
-    data
-        What is trained on.
-    base
-        The first look at it.
-    config
-        Settings of the fit.
-    """
+    """Settings and starting values with the structure that the data show; unchanged where they show none."""
     joints, names, size = any(data.angles), dictionary(data), max(base.scale)
 
     def without(reason: str) -> Structure:

@@ -99,21 +99,14 @@ class Errors:
 
 
 def judged(
-    task: Task, seen: Look, fitted: Fitted, everywhere: Tensor, free: Tensor | None, metrics: dict[str, Any]
+    task: Task,
+    seen: Look,
+    fitted: Fitted,
+    everywhere: Tensor,  # (N, 2n+1) states at all samples
+    free: Tensor | None,  # (M, n) errors of the free run over the unseen part; None: nothing was held out
+    metrics: dict[str, Any],  # what is known of the fit already
 ) -> dict[str, Any]:
-    """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say.
-
-    Parameters
-    ----------
-    task, seen, fitted
-        A finished fit.
-    everywhere
-        (N, 2n+1) states at all samples.
-    free
-        (M, n) errors of the free run over the unseen part; None: nothing was held out.
-    metrics
-        What is known of the fit already.
-    """
+    """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say."""
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
     kept, states = without(task.data, ~used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)

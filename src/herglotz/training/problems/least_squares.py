@@ -23,29 +23,16 @@ class LeastSquares:
     """Σ ρ(r) + prior(θ), with r the residuals over their standard deviations and ρ(r) = ½r² or Student's t.
 
     An objective derives `cost` and `normal_equations` (`solvers.levenberg_marquardt.SumOfSquares`) from these parts.
-
-    Parameters
-    ----------
-    model
-        Its current parameters are the start; the model is not changed.
-    data
-        Trajectories of positions, and of inputs where the model takes them.
-    sigma
-        Standard deviation of the noise of q over its `balance`.
-    prior
-        Penalty on the parameters; None: there is none.
-    freedom
-        Degrees of freedom ν of Student's t (`robust`); None: least squares.
     """
 
     def __init__(
         self,
-        model: ContactLagrangian,
-        data: Trajectories,
+        model: ContactLagrangian,  # its current parameters are the start; the model is not changed
+        data: Trajectories,  # of positions, and of inputs where the model takes them
         *,
-        sigma: float,
-        prior: Prior | None = None,
-        freedom: float | None = None,
+        sigma: float,  # standard deviation of the noise of q over its `balance`
+        prior: Prior | None = None,  # penalty on the parameters
+        freedom: float | None = None,  # degrees of freedom ν of Student's t (`robust`); None: least squares
     ):
         self.parameters, self.data, self.n = ParameterVector(model), data, data.dof
         self.P = len(self.parameters.get())

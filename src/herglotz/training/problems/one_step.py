@@ -140,20 +140,7 @@ class OneStep(LeastSquares, ABC):
 class ResidualProblem(OneStep):
     """½ Σ |r_k|² / σ² + prior over parameters and, where s enters the motion, one latent s per trajectory.
 
-    Parameters
-    ----------
-    model, data, sigma, prior, freedom
-        As for `LeastSquares`. s is integrated along each trajectory from its latent start.
-    metric
-        "position" for J⁻¹R, "raw" for R.
-    max_step
-        Leave out triples that span a longer step (gaps).
-    expected
-        Triples that were not recorded, and their standard deviation (`baseline_motion`). `residuals` leaves them out.
-    most
-        Use at most so many recorded triples, evenly spread; None: all. Where s enters the motion all are used.
-    chunk
-        Triples whose Jacobian is held in memory at once.
+    s is integrated along each trajectory from its latent start. `residuals` leaves expected triples out.
     """
 
     def __init__(
@@ -162,12 +149,13 @@ class ResidualProblem(OneStep):
         data: Trajectories,
         *,
         sigma: float = 1.0,
-        metric: str = "position",
-        max_step: float | None = None,
+        metric: str = "position",  # for J⁻¹R; "raw" for R
+        max_step: float | None = None,  # triples that span a longer step (gaps) are left out
+        # Triples that were not recorded, and their standard deviation (`baseline_motion`).
         expected: tuple[Triples, float] | None = None,
-        most: int | None = None,
-        chunk: int = CHUNK,
-        **settings: Any,
+        most: int | None = None,  # recorded triples, evenly spread; None: all, and so where s enters the motion
+        chunk: int = CHUNK,  # triples whose Jacobian is held in memory at once
+        **settings: Any,  # of `LeastSquares`
     ):
         super().__init__(model, data, sigma=sigma, **settings)
         self.metric, self.chunk, self.carries_s = metric, chunk, model.s_enters_motion

@@ -31,21 +31,7 @@ KNOWN = 1e3  # times σ: a start that is known so much better is known
 
 
 class ShootingProblem(StatesProblem):
-    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states.
-
-    Parameters
-    ----------
-    model, data, sigma, prior
-        As for `LeastSquares`.
-    grid
-        The segments.
-    freedom
-        Degrees of freedom ν of Student's t for the residuals of data and joints (`robust`); None: least squares.
-    used
-        (N,) which samples have a say; all without it. The others are outliers that were found.
-    s
-        (N,) s at every sample in the model's unit, where it is known: trajectories start from it, not from about 0.
-    """
+    """½ Σ (q − q_data)²/σ² + ½ Σ (joint defects / weight)² + prior, over parameters and segment states."""
 
     def __init__(
         self,
@@ -53,9 +39,9 @@ class ShootingProblem(StatesProblem):
         data: Trajectories,
         grid: SegmentGrid,
         *,
-        used: Tensor | None = None,
-        s: Tensor | None = None,
-        **settings: Any,
+        used: Tensor | None = None,  # (N,) which samples have a say; all without it. The others are outliers
+        s: Tensor | None = None,  # (N,) in the model's unit, where it is known: trajectories start from it, not near 0
+        **settings: Any,  # of `LeastSquares`; `freedom` is for the residuals of data and joints
     ):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used

@@ -30,20 +30,12 @@ DAMPING = 1e-9  # of the first step of Levenberg–Marquardt: the stiff steps, n
 
 
 class SmoothingProblem(StatesProblem):
-    """The sum of squares above, over parameters and the states of all nodes.
+    """The sum of squares above, over parameters and the states of all nodes of a grid of whole trajectories.
 
-    Parameters
-    ----------
-    model, data, sigma, prior
-        As for `LeastSquares`.
-    grid
-        Whole trajectories, one segment each.
-    process
-        Standard deviation of what a step leaves of the model in v, relative to sigma, in the natural units of both;
-        that times the mass of each coordinate in p, the same share of the natural size in s, and h/√3 of v's in q, as a
-        random force would add.
-    freedom
-        Degrees of freedom ν of Student's t for the residuals of data and steps (`robust`); None: least squares.
+    `process` is the standard deviation of what a step leaves of the model in v, relative to sigma, in the natural units
+    of both; that times the mass of each coordinate in p, the same share of the natural size in s, and h/√3 of v's in q,
+    as a random force would add. The other settings are those of `LeastSquares`; `freedom` is for the residuals of data
+    and steps.
     """
 
     def __init__(

@@ -26,14 +26,7 @@ class SupervisedProblem(OneStep):
 
         r_q = J⁻¹R at the recorded s,    r_s = (s₁ − s₀)/κ − L_d,    r_p = p₁/κ − D2 L_d − F⁺ (with momenta only),
 
-    r_s and r_p brought to units of q by the natural sizes of s and p.
-
-    Parameters
-    ----------
-    model, data, max_step, sigma, prior, freedom, chunk
-        As for `ResidualProblem`.
-    momenta
-        Use recorded momenta too.
+    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`.
 
     Raises
     ------
@@ -48,7 +41,7 @@ class SupervisedProblem(OneStep):
         model: ContactLagrangian,
         data: Trajectories,
         *,
-        momenta: bool,
+        momenta: bool,  # whether recorded momenta are used too
         max_step: float | None = None,
         sigma: float = 1.0,
         chunk: int = CHUNK,
