@@ -12,7 +12,7 @@ import math
 import subprocess
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,36 +101,27 @@ class Native:
             values = weights.values.double().contiguous()
             self.library.set_weights(ctypes.c_void_p(values.data_ptr()))
 
-    def motions(
-        self, y: Tensor, T: float, checks: int, method: str, x: float, u: Tensor | None = None
-    ) -> tuple[Tensor, int]:
-        """Positions (B, checks, n) at equal times up to T, and the evaluations of f."""
-        out = torch.empty(len(y), checks, y.shape[1], dtype=torch.float64)
-        count = self.call(y, T, checks, method, x, u, out)()
-        return out[..., : self.dof], count
 
-    def call(
-        self,
-        y: Tensor,
-        T: float,
-        checks: int,
-        method: str,
-        x: float,
-        u: Tensor | None = None,
-        out: Tensor | None = None,
-    ) -> Any:
-        """The call in C, its arguments made beforehand."""
-        y = y.double().contiguous()
-        u = None if u is None else u.double().contiguous()
-        arguments = (
-            ctypes.c_long(len(y)), ctypes.c_long(checks), ctypes.c_double(T / checks), ctypes.c_int(METHODS[method]),
-            ctypes.c_double(x), ctypes.c_double(0.0), _pointer(u), _pointer(y), _pointer(out),
-        )  # fmt: skip
-        return lambda keep=(y, u, out): self.library.motions(*arguments)  # noqa: ARG005
+@dataclass(frozen=True)
+class Motions:
+    """What is asked of compiled methods: positions of motions at equal times up to T."""
 
-    def timing(self, y: Tensor, T: float, checks: int, method: str, x: float, u: Tensor | None = None) -> Timing:
+    library: Native
+    y: Tensor  # (B, 2n) starts
+    T: float
+    checks: int  # times
+    method: str
+    x: float  # steps between two times, or a tolerance
+    u: Tensor | None = None  # (checks, m) held inputs
+
+    def made(self) -> tuple[Tensor, int]:
+        """Positions (B, checks, n), and the evaluations of f."""
+        out = torch.empty(len(self.y), self.checks, self.y.shape[1], dtype=torch.float64)
+        return out[..., : self.library.dof], self._call(len(self.y), out)()
+
+    def timing(self) -> Timing:
         """Some of the motions, as often as makes the call long enough to time; a step is one motion."""
-        call = self.call(y[:TIMED], T, checks, method, x, u)
+        call = self._call(TIMED, None)
         call()
         times = max(1, round(PER / max(1e-7, seconds(call, time.perf_counter))))
 
@@ -138,11 +129,18 @@ class Native:
             for _ in range(times):
                 call()
 
-        return Timing(run, times * len(y[:TIMED]))
+        return Timing(run, times * len(self.y[:TIMED]))
 
-
-def _pointer(x: Tensor | None) -> ctypes.c_void_p:
-    return ctypes.c_void_p(None if x is None else x.data_ptr())
+    def _call(self, most: int, out: Tensor | None) -> Callable[[], int]:
+        """The call in C, its arguments made beforehand."""
+        y = self.y[:most].double().contiguous()
+        u = None if self.u is None else self.u.double().contiguous()
+        arguments = (
+            ctypes.c_long(len(y)), ctypes.c_long(self.checks), ctypes.c_double(self.T / self.checks),
+            ctypes.c_int(METHODS[self.method]), ctypes.c_double(self.x), ctypes.c_double(0.0),
+            *(ctypes.c_void_p(None if x is None else x.data_ptr()) for x in (u, y, out)),
+        )  # fmt: skip
+        return lambda keep=(y, u, out): self.library.library.motions(*arguments)  # noqa: ARG005
 
 
 def dop853_source() -> str:
@@ -292,11 +290,12 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
     segments = CHECKS if u is None else len(u)
     if u is not None and method != "DOP853":
         x = max(1, round(x * CHECKS / segments))
-    q, count = library.motions(y, setup.T, segments, method, x, u)
+    asked = Motions(library, y, setup.T, segments, method, x, u)
+    q, count = asked.made()
     each = count / len(y) / setup.T
     more = {"evaluations_per_time": each, "flops_per_time": each * library.flops, "artefact": "C"}
     errors = judged(q[:, segments // CHECKS - 1 :: segments // CHECKS], case.truth)
-    return Timed({**point, **errors, **more}, library.timing(y, setup.T, segments, method, x, u), setup.T)
+    return Timed({**point, **errors, **more}, asked.timing(), setup.T)
 
 
 def neural(case: Case) -> list[Timed]:

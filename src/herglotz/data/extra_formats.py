@@ -42,50 +42,36 @@ class Table:
         return self.columns[name]
 
 
-def read_parquet(path: PathLike, **columns: Any) -> Trajectories:
-    """Read a Parquet file like a csv file with the same header; `columns` are those of `read_csv`.
+def read_packed(path: PathLike, **columns: Any) -> Trajectories:
+    """Read a table of a suffix of `ARRAYS` like a csv file with the same header; `columns` are those of `read_csv`.
 
     Raises
     ------
     InputError
-        If pyarrow is missing, the file is damaged, or as `read_csv`.
+        If the package that reads it is missing, the file is damaged, columns differ in length, or as `read_csv`.
     """
+    every = ARRAYS[Path(path).suffix.lower()](path)  # of each recording
+    return Trajectories.cat(from_frame(Table(Path(path), one), Wanted(**columns), Path(path)) for one in every)
+
+
+def _parquet(path: PathLike) -> list[dict[str, np.ndarray]]:
     parquet = _package("pyarrow.parquet", path)
     table = _opened(path, lambda: parquet.read_table(str(path)))
     names = [name for name in table.column_names if not COUNTER.fullmatch(name)]
-    arrays = {name: table.column(name).to_numpy() for name in names}
-    return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+    return [{name: table.column(name).to_numpy() for name in names}]
 
 
-def read_hdf5(path: PathLike, **columns: Any) -> Trajectories:
-    """Read the datasets of an HDF5 file as columns, with their attribute `unit` or `units`; groups inside are opened.
-
-    Raises
-    ------
-    InputError
-        If h5py is missing, the file is damaged, datasets differ in length, or as `read_csv`.
-    """
-    return from_frame(Table(Path(path), _datasets(path)), Wanted(**columns), Path(path))
-
-
-def read_mat(path: PathLike, **columns: Any) -> Trajectories:
-    """Read the arrays of a MATLAB file as columns: vectors t, q, u, ... or matrices (N, n), in structs as well.
+def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
+    """The arrays of a MATLAB file, vectors t, q, u, ... or matrices (N, n), in structs as well.
 
     A struct array holds one recording an element. Text and single numbers are left aside.
-
-    Raises
-    ------
-    InputError
-        If scipy (or h5py, for version 7.3) is missing, the file is damaged, or as `read_csv`.
     """
     with Path(path).open("rb") as file:
         if HDF5 in file.read(520):  # version 7.3: matrices are stored transposed
-            arrays = {name: array.T for name, array in _datasets(path).items()}
-            return from_frame(Table(Path(path), arrays), Wanted(**columns), Path(path))
+            return [{name: array.T for name, array in one.items()} for one in _datasets(path)]
     scipy_io = _package("scipy.io", path)
     stored = _opened(path, lambda: scipy_io.loadmat(str(path), simplify_cells=True))
-    sets = [Table(Path(path), _vectors(path, one)) for one in _recordings(stored)]
-    return Trajectories.cat(from_frame(one, Wanted(**columns), Path(path)) for one in sets)
+    return [_vectors(path, one) for one in _recordings(stored)]
 
 
 def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
@@ -112,8 +98,8 @@ def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]
     return found
 
 
-def _datasets(path: PathLike) -> dict[str, np.ndarray]:
-    """Every dataset of numbers, by the last part of its name, with its unit in brackets."""
+def _datasets(path: PathLike) -> list[dict[str, np.ndarray]]:
+    """Every dataset of numbers in an HDF5 file, its groups opened, by the last part of its name, with its unit."""
     h5py = _package("h5py", path)
     found: dict[str, np.ndarray] = {}
 
@@ -133,7 +119,12 @@ def _datasets(path: PathLike) -> dict[str, np.ndarray]:
             file.visititems(take)
 
     _opened(path, read)
-    return found
+    return [found]
+
+
+ARRAYS: dict[str, Callable[[PathLike], list[dict[str, np.ndarray]]]] = {
+    ".parquet": _parquet, ".h5": _datasets, ".hdf5": _datasets, ".mat": _matlab,
+}  # fmt: skip
 
 
 def _package(name: str, path: PathLike) -> Any:

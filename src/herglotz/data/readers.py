@@ -12,7 +12,7 @@ from typing import Any
 from herglotz.data.checks import check_alike
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_format import read_table, write_csv
-from herglotz.data.extra_formats import read_hdf5, read_mat, read_parquet
+from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
@@ -47,10 +47,10 @@ FORMATS = (
     ),
     *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_table(path, Wanted(**columns)), True)
       for end in (".csv", ".txt", ".tsv", ".dat")),
-    Format("columns as in csv (.parquet)", ".parquet", read_parquet, True),
-    Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_hdf5, True),
-    Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_hdf5, True),
-    Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_mat, True),
+    Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
+    Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
+    Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_packed, True),
+    Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_packed, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
 SHOWN = 76  # characters of the note that names the files of a folder: a line of a terminal

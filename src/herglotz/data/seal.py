@@ -30,22 +30,22 @@ def sealed_zip(content: bytes) -> bytes:
     """
     if content[-22:-18] != b"PK\5\6" or content[-2:] != EMPTY_ZIP_COMMENT:
         raise ValueError("not a zip archive without a comment")
-    return _sealed(content[:-2] + SIZE.to_bytes(2, "little"))
+    return sealed_bytes(content[:-2] + SIZE.to_bytes(2, "little"))
 
 
 def sealed_onnx(content: bytes) -> bytes:
     """An ONNX model whose last metadata entry is the hash."""
-    return _sealed(content + ONNX_ENTRY)
+    return sealed_bytes(content + ONNX_ENTRY)
 
 
 def sealed_text(content: str) -> str:
     """A C header whose last line is the hash, whatever its line ends become."""
-    return _sealed(content.encode() + TEXT[0], TEXT[1]).decode()
+    return sealed_bytes(content.encode() + TEXT[0], TEXT[1]).decode()
 
 
-def sealed_bytes(content: bytes) -> bytes:
-    """A file whose format ignores what follows it, such as a shared library."""
-    return _sealed(content)
+def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
+    """A file whose format ignores what follows it, such as a shared library: the content, its hash, and the tail."""
+    return content + hashlib.sha256(content).hexdigest().encode() + tail
 
 
 def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
@@ -65,7 +65,3 @@ def check_seal(content: bytes, path: PathLike, remedy: str = "export the model a
         )
     if hashlib.sha256(body).hexdigest().encode() != seal:
         raise InputError(f"{path}: its sha256 is not the one it was written with: it was damaged or changed; {remedy}")
-
-
-def _sealed(body: bytes, tail: bytes = b"") -> bytes:
-    return body + hashlib.sha256(body).hexdigest().encode() + tail

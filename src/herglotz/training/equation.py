@@ -229,15 +229,11 @@ class _Reader:
         return f"({what} {'−' if zero > 0 else '+'} {abs(zero):.3g})" if zero else what
 
     def _baseline(self, i: int, power: int, part: Part) -> Line:
-        """A term of the baseline's potential k (1 − cos q) + b sin q, or k q²/2 + b q."""
-        name, angle, (parameter, entry, by) = self.data.names[i], self.data.angles[i], part
-        if self.newton:
-            what = (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else "")
-            size = unit_of(self.data.units[i], 1 if angle else 2 - power, self.time, 2)
-            return self.lefts[i], what, size, [(parameter, entry, -by)]
-        what = (f"cos {name}" if power == 2 else f"sin {name}") if angle else raised(name, power)
-        factor = (by if power == 2 else -by) if angle else (-by / 2 if power == 2 else -by)
-        return "L", what, "", [(parameter, entry, factor)]
+        """A term of the baseline's potential."""
+        angle, (parameter, entry, by) = self.data.angles[i], part
+        what, factor = own_term(self.data.names[i], angle, power, self.newton)
+        size = unit_of(self.data.units[i], 1 if angle else 2 - power, self.time, 2) if self.newton else ""
+        return self.lefts[i] if self.newton else "L", what, size, [(parameter, entry, factor * by)]
 
     def _feature(self, text: str, at: tuple[str, int]) -> Iterator[Line]:
         """A feature of the potential: its force on each coordinate, or its part of L."""
@@ -250,6 +246,15 @@ class _Reader:
                 if product.function == "radius" or product.form[i]:
                     what, by, power = slope(product, i, names)
                     yield self.lefts[i], what, unit_of(units[i], power, self.time, 2), [(*at, -by)]
+
+
+def own_term(name: str, angle: bool, power: int, newton: bool) -> tuple[str, float]:
+    """Text and factor of a term of the potential k (1 − cos q) + b sin q, or k q²/2 + b q: of its force, or in L."""
+    if newton:
+        return (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else ""), -1.0
+    if angle:
+        return (f"cos {name}", 1.0) if power == 2 else (f"sin {name}", -1.0)
+    return raised(name, power), -0.5 if power == 2 else -1.0
 
 
 def network_of(run: FittedRun) -> str | None:

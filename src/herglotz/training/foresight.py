@@ -104,12 +104,11 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if path is None:
         return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
-    order = ahead.grid.sample.argsort()
-    Z = ahead.sensitivities(theta, path)[..., : problem.n, :].flatten(0, 1)[ahead.grid.node] / spread[:, None]
-    q = path.x[..., : problem.n].flatten(0, 1)[ahead.grid.node][order]
+    Z = ahead.grid.at_samples(ahead.sensitivities(theta, path)[..., : problem.n, :]) / spread[:, None]
+    q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
     runs = replace(runs, beyond=runs.beyond & inside)
-    return _summary(A.double(), Z[order].double(), problem, runs, absent)
+    return _summary(A.double(), Z.double(), problem, runs, absent)
 
 
 @dataclass(frozen=True)

@@ -53,36 +53,26 @@ def one_step_problem(
 
 def fit_one_step(task: Task, problem: OneStep, name: str, iterations: int) -> tuple[OptimiserResult, float]:
     """Minimise a one-step objective, write the result into its model, and return it with the RMS error of q."""
-    if task.config.optimiser == "lm":
-        total, optimise = iterations, _levenberg_marquardt(task, problem, iterations)
-    else:
-        total = ADAM_STEPS * iterations
-        optimise = _adam(task, problem, total)
-    result = task.stages.run(name, problem.start(), total, optimise)
+    total = iterations if task.config.optimiser == "lm" else ADAM_STEPS * iterations
+    start = problem.start()
+    result = task.stages.run(name, start, total, lambda x, callback: _optimised(task, problem, x, total, callback))
     rms = float(problem.residuals(result.x).square().mean().sqrt())
     problem.parameters.set(result.x[: problem.P])
     return result, rms
 
 
-def _levenberg_marquardt(
-    task: Task, problem: OneStep, iterations: int
-) -> Callable[[Tensor, Callback], OptimiserResult]:
-    """Return the optimiser; it forms no matrix where there are too many parameters for one."""
+def _optimised(task: Task, problem: OneStep, x: Tensor, total: int, callback: Callback) -> OptimiserResult:
+    """The end of a search from x; Levenberg–Marquardt forms no matrix where there are too many parameters for one."""
+    c = task.config
+    if c.optimiser != "lm":
+        return adam(
+            problem, x, max_iterations=total, learning_rate=c.learning_rate,
+            decay=DECAY if c.optimiser == "adamw" else 0.0, batch=c.batch, seed=c.seed, callback=callback,
+        )  # fmt: skip
     large = isinstance(problem, ResidualProblem) and not problem.carries_s and problem.P > DENSE
     target = MatrixFree(problem) if large and isinstance(problem, ResidualProblem) else problem
     rtol, atol = HURRIED if task.hurried else RTOL, UNLIKELIER if problem.sigma <= task.exact else 0.0
-    return lambda x, callback: levenberg_marquardt(
-        target, x, max_iterations=iterations, rtol=rtol, atol=atol, callback=callback
-    )
-
-
-def _adam(task: Task, problem: OneStep, steps: int) -> Callable[[Tensor, Callback], OptimiserResult]:
-    """Adam or AdamW as the settings say."""
-    c = task.config
-    return lambda x, callback: adam(
-        problem, x, max_iterations=steps, learning_rate=c.learning_rate,
-        decay=DECAY if c.optimiser == "adamw" else 0.0, batch=c.batch, seed=c.seed, callback=callback,
-    )  # fmt: skip
+    return levenberg_marquardt(target, x, max_iterations=total, rtol=rtol, atol=atol, callback=callback)
 
 
 def best_restart(

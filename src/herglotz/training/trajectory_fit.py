@@ -62,10 +62,7 @@ class TrajectoryFit:
 
     def states(self) -> Tensor:
         """The fitted trajectory at the samples, (N, 2n+1)."""
-        grid, x = self.problem.grid, self.path.x.flatten(0, 1)
-        out = x.new_empty(self.problem.data.samples, x.shape[-1])
-        out[grid.sample] = x[grid.node]
-        return out
+        return self.problem.grid.at_samples(self.path.x)
 
     def held_out_errors(self) -> Tensor:
         """Of every fold, in units of q; see `cross_validation`."""

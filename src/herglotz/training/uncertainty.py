@@ -173,10 +173,7 @@ class Laplace:
         with torch.no_grad():
             Z = whole.sensitivities(self.theta, path)[..., : whole.n, :].double()  # (B, K+1, n, P + d)
             variance = torch.stack([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
-        grid = whole.grid
-        q, std = data.q.new_empty(data.q.shape), data.q.new_empty(data.q.shape)
-        q[grid.sample] = path.x[..., : whole.n].flatten(0, 1)[grid.node]
-        std[grid.sample] = variance.clamp_min(0).sqrt().flatten(0, 1)[grid.node].to(std.dtype)
+        q, std = (whole.grid.at_samples(x).to(data.q) for x in (path.x[..., : whole.n], variance.clamp_min(0).sqrt()))
         return Bands(q, std, self.problem.deviations)
 
     def standard_deviations(self) -> dict[str, Tensor]:

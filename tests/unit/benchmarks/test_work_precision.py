@@ -25,7 +25,7 @@ def test_the_equations_in_c_are_those_of_the_scene(name):
     every = segments // ways.CHECKS
 
     def error(method, x):
-        q, _ = library.motions(y, setup.T, segments, method, x, u)
+        q, _ = rivals.Motions(library, y, setup.T, segments, method, x, u).made()
         return float((q[:, every - 1 :: every] - truth).abs().max())
 
     assert error("RK4", 4000 // every) < 1e-7
@@ -38,15 +38,17 @@ def test_dop853_in_c_is_dop853():
     # fails if a coefficient is lost on the way into C: the error must follow the tolerance, at order 8's price
     library = rivals.Native("damped_pendulum", "float64", fast=False)
     y = torch.tensor([[1.5, 0.3]], dtype=torch.float64)
-    exact, _ = library.motions(y, 8.0, 4, "RK4", 4000)
+    exact, _ = rivals.Motions(library, y, 8.0, 4, "RK4", 4000).made()
     errors, counts = [], []
     for tol in (1e-4, 1e-7, 1e-10):
-        q, count = library.motions(y, 8.0, 4, "DOP853", tol)
+        q, count = rivals.Motions(library, y, 8.0, 4, "DOP853", tol).made()
         errors.append(float((q - exact).abs().max()))
         counts.append(count)
     assert [e < 10 * tol for e, tol in zip(errors, (1e-4, 1e-7, 1e-10), strict=True)] == [True] * 3, errors
     assert counts[2] < 5 * counts[0]  # six decades: 10^(6/8) = 5.6 times the steps, less what the shortest need
-    fixed = [float((library.motions(y, 8.0, 4, "DOP853 fixed", x)[0] - exact).abs().max()) for x in (2, 4)]
+    fixed = [
+        float((rivals.Motions(library, y, 8.0, 4, "DOP853 fixed", x).made()[0] - exact).abs().max()) for x in (2, 4)
+    ]
     assert math.log2(fixed[0] / fixed[1]) > 7.5
 
 
@@ -72,7 +74,7 @@ def test_a_network_in_c_is_the_network(layers):
     k2 = rhs(y + h / 2 * k1)
     k3 = rhs(y + h / 2 * k2)
     wanted = y + h / 6 * (k1 + 2 * (k2 + k3) + rhs(y + h * k3))
-    q, count = library.motions(y, h, 1, "RK4", 1)
+    q, count = rivals.Motions(library, y, h, 1, "RK4", 1).made()
     assert count == 20
     assert float((q[:, 0] - wanted[:, :n]).abs().max()) < 1e-6
 
@@ -132,10 +134,10 @@ def test_the_learned_equation_is_that_of_the_model():
     start = State(q, p, torch.zeros(1).double())
     torch.testing.assert_close(rivals._velocity(found, start), v, rtol=1e-3, atol=1e-3)
     library = rivals.Native("double_pendulum", "float64", dof=2, constants=found)
-    wanted, _ = library.motions(torch.cat([q, v], -1), 0.1, 1, "RK4", 100)
+    wanted, _ = rivals.Motions(library, torch.cat([q, v], -1), 0.1, 1, "RK4", 100).made()
     torch.testing.assert_close(out.q[:, -1], wanted[:, 0], rtol=0, atol=1e-4)
     plain = rivals.Native("double_pendulum", "float64", dof=2)
-    other, _ = plain.motions(torch.cat([q, v], -1), 0.1, 1, "RK4", 100)
+    other, _ = rivals.Motions(plain, torch.cat([q, v], -1), 0.1, 1, "RK4", 100).made()
     assert float((other - wanted).abs().max()) > 1e-3
 
 

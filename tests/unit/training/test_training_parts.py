@@ -8,7 +8,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.equation import _baseline
+from herglotz.training.equation import own_term
 from herglotz.training.quantities import DIMENSIONS, _unit, rounded
 from herglotz.training.structure import dictionary, start_of_features
 from herglotz.training.task import drag_starts_the_fit
@@ -95,7 +95,6 @@ def test_features_beside_other_settings_do_not_start_the_fit(settings):
 )
 def test_the_baseline_in_words(angle, power, in_L, in_force):
     # fails if L has +V, or the force +V′, or a factor 2 is lost between them
-    run = SimpleNamespace(data=SimpleNamespace(units=("m",), time_unit="s"))
     for newton, wanted in ((False, in_L), (True, in_force)):
-        _, what, _, parts = _baseline(run, ["x″"], newton, 0, "x", angle, power, ("k", 0, 3.0))  # type: ignore[arg-type]
-        assert (what, parts) == (wanted[0], [("k", 0, wanted[1])])
+        what, factor = own_term("x", angle, power, newton)
+        assert (what, 3.0 * factor) == wanted

@@ -49,6 +49,10 @@ class SegmentGrid:
         first = data.t[self.start_sample][:, None]
         return torch.cat([first, first + self.h.cumsum(1)], 1)
 
+    def at_samples(self, x: Tensor) -> Tensor:
+        """Values at the samples, (N, …) in their order, from those at every node, (S, K + 1, …)."""
+        return x.flatten(0, 1)[self.node[self.sample.argsort()]]
+
     def start_trajectory(self, data: Trajectories) -> Tensor:
         """Trajectory of every segment, (S,)."""
         return data.trajectory[self.start_sample]

@@ -156,7 +156,7 @@ class SmoothingProblem(StatesProblem):
                 P = partials(L_d, full[:, :-1, : self.n], full[:, 1:, : self.n], 0 * self.grid.h, self.grid.h)
             for k in range(self.grid.longest):  # L_d = L_d(s = 0) + (c − 1) s
                 full[:, k + 1, -1] = P.c[:, k] * full[:, k, -1] + P.L[:, k]
-        return full.flatten(0, 1)[self.node]
+        return self.grid.at_samples(full)
 
     def _stepped(self, x: Tensor) -> tuple[Tensor, Tensor] | None:
         """Φ̃ of every state but the last, and its derivative."""
