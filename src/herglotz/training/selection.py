@@ -21,8 +21,8 @@ from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
 from herglotz.training.fit import fit
-from herglotz.training.reading import reading_told
 from herglotz.training.run import Run
+from herglotz.training.run_folder import reading_told
 from herglotz.training.stages import Progress
 from herglotz.training.structure import structure_is_free, terms_are_free
 
