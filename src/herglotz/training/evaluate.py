@@ -63,6 +63,13 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
     return Run(fitted.model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
 
+def unseen_errors(run: Run) -> list[Tensor]:
+    """Errors of the free run over the unseen samples of each trajectory, (K, n); K is 0 where nothing was held out."""
+    error = run.prediction.detach() - run.data.unwrapped().q
+    rows = zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
+    return [error[first + trained : first + length] for first, length, trained in rows]
+
+
 def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
     """RMS error of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import torch
-
+from herglotz.training.evaluate import unseen_errors
 from herglotz.training.identifiability import PHYSICAL, WORDS
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
@@ -88,10 +87,4 @@ def _source(run: Run, i: int) -> tuple[str, str]:
 
 def held_out_rms(run: Run) -> list[list[float]]:
     """RMS of the free run over the unseen samples, [trajectory][coordinate]; NaN where nothing was held out."""
-    error = run.prediction.detach() - run.data.unwrapped().q
-    rows = zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
-    return [
-        torch.full((run.data.dof,), torch.nan).tolist() if trained == length
-        else error[first + trained : first + length].square().mean(0).sqrt().tolist()
-        for first, length, trained in rows
-    ]  # fmt: skip
+    return [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]  # the mean of nothing is NaN

@@ -20,6 +20,7 @@ from herglotz.models import LEVELS
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
+from herglotz.training.evaluate import unseen_errors
 from herglotz.training.fit import fit
 from herglotz.training.run import Run
 from herglotz.training.run_folder import reading_told
@@ -231,11 +232,7 @@ def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
 
 def block_errors(run: Run) -> Tensor:
     """RMS of the run's free prediction over each block of held-out time, (blocks,), in units of q; inf if it failed."""
-    error = run.prediction - run.data.unwrapped().q
-    held = [
-        error[first + trained : first + length]
-        for first, length, trained in zip(run.data.offsets, run.data.lengths, run.train_lengths, strict=True)
-    ]
+    held = unseen_errors(run)
     pieces = -(-BLOCKS // len(held))
     blocks = [part for x in held for part in x.tensor_split(min(pieces, len(x))) if len(part)]
     if not blocks:
