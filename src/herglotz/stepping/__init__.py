@@ -18,6 +18,7 @@ from herglotz.stepping.state import (
     Status as Status,
     Step as Step,
     StepError as StepError,
+    state_of as state_of,
     step_sizes as step_sizes,
 )
 from herglotz.stepping.stepper import Stepper as Stepper

@@ -47,12 +47,6 @@ class State(NamedTuple):
     p: Tensor  # (..., n) momentum
     s: Tensor  # (...) action variable
 
-    @classmethod
-    def of(cls, x: Tensor) -> State:
-        """The point whose numbers stand side by side, (..., 2n+1)."""
-        n = x.shape[-1] // 2
-        return cls(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
-
     @property
     def joined(self) -> Tensor:
         """All numbers side by side, (..., 2n+1)."""
@@ -62,6 +56,12 @@ class State(NamedTuple):
     def finite(self) -> Tensor:
         """(...) whether all numbers of a sample are finite."""
         return torch.isfinite(self.q).all(-1) & torch.isfinite(self.p).all(-1) & torch.isfinite(self.s)
+
+
+def state_of(x: Tensor) -> State:
+    """The point whose numbers stand side by side, (..., 2n+1)."""
+    n = x.shape[-1] // 2
+    return State(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
 
 
 @dataclass(frozen=True)

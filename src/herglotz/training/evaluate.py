@@ -15,7 +15,7 @@ import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.config import FitConfig
 from herglotz.training.free_run import states_everywhere
 from herglotz.training.look import Look
@@ -58,7 +58,7 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
             "python": platform.python_version(),
         },
     }
-    box = box_of(*State.of(fitted.states))
+    box = box_of(*state_of(fitted.states))
     h = train.typical_step / config.substeps
     return Run(fitted.model, told, metrics, data, train.lengths, states, h, box, task.stages.history)
 
@@ -91,7 +91,7 @@ def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tenso
         before = run - 1
         inputs, h = None if u is None else u[before], train.t[run] - train.t[before]
         with torch.no_grad():
-            found = Stepper(fitted.model).rollout(*State.of(out[run[0] - 1]), h=h, inputs=inputs)
+            found = Stepper(fitted.model).rollout(*state_of(out[run[0] - 1]), h=h, inputs=inputs)
         out[run] = found.states.joined[1:]
     return out
 

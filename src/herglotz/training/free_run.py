@@ -7,7 +7,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
@@ -29,11 +29,11 @@ def states_everywhere(
     trained = torch.arange(data.samples) < ends[data.trajectory.cpu()]
     out[trained] = fitted.states
     if bool(trained.all()):
-        return State.of(out), "ok"
+        return state_of(out), "ok"
     found, status = _at_once(fitted, data, out, ends, max_step), "ok"
     if found is None:
         found, status = _stepped(fitted, data, out, ends, max_step)
-    return State.of(found), status
+    return state_of(found), status
 
 
 def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> Tensor | None:
@@ -90,7 +90,7 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
 
     def stepped(part: slice) -> Tensor:
         inputs = None if u is None else u[:, part]
-        return Stepper(model).rollout(*State.of(x[:, -1]), h=h[:, part], inputs=inputs).states.joined
+        return Stepper(model).rollout(*state_of(x[:, -1]), h=h[:, part], inputs=inputs).states.joined
 
     with torch.no_grad():
         while k < h.shape[1]:
@@ -110,7 +110,7 @@ def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_
         h, stops, row, part = _fine_steps(data.t[end - 1 : first + length], max_step)
         inputs = data.inputs_of_steps(end - 1 + row, part) if driven else None
         with torch.no_grad():
-            run = stepper.rollout(*State.of(out[end - 1]), h=h, inputs=inputs)
+            run = stepper.rollout(*state_of(out[end - 1]), h=h, inputs=inputs)
         out[end : first + length] = run.states.joined[stops]
         if not bool(run.ok.all()):
             status = f"a step failed after t = {float(data.t[end - 1]):g}; nothing is predicted beyond it"

@@ -17,7 +17,7 @@ from herglotz.data.sensors import measured
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import State, Stepper, state_of
 from herglotz.threads import one_thread
 from herglotz.training.fitted_run import FittedRun
 from herglotz.training.free_run import near_data
@@ -180,7 +180,7 @@ def predict(
     h = grid.h[inside]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    found = Prediction(data, State.of(states), warmup, every, most, outside, zeros[best])
+    found = Prediction(data, state_of(states), warmup, every, most, outside, zeros[best])
     return replace(found, beyond=_beyond(run.box, found))
 
 
@@ -300,7 +300,7 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     if nodes is None:
         with torch.no_grad():
             inputs = None if u is None else u[known]
-            out = stepper.rollout(*State.of(start[known]), h=grid.h[known], inputs=inputs)
+            out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)
         nodes = states.new_full((len(spans), grid.longest + 1, states.shape[-1]), torch.nan)
         nodes[known] = out.states.joined
     states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]

@@ -13,7 +13,7 @@ from herglotz.data.smoothing import smoothed
 from herglotz.data.trajectories import GAP
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State
+from herglotz.stepping import State, state_of
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
 from herglotz.training.first_states import first_states
 from herglotz.training.problems.grid import segment_grid
@@ -65,7 +65,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     std = torch.zeros_like(found)
     _, matrix, _ = problem.normal_equations(x, held=True)
     std[:, : problem.d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
-    return Smoothed(*(State.of(y) for y in (found, std)))
+    return Smoothed(*(state_of(y) for y in (found, std)))
 
 
 def smoothed_states(problem: SmoothingProblem) -> tuple[Tensor, float] | None:

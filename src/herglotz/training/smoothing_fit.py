@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper, state_of
 from herglotz.stepping.block_tridiagonal import diagonal_of_inverse
 from herglotz.training.cross_validation import Chosen, left_out_errors, strongest_not_beaten, without_rows
 from herglotz.training.problems.grid import segment_grid
@@ -51,7 +51,7 @@ class SmoothingFit:
     def follows_data(self) -> bool:
         """Whether free runs from the first states stay within a factor of the noise: whether the model is enough."""
         problem, states = self.problem, self.problem.unpack(self.x)[1]
-        start = State.of(problem.with_s(states[:, 0]))
+        start = state_of(problem.with_s(states[:, 0]))
         with torch.no_grad():
             stepper = Stepper(problem.parameters.at(self.theta))
             out = stepper.rollout(*start, h=problem.grid.h, inputs=problem.u)

@@ -25,7 +25,7 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.data.spikes import without
 from herglotz.data.units import common_unit, size
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper, state_of
 from herglotz.training.foresight import Foresight, foresee
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
@@ -47,7 +47,7 @@ STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a w
 def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories) -> Tensor:
     """Errors of free runs over windows of 20 recorded steps from states (N, 2n+1) at the samples, (N', n)."""
     grid = segment_grid(data, FIRST_SEGMENT, task.base.model_step)
-    start, u = State.of(states[grid.start_sample]), step_inputs(fitted.model, data, grid)
+    start, u = state_of(states[grid.start_sample]), step_inputs(fitted.model, data, grid)
     with torch.no_grad():
         out = Stepper(fitted.model).rollout(*start, h=grid.h, inputs=u)
     return out.q.flatten(0, 1)[grid.node] - data.q[grid.sample]

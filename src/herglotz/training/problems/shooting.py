@@ -20,7 +20,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
-from herglotz.stepping import State, Stepper
+from herglotz.stepping import Stepper, state_of
 from herglotz.training.distributed import everywhere
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
@@ -110,7 +110,7 @@ class ShootingProblem(StatesProblem):
             if self.path is not None:
                 path = solve_path(L_d, start, self.grid.h, self._guess(x, self.path), tol)
             if path is None and (self.path is None or self.patient):  # no trajectory near by to start from
-                out = Stepper(L_d).rollout(*State.of(start), h=self.grid.h, inputs=self.u)
+                out = Stepper(L_d).rollout(*state_of(start), h=self.grid.h, inputs=self.u)
                 if bool(out.ok.all()):
                     path = solve_path(L_d, start, self.grid.h, out.states.joined, tol)
         self._solved = x.clone(), path
