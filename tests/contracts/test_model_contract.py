@@ -194,7 +194,7 @@ def test_the_step_equation_equals_that_of_the_partials(settings, dtype, tol, tra
         L_d = model.at(u)
     for increments, step in ((False, h), (True, h[0])):
         x = q1 - q0 if increments else q1
-        twin = PartialsEquation(L_d, q0, p0, s0, step, 1, increments)
+        twin = PartialsEquation(L_d, State(q0, p0, s0), step, 1, increments)
         own = known.at(State(q0, p0, s0), step, u, increments)
         for second in (True, False):
             a, b = own(x, second), twin(x, second)

@@ -36,7 +36,7 @@ class Terms:
         u = inputs[0] if inputs else None
         self.equation: StepOfModel | PartialsEquation
         if maker is None:
-            self.equation = PartialsEquation(driven_by(model, u), *state, h, 1, increments=True)
+            self.equation = PartialsEquation(driven_by(model, u), state, h, 1, increments=True)
         else:
             self.equation = maker.at(state, h, u, True, Field(*here))
 

@@ -124,7 +124,7 @@ class StepParts:
 
     def _by_jets(self, state: State, h: Tensor, ends: Ends, delta: Tensor, x: Tensor, u: Tensor | None) -> Parts:
         with self._given(ends):
-            form = PartialsEquation(driven_by(self.model, u), *state, h, 1, increments=True)
+            form = PartialsEquation(driven_by(self.model, u), state, h, 1, increments=True)
             point = form(delta, True)
         end = form.end(delta, point)
         dp = (end.p1 + point.F) - state.p  # as F is not quite 0
@@ -134,7 +134,7 @@ class StepParts:
 
     def _by_sticking(self, state: State, h: Tensor, ends: Ends, delta: Tensor, x: Tensor, u: Tensor | None) -> Parts:
         with self._given(ends):
-            equation = PartialsEquation(driven_by(self.model, u), *state, h, 1, increments=True)
+            equation = PartialsEquation(driven_by(self.model, u), state, h, 1, increments=True)
             guess, stiffness, bound = at_rest(equation)
             form = StickSlip(equation, stiffness, bound)
             point = form(delta, True)

@@ -129,6 +129,16 @@ class _Here(NamedTuple):
     residual: Number  # |J⁻¹F|
 
 
+def _moved(here: _Here, trial: _Here, accept: Number, refused: bool, alone: bool) -> tuple[_Here, bool]:
+    """The trial of each sample that accepts it, and whether the point is that of no one trial."""
+    if not refused:  # a done sample's trial is its own x: nothing to select
+        return trial, False
+    if alone:
+        return here, False
+    values = (select(accept, new, old) for new, old in zip(trial[2:], here[2:], strict=True))
+    return _Here(select(accept, trial.x, here.x), here.point, *values), True
+
+
 def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: bool = False) -> Found:
     """Iterate from x (..., m), all samples at once.
 
@@ -161,12 +171,7 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
         going = going & _not(settled | stalled)
         if rules.natural:  # this test may accept a trial where J is singular
             going = going & _not(accept & _not(trial.residual < inf))
-        mixed = not alone and _any(refused)
-        if not _any(refused):  # a done sample's trial is its own x: nothing to select
-            here = trial
-        elif not alone:  # the point is that of no sample
-            values = (select(accept, new, old) for new, old in zip(trial[2:], here[2:], strict=True))
-            here = _Here(select(accept, trial.x, here.x), here.point, *values)
+        here, mixed = _moved(here, trial, accept, _any(refused), alone)
         if fraction is not None or _any(refused):
             fraction = _next(fraction, accept, rules.natural, like=here.merit)
             going = going & (fraction >= rules.shortest)

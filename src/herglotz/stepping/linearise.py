@@ -58,13 +58,13 @@ def step_functions(L_d: DiscreteLagrangian) -> StepFunctions:
     def functions(
         q: Tensor, p: Tensor, s: Tensor, h: Tensor, delta: Tensor, u: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        maker = model_equation(L_d, fold=False)
+        state, maker = State(q, p, s), model_equation(L_d, fold=False)
         if maker is not None:
-            form = maker.at(State(q, p, s), h, u, True)
+            form = maker.at(state, h, u, True)
             x = delta
         else:
             increments = hasattr(L_d, "partials_increment")
-            form = PartialsEquation(driven_by(L_d, u), q, p, s, h, 1, increments)
+            form = PartialsEquation(driven_by(L_d, u), state, h, 1, increments)
             x = delta if increments else q + delta
         point = form(x, False)
         end, F = form.end(x, point), point.F

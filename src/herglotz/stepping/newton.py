@@ -13,7 +13,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
-from herglotz.stepping.state import Status
+from herglotz.stepping.state import State, Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
 
 ROUNDING = 1e3  # machine epsilons of the size: below that a move is rounding
@@ -68,7 +68,7 @@ def solve_step(
     """
     if increments and not isinstance(L_d, Increments):
         raise InputError("this L_d has no partials_increment; leave increments=False, or use a model or a rule with it")
-    equation = PartialsEquation(L_d, q0, p0, s0, h, order, increments)
+    equation = PartialsEquation(L_d, State(q0, p0, s0), h, order, increments)
     found = find_root(equation, guess, tol, max_iterations, order)
     P = found.point.rest
     status, _ = status_of(found, End(P.D2, P.L, P.c))

@@ -16,6 +16,7 @@ from herglotz.mechanics import (
     partials,
 )
 from herglotz.mechanics.newton import Point
+from herglotz.stepping.state import State
 
 
 class End(NamedTuple):
@@ -53,11 +54,9 @@ class StepEquation(Protocol):
 class PartialsEquation:
     """The step equation of any L_d; `rest` holds its partials."""
 
-    def __init__(
-        self, L_d: DiscreteLagrangian, q0: Tensor, p0: Tensor, s0: Tensor, h: Tensor, order: int, increments: bool
-    ):
-        self.L_d, self.q0, self.p0, self.s0, self.h = L_d, q0, p0, s0, h
-        self.order, self.increments = order, increments
+    def __init__(self, L_d: DiscreteLagrangian, state: State, h: Tensor, order: int, increments: bool):
+        self.L_d, self.h, self.order, self.increments = L_d, h, order, increments
+        self.q0, self.p0, self.s0 = state
 
     def __call__(self, x: Tensor, second: bool) -> Point:
         """See `StepEquation`."""

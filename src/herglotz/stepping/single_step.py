@@ -116,7 +116,7 @@ class SingleStep:
         if not self._tried:
             self._tried, self._terms = True, model_equation(self.L_d)
         if self._terms is None:
-            return PartialsEquation(L_d, *state, h, order, increments)
+            return PartialsEquation(L_d, state, h, order, increments)
         return self._terms.at(state, h, u, increments, self._field if self._at is state.q else None)
 
 

@@ -45,7 +45,7 @@ class FlowProblem:
     def residuals(self, theta: Tensor) -> Tensor:
         """Return the residuals, (T, 2n + 1), in units of q."""
         with torch.no_grad():
-            return self._local(theta, *self.before, *self.after)
+            return self._local(theta, self.before, self.after)
 
     def cost(self, x: Tensor) -> Tensor:
         """Return ½ Σ |r|²/σ² + prior."""
@@ -54,15 +54,16 @@ class FlowProblem:
     def normal_equations(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Return (cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
         cost, A, b = self.prior.normal_equations(x)
-        slopes = vmap(jacrev(lambda *x: (r := self._local(*x), r), has_aux=True), (None, *(0,) * 6))
+        slopes = vmap(jacrev(lambda *x: (r := self._local(*x), r), has_aux=True), (None, 0, 0))
         for part in torch.arange(len(self.before.s)).split(self.chunk):
-            pair = [y[part] for y in (*self.before, *self.after)]
+            pair = (State(*(y[part] for y in one)) for one in (self.before, self.after))
             J, r = slopes(x, *pair)
             J, r = J.reshape(-1, len(x)) / self.sigma, r.reshape(-1) / self.sigma
             cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
         return cost, A, b
 
-    def _local(self, theta: Tensor, q0: Tensor, p0: Tensor, s0: Tensor, q1: Tensor, p1: Tensor, s1: Tensor) -> Tensor:
+    def _local(self, theta: Tensor, before: State, after: State) -> Tensor:
+        (q0, p0, s0), (q1, p1, s1) = before, after
         P = self.parameters.partials(theta, q0, q1, s0, self.h, 2)
         J = momentum_jacobian(P, p0)
         action = (s0 + P.L - s1) / self.momentum

@@ -21,7 +21,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.mechanics.legendre import soft_threshold
-from herglotz.stepping import Status, solve, solve_step
+from herglotz.stepping import State, Status, solve, solve_step
 from herglotz.stepping.partials_equation import PartialsEquation
 from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
@@ -141,7 +141,7 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0, q1 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n], x[:, 1:, :n]
     if L_d.capabilities.sticking:
-        rest = at_rest(PartialsEquation(L_d, q0, p0, s0, h, 2, increments=False))
+        rest = at_rest(PartialsEquation(L_d, State(q0, p0, s0), h, 2, increments=False))
         delta = soft_threshold(rest.start, rest.bound)
         q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
     P = partials(L_d, q0, q1, s0, h, order=2)
