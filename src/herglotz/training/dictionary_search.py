@@ -24,13 +24,11 @@ from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.found_terms import Found, gain
-from herglotz.training.linear_terms import LinearStart, linear_starts
+from herglotz.training.linear_terms import LinearStart, starts_of
 from herglotz.training.named_terms import (
     DRY,
     NamedTerms,
     candidates,
-    central,
-    chains,
     loads,
     offered,
     own_terms,
@@ -127,13 +125,12 @@ class DictionarySearch:
         bare = self._grown(*self._bare(), 1, start) if self.coarse and self.data.dof == 1 else None
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
-        families = (self.all, *(replace(self.all.only(x.names), apart=x.apart) for x in chains(self.data)))
-        linear = linear_starts(self.data, self.base, families, local, central(self.data, self.all))
+        linear = starts_of(self.data, self.base, self.all, local)
         grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
             bare = self._grown(*self._bare(), 1, start)
-        if bare is not None and (found is None or (bare.whole >= found.whole and bare.rms < found.rms)):
+        if bare is not None and bare.misses_less(found):
             found, linear = bare, []
         return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[at:])
 
@@ -236,8 +233,9 @@ class DictionarySearch:
         stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
-        lost = first is None or not first.noise < self.spread
-        return None if lost else self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
+        if first is None or not first.noise < self.spread:
+            return None
+        return self._found(terms, stages, stages.grow(first, max(first.noise, self.floor)))
 
     def _longer(self, found: Found) -> Found:
         """The same terms over longer segments, where the model follows the data now."""

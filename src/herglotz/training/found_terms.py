@@ -109,6 +109,10 @@ class Found:
         """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""
         return self.rms <= 2**0.5 * max(other.rms, floor) and not self.beaten_by(other, floor)
 
+    def misses_less(self, other: Found | None) -> bool:
+        """Whether it misses less than the other one, if there is any, over segments that are as long."""
+        return other is None or (self.whole >= other.whole and self.rms < other.rms)
+
     def instead_of(self, other: Found, floor: float) -> bool:
         """Whether these terms, which are fewer, take the place of the other ones.
 

@@ -17,7 +17,7 @@ from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.linear_start import LinearFit, NamedForces
-from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, holders, own_terms
+from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
 from herglotz.training.pruning import prune
 
 ROWS = 4000  # triples in the linear problem
@@ -38,6 +38,12 @@ class LinearStart(NamedTuple):
         """Its terms, and those without dry friction that drives every joint, where no step may be solved with it."""
         pushes = self.terms.dry and max(self.values[DRY]) <= 0
         return [self.terms, replace(self.terms, dry=False)] if pushes else [self.terms]
+
+
+def starts_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> list[LinearStart]:
+    """`linear_starts` of all candidates, of the fewer terms of chains of joints, and of one power of the distance."""
+    families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
+    return linear_starts(data, base, families, local, central(data, every))
 
 
 def linear_starts(

@@ -144,7 +144,7 @@ def test_peers_recover_a_pendulum(pendulum, noisy):
 def test_the_true_equation_is_fitted_where_a_joint_sticks():
     # fails if the fit gives up while slopes hold over shorter ways than its steps, and the true numbers count as fitted
     axis = Mechanism("axis", 1, {"o0": 0.04, "d0": 0.24, "c0": 0.11, "b": 1.4})
-    rng, t = np.random.default_rng(0), 2 * np.pi / 76 * np.arange(120)
+    rng, t = np.random.default_rng(0), 2 * np.pi / 76 * np.arange(120, dtype=np.float64)
     u = np.stack([np.sin(w * t + 6 * rng.random()) for w in rng.uniform(0.3, 1.0, 10)])
     q = roll(MechanismModel(axis), np.zeros((10, 1)), np.zeros((10, 1)), t, u)
     sigma = 0.02 * q.std()

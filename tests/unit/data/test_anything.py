@@ -43,7 +43,8 @@ def test_no_inputs_means_none(tmp_path):  # fails if inputs=() of a file is forg
     assert as_trajectories(tmp_path / "a.csv").u is not None
     for data in (tmp_path / "a.csv", {"t": T, "x": Q[:, 0], "force": Q[:, 1]}):
         assert as_trajectories(data, inputs=()).u is None
-        assert as_trajectories(data, coordinates=np.array(["x"]), inputs=np.array(["force"])).names == ("x",)
+        x, force = (np.array([name]) for name in ("x", "force"))  # as pandas' columns are
+        assert as_trajectories(data, coordinates=x, inputs=force).names == ("x",)  # pyright: ignore[reportArgumentType]
 
 
 def test_angles_are_continuous():  # fails if an array's angle keeps a jump of 2π, which would read as a motion

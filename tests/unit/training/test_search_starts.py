@@ -67,15 +67,14 @@ def test_fewer_terms_stand_in_for_more(coloured, whole, good, likely, taken):
 def test_a_model_without_terms_has_to_miss_less(monkeypatch, whole, rms, bare_whole, bare_rms, kept):
     # fails if an overdamped model that misses by a quarter of the motion takes the place of one that is lost late
     fits = {"found": stub(whole=whole, rms=rms, coloured=True), "bare": stub(whole=bare_whole, rms=bare_rms)}
+    fits["bare"].misses_less = lambda other: Found.misses_less(fits["bare"], other)
     search: Any = object.__new__(DictionarySearch)
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=1), None, None
     search._grown = lambda terms, *_: fits[terms]
     search._bare = lambda: ("bare", {})
     search._simpler = search._held = search._finer = lambda found: found
     start = stub(terms="found", values={}, ways=["found"])
-    monkeypatch.setattr(dictionary_search, "linear_starts", lambda *_: [start])
-    monkeypatch.setattr(dictionary_search, "chains", lambda _: [])
-    monkeypatch.setattr(dictionary_search, "central", lambda *_: [])
+    monkeypatch.setattr(dictionary_search, "starts_of", lambda *_: [start])
     assert search._first(None, None)[0] is fits[kept]
 
 
@@ -88,9 +87,7 @@ def test_the_next_family_follows_one_that_cannot_be_stepped(monkeypatch):
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=2), None, None
     search._grown = lambda terms, *_: {"c": found, "d": found}.get(terms)
     search._simpler = search._held = search._finer = lambda found: found
-    monkeypatch.setattr(dictionary_search, "linear_starts", lambda *_: families)
-    monkeypatch.setattr(dictionary_search, "chains", lambda _: [])
-    monkeypatch.setattr(dictionary_search, "central", lambda *_: [])
+    monkeypatch.setattr(dictionary_search, "starts_of", lambda *_: families)
     assert search._first(None, None) == (found, families[2:])
 
 
