@@ -49,7 +49,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
     if (fewer := _without_terms(seen)) is not None:
         bare = stages.keep("held out, no terms", lambda: _held_out(fewer, config, choose(fewer, config)))
         if bare["rms"] <= min(MARGIN * first["rms"], FOLLOWS * _spread(seen)):
-            seen, first, named = fewer, bare, choose(fewer, config)
+            seen, first, named = _going_on(fewer, bare), bare, choose(_going_on(fewer, bare), config)
     other = look(data, config, _of(stages, seen.zeros), named=False, zeros=seen.zeros)
     other = replace(other, apart=seen.apart) if seen.apart else other
     networks = choose(other, config)
@@ -60,10 +60,10 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
     if first["rms"] <= MARGIN * second["rms"]:
         return seen, _reasoned(named, why)
     if networks.objective == "trajectory" and "departure" in second:
-        start = {name: tuple(values) for name, values in second["start"].items()}
+        other = _going_on(other, second)
         networks = replace(
-            networks, start={**networks.start, **start}, sigma=second["sigma"], departures=(second["departure"],),
-            fitted_before=True,
+            networks, start={**networks.start, **other.base.start}, sigma=second["sigma"],
+            departures=(second["departure"],), fitted_before=True,
             reasons={**networks.reasons, "fitted_before": "to three quarters of the training part"},
         )  # fmt: skip
     return other, _reasoned(networks, why)
@@ -113,6 +113,12 @@ def _without_terms(seen: Look) -> Look | None:
     )
 
 
+def _going_on(seen: Look, found: dict[str, Any]) -> Look:
+    """From the parameters that were fitted to the first part."""
+    start = {name: tuple(values) for name, values in found["start"].items()}
+    return replace(seen, base=replace(seen.base, start={**seen.base.start, **start}))
+
+
 def _both(found: dict[str, Any], seen: Look) -> float:
     """Geometric mean of both errors over held-out time; a free run that is lost, as of chaos, misses by the spread."""
     return (found["windows"] * min(found["rms"], _spread(seen))) ** 0.5
@@ -150,7 +156,6 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
     if config.find_zeros and plan.network == "none" and inside.unseen is not None:
         error = unseen_window_errors(task, fitted, inside.unseen) / inside.train.balance
         found["windows"] = float(error.square().mean().sqrt())
-    if fitted.notes.get("departure") is not None:
-        values = {name: tuple(x.detach().reshape(-1).tolist()) for name, x in fitted.model.named_parameters()}
-        found |= {"departure": fitted.notes["departure"], "start": values}
-    return found
+    found["start"] = {name: x.detach().reshape(-1).tolist() for name, x in fitted.model.named_parameters()}
+    departure = fitted.notes.get("departure")
+    return found if departure is None else found | {"departure": departure}

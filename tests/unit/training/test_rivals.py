@@ -48,12 +48,17 @@ def held(monkeypatch):
         looks.append((named, zeros))
         return SimpleNamespace(name="networks")
 
+    def going_on(seen, found):
+        start = {name: tuple(values) for name, values in found.get("start", {}).items()}
+        return SimpleNamespace(**{**vars(seen), "base": SimpleNamespace(start=start)})
+
     def held_out(seen, config, plan, every=1):  # noqa: ARG001
         return errors["bare" if seen.name == "bare" else plan.network]
 
     monkeypatch.setattr(rivals, "look", look)
     monkeypatch.setattr(rivals, "choose", lambda seen, _: plan("potential" if seen.name == "networks" else "none"))
     monkeypatch.setattr(rivals, "_held_out", held_out)
+    monkeypatch.setattr(rivals, "_going_on", going_on)
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=NOISE, seed=0)
     found = SimpleNamespace(doubt=True, apart=False)
     seen = SimpleNamespace(name="named", kept=data, train=data, found=found, zeros=(), apart="", settings=FitConfig())
@@ -88,6 +93,7 @@ def test_the_smaller_error_wins_and_networks_go_on_from_their_fit(held):
     second = {"rms": 3 * NOISE, "sigma": NOISE, "departure": 6e-3, "start": values}
     seen, chosen = held.winner({"rms": 5 * NOISE, "sigma": NOISE}, second)
     assert (seen.name, chosen.network) == ("networks", "potential")
+    assert seen.base.start == values  # fails if the last fit starts from the first look all the same
     assert chosen.fitted_before
     assert chosen.departures == (6e-3,)
     assert chosen.sigma == NOISE
@@ -108,7 +114,10 @@ def test_terms_that_lower_the_error_of_free_runs_by_too_little_go(held, named, b
     # fails if terms that go on with the disturbances of a motor axis stay: 7.0 mm over its last quarter, 5.8 without;
     # or if they go where both free runs are lost: the pendulum of a motor that swings up had no weight left
     errors = {"rms": named, "sigma": NOISE}, {"rms": 2.0 * named, "sigma": NOISE}
-    assert held.winner(*errors, bare={"rms": bare, "sigma": NOISE})[0].name == kept
+    start = {"friction.coulomb": (0.2,)}
+    seen = held.winner(*errors, bare={"rms": bare, "sigma": NOISE, "start": start})[0]
+    assert seen.name == kept
+    assert kept == "named" or seen.base.start == start
 
 
 def test_what_is_left_without_terms_is_a_model_of_friction_and_inputs():
@@ -125,3 +134,16 @@ def test_what_is_left_without_terms_is_a_model_of_friction_and_inputs():
     assert rivals._without_terms(replace(seen, settings=FitConfig())) is None
     two: Any = Seen(Trajectories.of(data.t, data.q.repeat(1, 2)), config, base)
     assert rivals._without_terms(two) is None
+
+
+def test_the_last_fit_goes_on_from_the_first_part():
+    # fails if the parameters that were fitted to the first part are lost: a motor axis ended at 3.6 mm, and ends at 2.5
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=60, h=0.2, seed=0)
+    base = replace(estimate_baseline(data), start={"a": (1.0,), "b": (2.0,)})
+    seen: Any = Seen(data, FitConfig(), base)
+    assert rivals._going_on(seen, {"start": {"b": [3.0], "c": [4.0]}}).base.start == {
+        "a": (1.0,),
+        "b": (3.0,),
+        "c": (4.0,),
+    }
+    assert seen.base.start == {"a": (1.0,), "b": (2.0,)}
