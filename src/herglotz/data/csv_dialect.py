@@ -53,13 +53,19 @@ def in_commas(
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
     elif not any('"' in line for _, line in rows):
         return _without_empty_ends(rows), tuple(notes)
-    table = [(i, cells_of(line, separator)) for i, line in rows]
-    if any("," in cell for _, cells in table[1:] for cell in cells):
-        _check_decimals(path, table[1:])
+    points, changed = _with_points(path, [(i, cells_of(line, separator)) for i, line in rows[1:]])
+    if changed:
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
     names = ",".join(header_cells(rows[0][1], separator))
-    points = [(i, ",".join(cell.replace(",", ".") for cell in cells)) for i, cells in table[1:]]
     return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
+
+
+def _with_points(path: Path, table: Sequence[tuple[int, list[str]]]) -> tuple[Rows, bool]:
+    """Rows below the header with decimal points, and whether they had commas."""
+    commas = any("," in cell for _, cells in table for cell in cells)
+    if commas:
+        _check_decimals(path, table)
+    return [(i, ",".join(cell.replace(",", ".") for cell in cells)) for i, cells in table], commas
 
 
 def _without_empty_ends(rows: Rows) -> Rows:

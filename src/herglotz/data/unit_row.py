@@ -25,15 +25,17 @@ def with_units(
         If a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
     """
     units = [cell.strip("[]()<> ").removesuffix("-") for cell in below]
-    if (
-        len(units) != len(cells)
-        or any(is_number(unit) and unit != "1" for unit in units)
-        or not {"s", *PER_SECOND}.intersection(units)
-    ):
+    if len(units) != len(cells) or not {"s", *PER_SECOND}.intersection(units) or any(map(_is_sample, units)):
         return None
-    named = [(cell, unit, (name_and_unit(cell) or ("", ""))[1]) for cell, unit in zip(cells, units, strict=True)]
-    both = [f"{cell!r} and below it {unit!r}" for cell, unit, own in named if own and unit not in ("", own)]
+    own = [(name_and_unit(cell) or ("", ""))[1] for cell in cells]
+    named = list(zip(cells, units, own, strict=True))
+    both = [f"{cell!r} and below it {unit!r}" for cell, unit, told in named if told and unit not in ("", told)]
     refuse({f"{where}: two units of one column, {both and both[0]}; keep one of them": both})
-    found = [f"{cell}[{unit}]" if unit and not own else cell for cell, unit, own in named]
+    found = [f"{cell}[{unit}]" if unit and not told else cell for cell, unit, told in named]
     clock = assign(found, where, wanted).time
     return found if units[clock] in ("s", *PER_SECOND) else None
+
+
+def _is_sample(unit: str) -> bool:
+    """Whether a cell is a number, which 1 need not be: it is the unit of plain numbers."""
+    return is_number(unit) and unit != "1"
