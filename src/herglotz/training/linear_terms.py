@@ -110,16 +110,16 @@ class LinearTerms:
     def _regular(self, x: Tensor) -> Tensor:
         """With masses that turn with angles made smaller until no mass matrix of the data is nearly singular.
 
-        Smoothing may leave them too large, and no step is solved from there.
+        Smoothing may leave them too large, and no step is solved from there. Where it is not they, x stays.
         """
-        x, moving = x.clone(), torch.tensor([name == MOVING for name in self.fit.names])
+        less, moving = x.clone(), torch.tensor([name == MOVING for name in self.fit.names])
         for _ in range(SMALLER if bool(moving.any()) else 0):
-            M = -(self.fit.J @ x) * x[0].sign()
+            M = -(self.fit.J @ less) * x[0].sign()
             size = M.diagonal(dim1=-2, dim2=-1).abs().clamp_min(1e-300).sqrt()
             M = (M + M.mT) / 2 / size[:, :, None] / size[:, None, :]
-            if not bool(torch.isfinite(M).all()) or float(torch.linalg.eigvalsh(M).min()) > SINGULAR:
-                break
-            x[moving] *= 0.9
+            if bool(torch.isfinite(M).all()) and float(torch.linalg.eigvalsh(M).min()) > SINGULAR:
+                return less
+            less[moving] *= 0.9
         return x
 
     def _problem(self, local: LocalPolynomials) -> LinearFit:

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import asdict, replace
 from typing import Any
 
-from herglotz.data import Trajectories
+from herglotz.data import MIN_SAMPLES, Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision, sparsest
 from herglotz.schema import from_plain
 from herglotz.training.choose import choose
@@ -35,7 +35,9 @@ INNER = 0.75  # of the training part that rivals are fitted to
 
 def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
     """The plan whose free run over the last quarter of the training part errs less, with its look at the data."""
-    named = choose(seen, config)
+    named, shortest = choose(seen, config), min(seen.train.lengths)
+    if shortest - round(INNER * shortest) < MIN_SAMPLES:
+        return seen, _reasoned(named, f"{shortest} samples of a recording leave none to hold out")
     first = stages.keep("held out, named terms", lambda: _held_out(seen, config, named))
     if first["rms"] > AT_THE_NOISE * precision(seen.kept):
         seen, first = _aligned(data, config, stages, seen, first)
@@ -46,16 +48,18 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         )
     if seen.found is None or not seen.found.doubt:
         return seen, named
+    model = "named terms"
     if (fewer := _without_terms(seen)) is not None:
         bare = stages.keep("held out, no terms", lambda: _held_out(fewer, config, choose(fewer, config)))
-        if bare["rms"] <= min(MARGIN * first["rms"], FOLLOWS * _spread(seen)):
-            seen, first, named = _going_on(fewer, bare), bare, choose(_going_on(fewer, bare), config)
+        if bare["rms"] <= FOLLOWS * _spread(seen) and not bare["rms"] > MARGIN * first["rms"]:
+            seen, first, model = _going_on(fewer, bare), bare, "friction and inputs alone"
+            named = choose(seen, config)
     other = look(data, config, _of(stages, seen.zeros), named=False, zeros=seen.zeros)
     other = replace(other, apart=seen.apart) if seen.apart else other
     networks = choose(other, config)
     every = sparsest(seen.kept)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
-    why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with named terms, "
+    why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with {model}, "
     why += f"{second['rms']:.2g} with networks ({networks.objective})"
     if first["rms"] <= MARGIN * second["rms"]:
         return seen, _reasoned(named, why)
@@ -116,7 +120,8 @@ def _without_terms(seen: Look) -> Look | None:
 def _going_on(seen: Look, found: dict[str, Any]) -> Look:
     """From the parameters that were fitted to the first part."""
     start = {name: tuple(values) for name, values in found["start"].items()}
-    return replace(seen, base=replace(seen.base, start={**seen.base.start, **start}))
+    named = seen.found and seen.found._replace(sigma=found["sigma"])
+    return replace(seen, base=replace(seen.base, start={**seen.base.start, **start}), found=named)
 
 
 def _both(found: dict[str, Any], seen: Look) -> float:

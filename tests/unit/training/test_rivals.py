@@ -14,6 +14,7 @@ from herglotz.training.baseline import Baseline, estimate_baseline
 from herglotz.training.named_terms import DRAG, STILL
 from herglotz.training.plan import Plan
 from herglotz.training.stages import Stages
+from herglotz.training.structure import Structure
 
 NOISE = 0.01
 
@@ -26,6 +27,7 @@ class Seen:
     settings: FitConfig
     base: Baseline
     structure: str = ""
+    found: Structure | None = None
 
 
 def plan(network):
@@ -69,7 +71,7 @@ def held(monkeypatch):
         monkeypatch.setattr(rivals, "_without_terms", lambda _: None if bare is None else less)
         return rivals.held_out_winner(data, FitConfig(), Stages(False, None, "", resume=False), seen)  # type: ignore[arg-type]
 
-    return SimpleNamespace(winner=winner, looks=looks)
+    return SimpleNamespace(winner=winner, looks=looks, seen=seen)
 
 
 def test_named_terms_at_the_noise_have_no_rival(held):
@@ -109,15 +111,34 @@ def test_networks_that_err_more_lose(held, networks):
     assert chosen.departures == (2e-4, 6e-3)
 
 
-@pytest.mark.parametrize(("named", "bare", "kept"), [(0.1, 0.103, "bare"), (0.1, 0.107, "named"), (40, 30, "named")])
+@pytest.mark.parametrize(
+    ("named", "bare", "kept"),
+    [(0.1, 0.103, "bare"), (0.1, 0.107, "named"), (40, 30, "named"), (1.0, 0.6, "named"), (math.nan, 0.1, "bare")],
+)
 def test_terms_that_lower_the_error_of_free_runs_by_too_little_go(held, named, bare, kept):
     # fails if terms that go on with the disturbances of a motor axis stay: 7.0 mm over its last quarter, 5.8 without;
     # or if they go where both free runs are lost: the pendulum of a motor that swings up had no weight left
-    errors = {"rms": named, "sigma": NOISE}, {"rms": 2.0 * named, "sigma": NOISE}
+    errors = {"rms": named, "sigma": NOISE}, {"rms": 90.0, "sigma": NOISE}
     start = {"friction.coulomb": (0.2,)}
-    seen = held.winner(*errors, bare={"rms": bare, "sigma": NOISE, "start": start})[0]
+    seen, chosen = held.winner(*errors, bare={"rms": bare, "sigma": NOISE, "start": start})
     assert seen.name == kept
     assert kept == "named" or seen.base.start == start
+    assert ("friction and inputs alone" in chosen.reasons["objective"]) is (kept == "bare")
+
+
+def test_networks_are_compared_with_what_won_before(held):
+    # fails if they win over terms that are gone: 0.15 against 0.2, and 0.1 without terms
+    bare = {"rms": 0.1, "sigma": NOISE}
+    assert held.winner({"rms": 0.2, "sigma": NOISE}, {"rms": 0.15, "sigma": NOISE}, bare=bare)[0].name == "bare"
+
+
+def test_recordings_that_leave_nothing_to_hold_out_have_no_rivals(held):
+    # fails if the fit of 10 samples ends in a fraction that nobody set: its training part has 7, and
+    # of these 2 are left
+    held.seen.train = held.seen.train.thinned(9)  # 7 samples of each
+    seen, chosen = held.winner(None, None)
+    assert seen.name == "named"
+    assert "7 samples" in chosen.reasons["objective"]
 
 
 def test_what_is_left_without_terms_is_a_model_of_friction_and_inputs():
@@ -147,3 +168,7 @@ def test_the_last_fit_goes_on_from_the_first_part():
         "c": (4.0,),
     }
     assert seen.base.start == {"a": (1.0,), "b": (2.0,)}
+    seen = replace(seen, found=Structure(FitConfig(), base, "", sigma=1.0))
+    told = rivals._going_on(seen, {"sigma": 0.5, "start": {}}).found
+    assert told is not None  # fails if σ is still that of the terms that are gone
+    assert told.sigma == 0.5
