@@ -106,6 +106,10 @@ def test_unicode_text(tmp_path):  # fails if what spreadsheets call so, UTF-16 w
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            't,x\n0,"900"\n1,"950"\n2,"1,000"\n3,"1,050"\n',
+            r"row 4: '1,000' may be 1000 or 1\.000; write numbers without",
+        ),
         ('t,x\n0,"5,000.5"\n1,"6,000.5"\n2,"7,0.5"\n', r"row 2: '5,000.5' has a separator of thousands"),
         ("t;x\n0;1.250,5\n1;2,5\n2;3\n", r"row 2: '1.250,5' has a separator of thousands; write numbers without it"),
         ("t;x\n0;1,234,567\n1;2,5\n2;3\n", "row 2: '1,234,567' has a separator of thousands"),
@@ -118,6 +122,12 @@ def test_mistakes_say_what_to_do(tmp_path, text, message):
     # fails if thousands become decimals, a title is taken for the header, or milliseconds since 1970 for seconds
     with pytest.raises(InputError, match=message):
         load(written(tmp_path, text))
+
+
+def test_decimal_commas_of_three_digits(tmp_path):  # fails if commas that cannot be of thousands are refused
+    for one, value in (("0,250", 0.25), ("-1,25", -1.25), ("1234,500", 1234.5)):
+        data = load(written(tmp_path, f't,x\n0,"{one}"\n1,"1,250"\n2,"2,500"\n'))
+        assert data.q[:, 0].tolist() == [value, 1.25, 2.5]
 
 
 def test_a_comma_in_a_quoted_name(tmp_path):  # fails if one name becomes two columns, fast or row by row
