@@ -172,6 +172,19 @@ def test_clocks(kind, tmp_path, capsys):  # fails if nanoseconds are taken for s
         assert load(written(tmp_path, "time,x\n" + text)).t.tolist() == T.tolist()
 
 
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_clocks_with_a_unit(kind, tmp_path):  # fails if dates below t[ms] are divided by 1000, or the delay is not
+    clock = CLOCKS[kind]
+    data = as_trajectories({"t[ms]": clock, "x": X})
+    assert (data.t.tolist(), data.time_unit) == (T.tolist(), "s")
+    if kind == "durations":
+        return
+    text = "".join(f"{t},{x},1\n" for t, x in zip(map(str, clock), X, strict=True))
+    for header in ("t[ms],x,u\n", "t,x,u\nms,rad,N\n"):
+        data = load(written(tmp_path, "# delay: 4\n" + header + text))
+        assert (data.t.tolist(), data.time_unit, data.delay) == (T.tolist(), "s", 0.004)
+
+
 def test_dates_of_which_some_have_a_zone():  # fails if their difference, which is not known, is a traceback
     clock = [START + timedelta(seconds=1), *(START.replace(tzinfo=None) + timedelta(seconds=t) for t in (2, 3, 4))]
     with pytest.raises(InputError, match="not all with a time zone"):
