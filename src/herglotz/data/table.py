@@ -178,7 +178,7 @@ def in_dates(found: Trajectories, told: str = "date") -> Trajectories:
 
 
 def plain(x: Any, what: str = "numbers") -> np.ndarray:
-    """Values as an array, those that are masked as NaN; messages call them `what`.
+    """Values as an array, those that are masked or pandas' NA as NaN; messages call them `what`.
 
     Raises
     ------
@@ -187,6 +187,9 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
     """
     array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
+    if array.dtype.kind == "O" and any(gaps := [type(x).__name__ == "NAType" for x in array.flat]):
+        array = array.copy()  # the user's own
+        array.flat[np.flatnonzero(gaps)] = np.nan
     return array
 
 

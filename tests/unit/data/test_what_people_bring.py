@@ -198,6 +198,30 @@ def test_a_missing_date_has_its_row():  # fails if NaT reads as a time that does
         as_trajectories({"t": clock, "x": X})
 
 
+class NAType:
+    """As pandas.NA: a comparison with it is neither true nor false."""
+
+    def __ne__(self, other):
+        return self
+
+    def __bool__(self):
+        raise TypeError("boolean value of NA is ambiguous")
+
+
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_gap_of_pandas(at):  # fails if NA is a traceback, or is written over in the user's own array
+    x = np.array(X, dtype=object)
+    x[at] = NAType()
+    rest = np.delete(X, at).tolist()
+    for data in (as_trajectories({"t": T, "x": x}), as_trajectories(x, h=0.5)):
+        assert data.q[:, 0].tolist() == rest
+    assert isinstance(x[at], NAType)
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
+    frame.loc[at, "x"] = pandas.NA
+    assert as_trajectories(frame).q[:, 0].tolist() == rest
+
+
 def test_masked_and_complex_numbers():  # fails if what numpy hides or drops becomes data
     mask = np.ma.masked_array(X, X > 5)
     for data in (as_trajectories(mask, h=0.5), as_trajectories({"t": T, "x": mask})):
