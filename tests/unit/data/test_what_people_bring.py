@@ -239,6 +239,15 @@ def test_arrays_that_are_tables_or_transposed():  # fails if fields are refused,
         as_trajectories(X[None], h=0.5)
 
 
+def test_many_coordinates_that_are_named():  # fails if a chain of 100 masses, recorded shortly, cannot be given at all
+    chain, names = np.random.default_rng(0).normal(size=(20, 100)), [f"x{k}[m]" for k in range(100)]
+    data = as_trajectories(chain, h=0.1, coordinates=names)
+    assert (data.q.tolist(), data.units) == (chain.tolist(), ("m",) * 100)
+    for some in (None, names[:20]):
+        with pytest.raises(InputError, match="or name every coordinate with coordinates="):
+            as_trajectories(chain, h=0.1, coordinates=some)
+
+
 def test_a_text_among_numbers_has_its_row():  # fails if a column of a table is refused without the place
     with pytest.raises(InputError, match="row 3, column 'x': could not convert string to float: 'broken'"):
         as_trajectories({"t": T, "x": np.array([*map(str, X[:3]), "broken", "4", "5"], dtype=object)})
