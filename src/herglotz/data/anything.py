@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
-from herglotz.data.csv_columns import Names, Wanted, name_and_unit
+from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, without
 from herglotz.data.readers import angles_like, load
@@ -161,8 +161,10 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     timeless = "positions without times: give h, the time between two samples, or time, an array of times"
     refuse({
         timeless: (h is None) == (time is None),
-        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, or give a "
-        "list of recordings": q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1],
+        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
+        "of recordings, or name every coordinate with coordinates=": (
+            q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1] != len(as_names(called or ()))
+        ),
     })  # fmt: skip
     if names["group"] is not None or names["drop"]:
         raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
@@ -182,7 +184,7 @@ def _labels(called: Names | None) -> dict[str, Any]:
     """What names of coordinates say, as cells of a header do: `x[m]` is x, in m. Nothing where there are none."""
     if called is None:
         return {}
-    heads = [name_and_unit(name) for name in ((called,) if isinstance(called, str) else called)]
+    heads = [name_and_unit(name) for name in as_names(called)]
     refuse({f"{called!r} names no coordinate; write name or name[unit]": None in heads})
     names, units = zip(*(head for head in heads if head), strict=True)
     units = tuple(unit or "1" for unit in units)

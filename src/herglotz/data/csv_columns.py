@@ -51,7 +51,7 @@ class Wanted:
         """The role that the user gives to this column; None where the user says nothing."""
         given = (("time", self.time), ("trajectory", self.group), ("dropped", self.drop), ("q", self.coordinates))
         for role, wanted in (*given, ("input", self.inputs)):
-            if name in _several(wanted or ()):
+            if name in as_names(wanted or ()):
                 return role
         return None
 
@@ -62,7 +62,7 @@ class Wanted:
     def names(self) -> tuple[str, ...]:
         """All columns that the user names."""
         every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
-        return tuple(name for wanted in every if wanted for name in _several(wanted))
+        return tuple(name for wanted in every if wanted for name in as_names(wanted))
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
         """The same with the name of each column that is given as its whole cell, `x (m)`."""
@@ -70,7 +70,7 @@ class Wanted:
         called = {cell: name for cell, name in zip(cells, names, strict=True) if cell not in every}
 
         def named(wanted: Names | None) -> Any:
-            of = [called.get(name, name) for name in _several(wanted or ())]
+            of = [called.get(name, name) for name in as_names(wanted or ())]
             return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
 
         who = ("time", "group", "drop", "coordinates", "inputs")
@@ -140,7 +140,7 @@ def assign(
     clock = _clock(where, names, roles["time"])
     u = wanted.in_order(roles["input"], names)
     q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
-    q = q if wanted.coordinates is None else tuple(place[x] for x in _several(wanted.coordinates))
+    q = q if wanted.coordinates is None else tuple(place[x] for x in as_names(wanted.coordinates))
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
@@ -160,7 +160,8 @@ def _remedy(names: Sequence[str], rates: list[int]) -> str:
     return f"{which} look like rates: choose with --coordinates NAMES (coordinates= in Python)"
 
 
-def _several(names: Names) -> Sequence[str]:
+def as_names(names: Names) -> Sequence[str]:
+    """Names, of which one may be given by itself."""
     return (names,) if isinstance(names, str) else names
 
 

@@ -15,6 +15,7 @@ from herglotz.errors import InputError
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 EXCEL = "sep=(.|tab)?"  # a line above the header by which Excel is told the separator
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*|[+-]?\d{1,3}(?:,\d{3}){2,}")
+EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")  # 1,250 is 1250 or 1.25; 0,250 is 0.25
 Rows = list[tuple[int, str]]  # row of the file, from 1, and its text
 
 
@@ -44,7 +45,7 @@ def in_commas(
     Raises
     ------
     InputError
-        If numbers have decimal commas in some rows and decimal points in others.
+        If numbers have decimal commas in some rows and decimal points in others, or commas that may be of thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
     rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
@@ -53,7 +54,10 @@ def in_commas(
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
     elif not any('"' in line for _, line in rows):
         return _without_empty_ends(rows), tuple(notes)
-    points, changed = _with_points(path, [(i, cells_of(line, separator)) for i, line in rows[1:]])
+    table = [(i, cells_of(line, separator)) for i, line in rows[1:]]
+    if separator == ",":
+        _check_thousands(path, table)
+    points, changed = _with_points(path, table)
     if changed:
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
     names = ",".join(header_cells(rows[0][1], separator))
@@ -113,3 +117,12 @@ def _check_decimals(path: Path, rows: Sequence[tuple[int, list[str]]]) -> None:
         if len(first) == 2:
             (one, a), (two, b) = first.values()
             raise InputError(f"{path}, row {two}: {b!r} beside {a!r} in row {one}; write all decimals with one sign")
+
+
+def _check_thousands(path: Path, rows: Sequence[tuple[int, list[str]]]) -> None:
+    """Raise where every comma in quotes may separate thousands: whoever writes commas between columns often does."""
+    found = [(i, cell) for i, cells in rows for cell in cells if "," in cell and is_number(cell.replace(",", "."))]
+    if found and all(EITHER.fullmatch(cell) for _, cell in found):
+        i, cell = found[0]
+        both = f"{cell.replace(',', '')} or {cell.replace(',', '.')}"
+        raise InputError(f"{path}, row {i}: {cell!r} may be {both}; write numbers without separators of thousands")

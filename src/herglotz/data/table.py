@@ -18,6 +18,7 @@ from herglotz.data.gaps import without
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import with_units
+from herglotz.data.units import in_seconds
 from herglotz.errors import InputError, refuse
 
 CENTURIES = 1e11  # seconds, 3000 years: a time of so many counts milliseconds or less since 1970
@@ -139,12 +140,12 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     heads, first = _heads(frame, raw, where, wanted)
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
     clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
-    dated = clock is not raw[columns.time] and raw[columns.time].dtype.kind != "m"
+    told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock
     every = [_numbers(where, columns.names[i], raw[i], i in known, first) for i in columns.numeric]
     labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
-    return in_dates(found) if dated else found
+    return found if told is None else in_dates(found, told)
 
 
 def _heads(frame: Any, raw: Sequence[np.ndarray], where: Path, wanted: Wanted) -> tuple[list[str], int]:
@@ -170,14 +171,14 @@ def _text(x: Any) -> str:
     return x if isinstance(x, str) else "" if x is None or x != x else "0"
 
 
-def in_dates(found: Trajectories) -> Trajectories:
-    """The same; the table of columns tells that times are dates."""
-    roles = ((name, role, "date" if role == "time" else unit) for name, role, unit in found.columns)
-    return replace(found, columns=tuple(roles))
+def in_dates(found: Trajectories, told: str = "date") -> Trajectories:
+    """The same, its times in s whatever the header says, as dates and durations are; the table of columns tells so."""
+    roles = ((name, role, (told or unit) if role == "time" else unit) for name, role, unit in found.columns)
+    return replace(in_seconds(found), t=found.t, time_unit="s", columns=tuple(roles))
 
 
 def plain(x: Any, what: str = "numbers") -> np.ndarray:
-    """Values as an array, those that are masked as NaN; messages call them `what`.
+    """Values as an array, those that are masked or pandas' NA as NaN; messages call them `what`.
 
     Raises
     ------
@@ -186,6 +187,9 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
     """
     array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
+    if array.dtype.kind == "O" and any(gaps := [type(x).__name__ == "NAType" for x in array.flat]):
+        array = array.copy()  # the user's own
+        array.flat[np.flatnonzero(gaps)] = np.nan
     return array
 
 

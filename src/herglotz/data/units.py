@@ -28,12 +28,17 @@ def in_radians_and_seconds(data: Trajectories) -> Trajectories:
             units=tuple("rad" if turned else unit for turned, unit in zip(degrees, data.units, strict=True)),
             angles=tuple(turned or angle for turned, angle in zip(degrees, data.angles, strict=True)),
         )
-    if data.time_unit in PER_SECOND:
-        # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
-        many = PER_SECOND[data.time_unit]
-        delay, lag = (None if x is None else x / many for x in data.arrival[1:])
-        data = replace(data, t=data.t / many, time_unit="s", delay=delay, lag=lag)
-    return data
+    return in_seconds(data)
+
+
+def in_seconds(data: Trajectories) -> Trajectories:
+    """Return the set with a time in ms, µs, ns, min or h in s."""
+    if data.time_unit not in PER_SECOND:
+        return data
+    # A quotient by a power of ten is the float nearest to the decimal number: 300 ms prints as 0.3 s.
+    many = PER_SECOND[data.time_unit]
+    delay, lag = (None if x is None else x / many for x in data.arrival[1:])
+    return replace(data, t=data.t / many, time_unit="s", delay=delay, lag=lag)
 
 
 def in_degrees(data: Trajectories, names: Collection[str]) -> Trajectories:

@@ -106,6 +106,10 @@ def test_unicode_text(tmp_path):  # fails if what spreadsheets call so, UTF-16 w
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        (
+            't,x\n0,"900"\n1,"950"\n2,"1,000"\n3,"1,050"\n',
+            r"row 4: '1,000' may be 1000 or 1\.000; write numbers without",
+        ),
         ('t,x\n0,"5,000.5"\n1,"6,000.5"\n2,"7,0.5"\n', r"row 2: '5,000.5' has a separator of thousands"),
         ("t;x\n0;1.250,5\n1;2,5\n2;3\n", r"row 2: '1.250,5' has a separator of thousands; write numbers without it"),
         ("t;x\n0;1,234,567\n1;2,5\n2;3\n", "row 2: '1,234,567' has a separator of thousands"),
@@ -118,6 +122,12 @@ def test_mistakes_say_what_to_do(tmp_path, text, message):
     # fails if thousands become decimals, a title is taken for the header, or milliseconds since 1970 for seconds
     with pytest.raises(InputError, match=message):
         load(written(tmp_path, text))
+
+
+def test_decimal_commas_of_three_digits(tmp_path):  # fails if commas that cannot be of thousands are refused
+    for one, value in (("0,250", 0.25), ("-1,25", -1.25), ("1234,500", 1234.5)):
+        data = load(written(tmp_path, f't,x\n0,"{one}"\n1,"1,250"\n2,"2,500"\n'))
+        assert data.q[:, 0].tolist() == [value, 1.25, 2.5]
 
 
 def test_a_comma_in_a_quoted_name(tmp_path):  # fails if one name becomes two columns, fast or row by row
@@ -162,6 +172,19 @@ def test_clocks(kind, tmp_path, capsys):  # fails if nanoseconds are taken for s
         assert load(written(tmp_path, "time,x\n" + text)).t.tolist() == T.tolist()
 
 
+@pytest.mark.parametrize("kind", CLOCKS)
+def test_clocks_with_a_unit(kind, tmp_path):  # fails if dates below t[ms] are divided by 1000, or the delay is not
+    clock = CLOCKS[kind]
+    data = as_trajectories({"t[ms]": clock, "x": X})
+    assert (data.t.tolist(), data.time_unit) == (T.tolist(), "s")
+    if kind == "durations":
+        return
+    text = "".join(f"{t},{x},1\n" for t, x in zip(map(str, clock), X, strict=True))
+    for header in ("t[ms],x,u\n", "t,x,u\nms,rad,N\n"):
+        data = load(written(tmp_path, "# delay: 4\n" + header + text))
+        assert (data.t.tolist(), data.time_unit, data.delay) == (T.tolist(), "s", 0.004)
+
+
 def test_dates_of_which_some_have_a_zone():  # fails if their difference, which is not known, is a traceback
     clock = [START + timedelta(seconds=1), *(START.replace(tzinfo=None) + timedelta(seconds=t) for t in (2, 3, 4))]
     with pytest.raises(InputError, match="not all with a time zone"):
@@ -173,6 +196,30 @@ def test_a_missing_date_has_its_row():  # fails if NaT reads as a time that does
     clock[2] = np.datetime64("NaT")
     with pytest.raises(InputError, match="row 2, column 't': nan is not finite"):
         as_trajectories({"t": clock, "x": X})
+
+
+class NAType:
+    """As pandas.NA: a comparison with it is neither true nor false."""
+
+    def __ne__(self, other):
+        return self
+
+    def __bool__(self):
+        raise TypeError("boolean value of NA is ambiguous")
+
+
+@pytest.mark.parametrize("at", [0, 2])
+def test_a_gap_of_pandas(at):  # fails if NA is a traceback, or is written over in the user's own array
+    x = np.array(X, dtype=object)
+    x[at] = NAType()
+    rest = np.delete(X, at).tolist()
+    for data in (as_trajectories({"t": T, "x": x}), as_trajectories(x, h=0.5)):
+        assert data.q[:, 0].tolist() == rest
+    assert isinstance(x[at], NAType)
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
+    frame.loc[at, "x"] = pandas.NA
+    assert as_trajectories(frame).q[:, 0].tolist() == rest
 
 
 def test_masked_and_complex_numbers():  # fails if what numpy hides or drops becomes data
@@ -190,6 +237,15 @@ def test_arrays_that_are_tables_or_transposed():  # fails if fields are refused,
     assert as_trajectories(table).q[:, 0].tolist() == X.tolist()
     with pytest.raises(InputError, match=r"shape \(1, 6\): few samples of many coordinates; transpose them"):
         as_trajectories(X[None], h=0.5)
+
+
+def test_many_coordinates_that_are_named():  # fails if a chain of 100 masses, recorded shortly, cannot be given at all
+    chain, names = np.random.default_rng(0).normal(size=(20, 100)), [f"x{k}[m]" for k in range(100)]
+    data = as_trajectories(chain, h=0.1, coordinates=names)
+    assert (data.q.tolist(), data.units) == (chain.tolist(), ("m",) * 100)
+    for some in (None, names[:20]):
+        with pytest.raises(InputError, match="or name every coordinate with coordinates="):
+            as_trajectories(chain, h=0.1, coordinates=some)
 
 
 def test_a_text_among_numbers_has_its_row():  # fails if a column of a table is refused without the place
