@@ -216,10 +216,6 @@ def test_a_gap_of_pandas(at):  # fails if NA is a traceback, or is written over 
     for data in (as_trajectories({"t": T, "x": x}), as_trajectories(x, h=0.5)):
         assert data.q[:, 0].tolist() == rest
     assert isinstance(x[at], NAType)
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
-    frame.loc[at, "x"] = pandas.NA
-    assert as_trajectories(frame).q[:, 0].tolist() == rest
 
 
 def test_masked_and_complex_numbers():  # fails if what numpy hides or drops becomes data
@@ -268,6 +264,9 @@ def test_frames():  # fails if pandas' headers of two rows, unit rows, zones or 
     with pytest.raises(InputError, match="positions without times"):
         as_trajectories(pandas.Series(X))
     assert as_trajectories(pandas.Series(X, name="x[m]"), h=0.5).units == ("m",)
+    gap = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
+    gap.loc[0, "x"] = pandas.NA
+    assert as_trajectories(gap).q[:, 0].tolist() == X[1:].tolist()
     with pytest.raises(InputError, match="'x' comes twice"):
         as_trajectories(pandas.concat([frame, frame[["x"]]], axis=1))
 
@@ -285,6 +284,7 @@ def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or se
         ({"log": {"t": T, "signals": {"values": X, "label": "x"}}}, (6,)),
         ({"runs": several}, (6, 6)),
         ({"exp": {"runs": several}}, (6, 6)),
+        ({"runs": several, "fs": 100.0, "name": "two"}, (6, 6)),
         (one, (6,)),
     ):
         savemat(path, stored)
@@ -292,6 +292,9 @@ def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or se
         assert (data.lengths, data.q[:6, 0].tolist()) == (lengths, X.tolist())
     for wrong, message in (
         ({"a": "text"}, "holds no vectors of numbers; save t and q"),
+        ({"a": np.zeros((0, 0))}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"a": {"b": "text"}}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"runs": several, "t": T}, r"a\.mat: runs is a struct array beside other variables; save it in a file of"),
         ({"a": {"t": T, "x": X}, "b": {"t": T, "x": X}}, "two arrays are called"),
     ):
         savemat(path, wrong)
