@@ -244,9 +244,13 @@ def test_many_coordinates_that_are_named():  # fails if a chain of 100 masses, r
             as_trajectories(chain, h=0.1, coordinates=some)
 
 
-def test_a_text_among_numbers_has_its_row():  # fails if a column of a table is refused without the place
-    with pytest.raises(InputError, match="row 3, column 'x': could not convert string to float: 'broken'"):
-        as_trajectories({"t": T, "x": np.array([*map(str, X[:3]), "broken", "4", "5"], dtype=object)})
+@pytest.mark.parametrize("wrong", ["broken", [1, 2], {"x": 1}, datetime(2026, 3, 1)])
+def test_what_is_no_number_has_its_row(wrong):  # fails if a column of a table is refused without the place
+    x = np.array([None, *X[1:]], dtype=object)
+    x[3] = wrong
+    with pytest.raises(InputError) as error:
+        as_trajectories({"t": T, "x": x})
+    assert f"row 3, column 'x': {str(wrong)!r} is not a number; convert it" in str(error.value)
 
 
 def test_frames():  # fails if pandas' headers of two rows, unit rows, zones or series without times are misread
