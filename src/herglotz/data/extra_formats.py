@@ -79,7 +79,7 @@ def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
 
 def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     """The elements of a struct array that is all that a file or its one struct holds; or else what it holds itself."""
-    inside = [x for name, x in stored.items() if not name.startswith("__") and (isinstance(x, Mapping) or _is_array(x))]
+    inside = [x for name, x in stored.items() if not name.startswith("__") and _is_kept(x)]
     if len(inside) != 1:
         return [stored]
     if isinstance(inside[0], Mapping):
@@ -87,13 +87,18 @@ def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     return list(inside[0]) if _is_structs(inside[0]) else [stored]
 
 
+def _is_kept(x: Any) -> bool:
+    return isinstance(x, Mapping) or _is_structs(x) or _is_array(x)
+
+
 def _is_array(x: Any) -> bool:
     """Whether a variable is more than a single number, and no text."""
-    return np.size(x) > 1 and np.asarray(x).dtype.kind in "fiubO"
+    return isinstance(x, np.ndarray) and x.size > 1 and x.dtype.kind in "fiub"
 
 
 def _is_structs(x: Any) -> bool:
-    return isinstance(x, (list, np.ndarray)) and np.size(x) > 0 and all(isinstance(one, Mapping) for one in x)
+    several = isinstance(x, list) or (isinstance(x, np.ndarray) and x.ndim == 1)
+    return several and len(x) > 0 and all(isinstance(one, Mapping) for one in x)
 
 
 def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -105,7 +110,7 @@ def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]
         refuse({beside: _is_structs(x)})
         twice = found.keys() & inside.keys()
         refuse({f"{path}: two arrays are called {', '.join(twice)}; save each recording in a file of its own": twice})
-        found |= {key: x for key, x in inside.items() if np.size(x) > 1 and np.asarray(x).dtype.kind in "fiub"}
+        found |= {key: x for key, x in inside.items() if _is_array(x)}
     return found
 
 
