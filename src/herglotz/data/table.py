@@ -17,7 +17,7 @@ from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, i
 from herglotz.data.gaps import without
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import with_units
+from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.data.units import in_seconds
 from herglotz.errors import InputError, refuse
 
@@ -139,6 +139,8 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
     heads, first = _heads(frame, raw, where, wanted)
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
+    if all(column.ndim == 1 and len(column) for column in raw):
+        refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
     clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
     told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock

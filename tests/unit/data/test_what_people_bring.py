@@ -1,6 +1,7 @@
 """Tables of measuring programs, spreadsheets, pandas and MATLAB: read right, or refused with what to do."""
 
 import importlib.util
+import re
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -64,6 +65,16 @@ def test_a_row_that_is_no_row_of_units(tmp_path, text, message):
     # fails if a damaged row is swallowed as units, or two units of one column are one by chance
     with pytest.raises(InputError, match=message):
         load(written(tmp_path, text + rows()))
+
+
+@pytest.mark.parametrize("unit", ["Sec", "S", "second", "[minutes]"])
+def test_a_row_of_units_without_a_known_time(tmp_path, unit):  # fails if nobody is told which units of time there are
+    known = "is not a number; in a row of units write one of s, ms, us, ns, min, h, sec, .*; or delete the row"
+    with pytest.raises(InputError, match=f"row 2, column 't': {re.escape(repr(unit))} {known}"):
+        load(written(tmp_path, f"t,x\n{unit},m\n{rows()}"))
+    table = {"t": np.array([unit, *T], dtype=object), "x": np.array(["m", *X], dtype=object)}
+    with pytest.raises(InputError, match=f"row 0, column 't': {re.escape(repr(unit))} {known}"):
+        as_trajectories(table)
 
 
 @pytest.mark.parametrize(
