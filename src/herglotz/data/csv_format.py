@@ -20,7 +20,7 @@ from herglotz.data.rows import MISSING, SHOWN, number, number_or_none, quote
 from herglotz.data.sensors import measured
 from herglotz.data.table import from_numbers, from_table, in_dates, moment
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import with_units
+from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.errors import InputError, refuse
 
 LONG = 100_000  # characters of a row of plain numbers
@@ -209,6 +209,8 @@ def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) 
         if i != columns.time:
             remedy = f"leave the column out with --drop {name} (drop= in Python), or write numbers"
         raise InputError(f"{path}, row {rows[0][0]}, column '{name}': {quote(two[0][i])} is not a number; {remedy}")
+    if len(two) == 2:
+        refuse_unknown(columns, two[0], f"{path}, row {rows[0][0]}")
 
 
 def _since(first: datetime, date: datetime, where: str) -> float:

@@ -71,18 +71,34 @@ def _matlab(path: PathLike) -> list[dict[str, np.ndarray]]:
             return [{name: array.T for name, array in one.items()} for one in _datasets(path)]
     scipy_io = _package("scipy.io", path)
     stored = _opened(path, lambda: scipy_io.loadmat(str(path), simplify_cells=True))
-    return [_vectors(path, one) for one in _recordings(stored)]
+    every = [_vectors(path, one) for one in _recordings(stored)]
+    what = "holds no vectors of numbers; save t and q, or a struct of them (a table: writetable to csv)"
+    refuse({f"{path}: {what}": not all(every)})
+    return every
 
 
 def _recordings(stored: Mapping[str, Any]) -> Sequence[Mapping[str, Any]]:
     """The elements of a struct array that is all that a file or its one struct holds; or else what it holds itself."""
-    inside = [x for name, x in stored.items() if not name.startswith("__")]
+    inside = [x for name, x in stored.items() if not name.startswith("__") and _is_kept(x)]
     if len(inside) != 1:
         return [stored]
     if isinstance(inside[0], Mapping):
         return _recordings(inside[0])
-    several = isinstance(inside[0], (list, np.ndarray)) and all(isinstance(x, Mapping) for x in inside[0])
-    return list(inside[0]) if several else [stored]
+    return list(inside[0]) if _is_structs(inside[0]) else [stored]
+
+
+def _is_kept(x: Any) -> bool:
+    return isinstance(x, Mapping) or _is_structs(x) or _is_array(x)
+
+
+def _is_array(x: Any) -> bool:
+    """Whether a variable is more than a single number, and no text."""
+    return isinstance(x, np.ndarray) and x.size > 1 and x.dtype.kind in "fiub"
+
+
+def _is_structs(x: Any) -> bool:
+    several = isinstance(x, list) or (isinstance(x, np.ndarray) and x.ndim == 1)
+    return several and len(x) > 0 and all(isinstance(one, Mapping) for one in x)
 
 
 def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]:
@@ -90,11 +106,11 @@ def _vectors(path: PathLike, stored: Mapping[str, Any]) -> dict[str, np.ndarray]
     found: dict[str, np.ndarray] = {}
     for name, x in stored.items():
         inside = _vectors(path, x) if isinstance(x, Mapping) else {name: x}
+        beside = f"{path}: {name} is a struct array beside other variables; save it in a file of its own"
+        refuse({beside: _is_structs(x)})
         twice = found.keys() & inside.keys()
         refuse({f"{path}: two arrays are called {', '.join(twice)}; save each recording in a file of its own": twice})
-        found |= {key: x for key, x in inside.items() if np.size(x) > 1 and np.asarray(x).dtype.kind in "fiub"}
-    what = "holds no vectors of numbers; save t and q, or a struct of them (a table: writetable to csv)"
-    refuse({f"{path}: {what}": not found and "__version__" in stored})
+        found |= {key: x for key, x in inside.items() if _is_array(x)}
     return found
 
 

@@ -17,7 +17,7 @@ from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, i
 from herglotz.data.gaps import without
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
-from herglotz.data.unit_row import with_units
+from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.data.units import in_seconds
 from herglotz.errors import InputError, refuse
 
@@ -139,6 +139,8 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
     heads, first = _heads(frame, raw, where, wanted)
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
+    if all(column.ndim == 1 and len(column) for column in raw):
+        refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
     clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
     told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock
@@ -242,11 +244,10 @@ def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int
     """A column, whose rows count from `first`, as float64: finite or, unless it must be known, NaN."""
     try:
         found = column.astype(np.float64)
-    except (TypeError, ValueError) as error:
-        row = next((k for k, x in enumerate(column, first) if isinstance(x, str) and not is_number(x)), first)
-        raise InputError(
-            f"{where}, row {row}, column {quote(name)}: {error}; convert it to numbers, or drop it"
-        ) from None
+    except (TypeError, ValueError):
+        at = next(k for k in range(len(column)) if not _is_float(column[k : k + 1]))
+        what = f"{where}, row {at + first}, column {quote(name)}: {quote(str(column[at]))} is not a number"
+        raise InputError(f"{what}; convert it to numbers, or drop it") from None
     if column.dtype.kind in "iu" and column.size and max(abs(int(column.min())), abs(int(column.max()))) > EXACT:
         raise InputError(f"{where}, column {quote(name)}: integers above 2^53 would be rounded; subtract the first one")
     bad = np.nonzero(~np.isfinite(found) if known else np.isinf(found))[0]
@@ -254,3 +255,11 @@ def _numbers(where: Path, name: str, column: np.ndarray, known: bool, first: int
         at, value = bad[0] + first, found[bad[0]]
         raise InputError(f"{where}, row {at}, column {quote(name)}: {value} is not finite; drop that row")
     return found
+
+
+def _is_float(cell: np.ndarray) -> bool:
+    """Whether numpy makes a float of a column of one cell, as of None."""
+    try:
+        return cell.astype(np.float64).size == 1
+    except (TypeError, ValueError):
+        return False

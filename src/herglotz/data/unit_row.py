@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from herglotz.data.csv_columns import Wanted, assign, is_number, name_and_unit
+from herglotz.data.csv_columns import Columns, Wanted, assign, is_number, name_and_unit
+from herglotz.data.rows import MISSING, quote
 from herglotz.data.units import PER_SECOND
 from herglotz.errors import refuse
 
@@ -24,7 +25,7 @@ def with_units(
     InputError
         If a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
     """
-    units = [cell.strip("[]()<> ").removesuffix("-") for cell in below]
+    units = [_bare(cell) for cell in below]
     if len(units) != len(cells) or not {"s", *PER_SECOND}.intersection(units) or any(map(_is_sample, units)):
         return None
     own = [(name_and_unit(cell) or ("", ""))[1] for cell in cells]
@@ -34,6 +35,20 @@ def with_units(
     found = [f"{cell}[{unit}]" if unit and not told else cell for cell, unit, told in named]
     clock = assign(found, where, wanted).time
     return found if units[clock] in ("s", *PER_SECOND) else None
+
+
+def refuse_unknown(columns: Columns, below: Sequence[str], where: str) -> None:
+    """Raise where the first row would be one of units, if its unit of time were known: no cell is a number."""
+    cell, name = below[columns.time], columns.names[columns.time]
+    text = _bare(cell).isalpha() and cell.casefold() not in MISSING and not any(map(_is_sample, below))
+    known = ", ".join(["s", *filter(str.isascii, PER_SECOND)])
+    what = f"{where}, column {quote(name)}: {quote(cell)} is not a number; in a row of units write one of {known}"
+    refuse({f"{what}; or delete the row": text})
+
+
+def _bare(cell: str) -> str:
+    """A unit without brackets; a dash is none."""
+    return cell.strip("[]()<> ").removesuffix("-")
 
 
 def _is_sample(unit: str) -> bool:

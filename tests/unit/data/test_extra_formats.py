@@ -77,6 +77,35 @@ def test_matlab(tmp_path, monkeypatch, as_csv):  # fails if a matrix is not cut 
     np.testing.assert_array_equal(found.u, as_csv.u)
 
 
+RUN = {"t": T, "x": np.cos(T)}
+
+
+@pytest.mark.parametrize(
+    ("stored", "found"),
+    [
+        ({"runs": [RUN, RUN], "fs": 10.0, "name": "two"}, (40, 40)),
+        ({"runs": np.array([RUN, RUN]), "fs": 10.0}, (40, 40)),
+        ({"exp": {"runs": [RUN, RUN], "fs": 10.0}}, (40, 40)),
+        ({"data": RUN, "cells": [T, T[1:]]}, (40,)),
+        ({"empty": np.zeros((0, 0))}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"data": {"name": "text"}}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"runs": [RUN, RUN], "t": T}, r"a\.mat: runs is a struct array beside other variables; save it in a file of"),
+    ],
+)
+def test_variables_of_matlab(tmp_path, monkeypatch, stored, found):
+    # fails if numbers beside a struct array hide it, or a file without vectors is refused without its name
+    (tmp_path / "a.mat").write_bytes(b"MATLAB 5.0 MAT-file")
+    stand_in = types.ModuleType("scipy.io")
+    stand_in.loadmat = lambda *_, **__: {"__version__": "1.0"} | stored  # pyright: ignore[reportAttributeAccessIssue]
+    monkeypatch.setitem(sys.modules, "scipy", types.ModuleType("scipy"))
+    monkeypatch.setitem(sys.modules, "scipy.io", stand_in)
+    if isinstance(found, tuple):
+        assert load(tmp_path / "a.mat").lengths == found
+        return
+    with pytest.raises(InputError, match=found):
+        load(tmp_path / "a.mat")
+
+
 class Dataset(np.ndarray):
     """What the reader asks a dataset of h5py for."""
 

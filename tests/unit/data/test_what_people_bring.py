@@ -1,6 +1,7 @@
 """Tables of measuring programs, spreadsheets, pandas and MATLAB: read right, or refused with what to do."""
 
 import importlib.util
+import re
 from datetime import UTC, datetime, timedelta
 
 import numpy as np
@@ -64,6 +65,16 @@ def test_a_row_that_is_no_row_of_units(tmp_path, text, message):
     # fails if a damaged row is swallowed as units, or two units of one column are one by chance
     with pytest.raises(InputError, match=message):
         load(written(tmp_path, text + rows()))
+
+
+@pytest.mark.parametrize("unit", ["Sec", "S", "second", "[minutes]"])
+def test_a_row_of_units_without_a_known_time(tmp_path, unit):  # fails if nobody is told which units of time there are
+    known = "is not a number; in a row of units write one of s, ms, us, ns, min, h, sec, .*; or delete the row"
+    with pytest.raises(InputError, match=f"row 2, column 't': {re.escape(repr(unit))} {known}"):
+        load(written(tmp_path, f"t,x\n{unit},m\n{rows()}"))
+    table = {"t": np.array([unit, *T], dtype=object), "x": np.array(["m", *X], dtype=object)}
+    with pytest.raises(InputError, match=f"row 0, column 't': {re.escape(repr(unit))} {known}"):
+        as_trajectories(table)
 
 
 @pytest.mark.parametrize(
@@ -216,10 +227,6 @@ def test_a_gap_of_pandas(at):  # fails if NA is a traceback, or is written over 
     for data in (as_trajectories({"t": T, "x": x}), as_trajectories(x, h=0.5)):
         assert data.q[:, 0].tolist() == rest
     assert isinstance(x[at], NAType)
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
-    frame.loc[at, "x"] = pandas.NA
-    assert as_trajectories(frame).q[:, 0].tolist() == rest
 
 
 def test_masked_and_complex_numbers():  # fails if what numpy hides or drops becomes data
@@ -248,9 +255,13 @@ def test_many_coordinates_that_are_named():  # fails if a chain of 100 masses, r
             as_trajectories(chain, h=0.1, coordinates=some)
 
 
-def test_a_text_among_numbers_has_its_row():  # fails if a column of a table is refused without the place
-    with pytest.raises(InputError, match="row 3, column 'x': could not convert string to float: 'broken'"):
-        as_trajectories({"t": T, "x": np.array([*map(str, X[:3]), "broken", "4", "5"], dtype=object)})
+@pytest.mark.parametrize("wrong", ["broken", [1, 2], {"x": 1}, datetime(2026, 3, 1)])
+def test_what_is_no_number_has_its_row(wrong):  # fails if a column of a table is refused without the place
+    x = np.array([None, *X[1:]], dtype=object)
+    x[3] = wrong
+    with pytest.raises(InputError) as error:
+        as_trajectories({"t": T, "x": x})
+    assert f"row 3, column 'x': {str(wrong)!r} is not a number; convert it" in str(error.value)
 
 
 def test_frames():  # fails if pandas' headers of two rows, unit rows, zones or series without times are misread
@@ -268,6 +279,9 @@ def test_frames():  # fails if pandas' headers of two rows, unit rows, zones or 
     with pytest.raises(InputError, match="positions without times"):
         as_trajectories(pandas.Series(X))
     assert as_trajectories(pandas.Series(X, name="x[m]"), h=0.5).units == ("m",)
+    gap = pandas.DataFrame({"t": T, "x": pandas.array(X, dtype="Float64")})
+    gap.loc[0, "x"] = pandas.NA
+    assert as_trajectories(gap).q[:, 0].tolist() == X[1:].tolist()
     with pytest.raises(InputError, match="'x' comes twice"):
         as_trajectories(pandas.concat([frame, frame[["x"]]], axis=1))
 
@@ -285,6 +299,7 @@ def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or se
         ({"log": {"t": T, "signals": {"values": X, "label": "x"}}}, (6,)),
         ({"runs": several}, (6, 6)),
         ({"exp": {"runs": several}}, (6, 6)),
+        ({"runs": several, "fs": 100.0, "name": "two"}, (6, 6)),
         (one, (6,)),
     ):
         savemat(path, stored)
@@ -292,6 +307,9 @@ def test_structs_of_matlab(tmp_path):  # fails if a struct is "no header", or se
         assert (data.lengths, data.q[:6, 0].tolist()) == (lengths, X.tolist())
     for wrong, message in (
         ({"a": "text"}, "holds no vectors of numbers; save t and q"),
+        ({"a": np.zeros((0, 0))}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"a": {"b": "text"}}, r"a\.mat: holds no vectors of numbers; save t and q"),
+        ({"runs": several, "t": T}, r"a\.mat: runs is a struct array beside other variables; save it in a file of"),
         ({"a": {"t": T, "x": X}, "b": {"t": T, "x": X}}, "two arrays are called"),
     ):
         savemat(path, wrong)
