@@ -158,16 +158,9 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     if h is None and time is None and _is_series(data) and type(data.index).__name__ != "RangeIndex":
         time = data.index
     q = torch.from_numpy(_floats("positions", data))
-    timeless = "positions without times: give h, the time between two samples, or time, an array of times"
-    refuse({
-        timeless: (h is None) == (time is None),
-        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
-        "of recordings, or name every coordinate with coordinates=": (
-            q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1] != len(as_names(called or ()))
-        ),
-    })  # fmt: skip
-    if names["group"] is not None or names["drop"]:
-        raise InputError("group and drop are of tables; give a list of arrays, and leave columns out by slicing")
+    _check_array(
+        q, called, timeless=(h is None) == (time is None), of_tables=names["group"] is not None or names["drop"]
+    )
     n = len(q)
     clock = time if time is None or isinstance(time, Tensor) else seconds(plain(time))
     t = np.arange(n) * float(h) if h is not None else _floats("time", clock)
@@ -178,6 +171,17 @@ def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Traj
     found = Trajectories.of(t, q.where(~q.isnan(), 0.0), u=u, source="array", **_labels(called))
     first = f"sample {int(missing.long().argmax())}" if known < n else ""
     return in_radians_and_seconds(without(found, missing, first) if known < n else found)
+
+
+def _check_array(q: Tensor, called: Names | None, *, timeless: bool, of_tables: bool) -> None:
+    refuse({
+        "positions without times: give h, the time between two samples, or time, an array of times": timeless,
+        f"positions (N, n) of shape {tuple(q.shape)}: few samples of many coordinates; transpose them, give a list "
+        "of recordings, or name every coordinate with coordinates=": (
+            q.ndim == 2 and TRANSPOSED * len(q) < q.shape[1] != len(as_names(called or ()))
+        ),
+        "group and drop are of tables; give a list of arrays, and leave columns out by slicing": of_tables,
+    })  # fmt: skip
 
 
 def _labels(called: Names | None) -> dict[str, Any]:
