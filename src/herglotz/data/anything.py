@@ -40,8 +40,8 @@ def as_trajectories(
     drop: Names = (),
     group: str | None = None,
     angles: Names | bool | None = None,
-    sensor_zeros: Sequence[float] = (),
-    sensor_scales: Sequence[float] = (),
+    sensor_zeros: Sequence[float] | None = (),
+    sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
 ) -> Trajectories:
     """Make trajectories of a path, a DataFrame, a Series, an array (N,) or (N, n), or a list of any of them.
@@ -68,7 +68,7 @@ def as_trajectories(
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
     sensor_zeros, sensor_scales
-        q = scale · (reading − zero): n numbers, or n for each recording.
+        q = scale · (reading − zero): n numbers, or n for each recording; None or () for none.
     like
         Another recording: columns of a table that have its names mean the same.
 
@@ -103,7 +103,7 @@ def as_trajectories(
         return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
-        refuse({several: len(sensor_scales) > 0})  # its angles are unwrapped by now
+        refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
         return measured(_of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like}), sensor_zeros)
     else:
         found = _array(data, h, time, names)

@@ -62,8 +62,8 @@ def load(
     angles: Names | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
-    sensor_zeros: Sequence[float] = (),  # what the sensors read at 0; see `herglotz.data.sensors`
-    sensor_scales: Sequence[float] = (),  # what one unit of each reading is worth
+    sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
+    sensor_scales: Sequence[float] | None = (),  # what one unit of each reading is worth
     like: Trajectories | None = None,  # another recording: columns of the same names mean the same
     **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
 ) -> Trajectories:

@@ -13,7 +13,9 @@ from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError, refuse
 
 
-def measured(data: Trajectories, zeros: Sequence[float] = (), scales: Sequence[float] = ()) -> Trajectories:
+def measured(
+    data: Trajectories, zeros: Sequence[float] | None = (), scales: Sequence[float] | None = ()
+) -> Trajectories:
     """The positions q = scale · (y − zero) of readings y; momenta and the action stay as they are recorded.
 
     Parameters
@@ -22,16 +24,17 @@ def measured(data: Trajectories, zeros: Sequence[float] = (), scales: Sequence[f
         Readings, in the units of their columns.
     zeros
         What each sensor reads where its coordinate is 0, in degrees where the table has degrees: n numbers or, of B
-        recordings that differ, B · n numbers, recording after recording; empty: 0.
+        recordings that differ, B · n numbers, recording after recording; empty or None: 0.
     scales
-        What one unit of each reading is worth, n numbers (or B · n); empty: 1.
+        What one unit of each reading is worth, n numbers (or B · n); empty or None: 1.
 
     Raises
     ------
     InputError
         If there is another number of them, one is not finite, or a scale is 0.
     """
-    zeros, scales = (np.atleast_1d(x).tolist() for x in (zeros, scales))
+    zeros = np.atleast_1d(() if zeros is None else zeros).tolist()
+    scales = np.atleast_1d(() if scales is None else scales).tolist()
     if not len(zeros) and not len(scales):
         return data
     zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", zeros), ("scales", scales)))

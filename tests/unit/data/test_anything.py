@@ -139,3 +139,12 @@ def test_an_index_that_counts_is_no_coordinate(tmp_path):  # fails if the index 
     both.to_parquet(tmp_path / "both.parquet")
     for found in (as_trajectories(both, group="run"), as_trajectories(tmp_path / "both.parquet", group="run")):
         assert (found.names, found.lengths) == (("x",), (4, 4))
+
+
+def test_sensors_of_none(tmp_path):  # fails if None, which options left out often are, is a traceback
+    rows = "".join(f"{t},{x}\n" for t, (x, _) in zip(T, Q, strict=True))
+    (tmp_path / "a.csv").write_text("t,x\n" + rows)
+    arrays = as_trajectories(Q, h=0.1)
+    for data in (tmp_path / "a.csv", {"t": T, "x": Q[:, 0]}, [arrays, arrays], arrays):
+        found = as_trajectories(data, sensor_zeros=None, sensor_scales=None)
+        assert found.q[: len(Q), 0].tolist() == Q[:, 0].tolist()
