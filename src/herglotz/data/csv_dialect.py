@@ -14,7 +14,7 @@ from herglotz.errors import InputError
 # Separators in the order in which they are tried; a comma last but one, as it may be the decimal sign of the others.
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
 EXCEL = "sep=(.|tab)?"  # a line above the header by which Excel is told the separator
-THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*|[+-]?\d{1,3}(?:,\d{3}){2,}")
+THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")  # 1,234.5 and 1,234,567
 EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")  # 1,250 is 1250 or 1.25; 0,250 is 0.25
 Rows = list[tuple[int, str]]  # row of the file, from 1, and its text
 

@@ -93,7 +93,7 @@ def load(
     Returns
     -------
     Trajectories
-        Angles in rad, unwrapped: no jump longer than π between samples. Times in ms, µs, ns or min become s.
+        Angles in rad, unwrapped: no jump longer than π between samples. Times in ms, µs, ns, min or h become s.
 
     Raises
     ------

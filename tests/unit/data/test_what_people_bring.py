@@ -141,6 +141,25 @@ def test_decimal_commas_of_three_digits(tmp_path):  # fails if commas that canno
         assert data.q[:, 0].tolist() == [value, 1.25, 2.5]
 
 
+@pytest.mark.parametrize(("header", "scale"), [("timestamp", 1), ("timestamp[us]", 10**6), ("timestamp[ms]", 10**3)])
+def test_times_since_1970(tmp_path, header, scale):  # fails if seconds since 1970, or others with a unit, are refused
+    start = 1_700_000_000
+    data = load(written(tmp_path, f"{header},x\n" + "".join(f"{(start + k) * scale},{k}\n" for k in range(4))))
+    assert data.t.tolist() == [start + k for k in range(4)]
+
+
+def test_rows_below_a_row_of_units_keep_their_numbers():  # fails if rows of a frame count from its first number
+    def table(value):
+        x = np.array(["m", *X], dtype=object)
+        x[3] = value
+        return {"t": np.array(["s", *T], dtype=object), "x": x}
+
+    for wrong, message in (("broken", "'broken' is not a number"), (np.inf, "inf is not finite")):
+        with pytest.raises(InputError, match=f"row 3, column 'x': {message}"):
+            as_trajectories(table(wrong))
+    assert "the first is row 3, column 'x'" in as_trajectories(table(None)).notes[0]
+
+
 def test_a_comma_in_a_quoted_name(tmp_path):  # fails if one name becomes two columns, fast or row by row
     for first in ("0,1", '"0",1'):
         data = load(written(tmp_path, f't,"x, left [m]"\n{first}\n1,2\n2,3\n'))
