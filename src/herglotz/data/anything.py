@@ -82,12 +82,9 @@ def as_trajectories(
     InputError
         If arrays come without times, or as `load` and `read_csv` do.
     """
-    told = {"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group}
-    names = {role: x.tolist() if _holds_names(x) else x for role, x in told.items()}
-    coordinates = names["coordinates"]
+    names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
+    coordinates, data = names["coordinates"], _by_field(data)
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
-    if fields := getattr(getattr(data, "dtype", None), "names", None):  # of a structured array, as genfromtxt makes
-        data = {name: data[name] for name in fields}
     if isinstance(data, Trajectories):
         wrong = "trajectories have their columns already; angles, sensor_zeros and sensor_scales alone change them"
         refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
@@ -115,17 +112,24 @@ def split_options(settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     return {k: v for k, v in settings.items() if k in OPTIONS}, {k: v for k, v in settings.items() if k not in OPTIONS}
 
 
+def _lists(told: dict[str, Any]) -> dict[str, Any]:
+    """What is said of columns, with a list for each array or index of names, as a DataFrame's columns are."""
+    hold = {role: hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU" for role, x in told.items()}
+    return {role: x.tolist() if hold[role] else x for role, x in told.items()}
+
+
+def _by_field(data: Any) -> Any:
+    """The columns of a structured array, as numpy.genfromtxt makes; all other data as they are."""
+    fields = getattr(getattr(data, "dtype", None), "names", None)
+    return {name: data[name] for name in fields} if fields else data
+
+
 def _is_list_of_recordings(data: Any) -> bool:
     if isinstance(data, (np.ndarray, Tensor)):
         return data.ndim == 3
     if _is_series(data):
         return False
     return isinstance(data, Sequence) and len(data) > 0 and not isinstance(data[0], Number)
-
-
-def _holds_names(x: Any) -> bool:
-    """Whether this is an array or an index of names, as a DataFrame's columns are."""
-    return hasattr(x, "tolist") and np.asarray(x).dtype.kind in "OU"
 
 
 def _is_series(data: Any) -> bool:

@@ -33,16 +33,15 @@ def measured(
     InputError
         If there is another number of them, one is not finite, or a scale is 0.
     """
-    zeros = np.atleast_1d(() if zeros is None else zeros).tolist()
-    scales = np.atleast_1d(() if scales is None else scales).tolist()
-    if not len(zeros) and not len(scales):
+    read, worth = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
+    if not read and not worth:
         return data
-    zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", zeros), ("scales", scales)))
+    zero, scale = (_of_each_sample(data, what, x) for what, x in (("zeros", read), ("scales", worth)))
     none = f"{data.source or 'data'}: a scale of 0 leaves no motion; give what one unit of the reading is worth"
-    refuse({none: 0.0 in [float(x) for x in scales]})
+    refuse({none: 0.0 in [float(x) for x in worth]})
     turned = [name in data.degrees and unit == "rad" for name, unit in zip(data.names, data.units, strict=True)]
-    q = data.q - zero * zero.new_tensor([math.pi / 180 if x else 1.0 for x in turned]) if len(zeros) else data.q
-    return replace(data, q=scale * q if len(scales) else q)
+    q = data.q - zero * zero.new_tensor([math.pi / 180 if x else 1.0 for x in turned]) if read else data.q
+    return replace(data, q=scale * q if worth else q)
 
 
 def _of_each_sample(data: Trajectories, what: str, numbers: Sequence[float]) -> Tensor:
