@@ -1,9 +1,10 @@
-"""Named terms or networks: both are fitted to the first part of the training data, and run free over the rest of it.
+"""Named terms, none, or networks: each is fitted to the first part of the training data, and runs free over the rest.
 
 Free runs on held-out time decide what no residual can. It costs one fit of each: named terms start from the values that
-their search found on all training data, and are alone where they meet the held-out time at the noise already; networks,
-the richer model, have to err less by a twentieth, and keep what they learn: the last fit goes on from there. They are
-tried on as few samples as tell the motion.
+their search found on all training data, and are alone where they meet the held-out time at the noise already. The
+richer model has to err less by a twentieth: named terms than friction and inputs alone, which one coordinate is tried
+with, and networks than both. These are tried on as few samples as tell the motion. Where named terms lose, the last fit
+goes on from what the winner has learned.
 """
 
 from __future__ import annotations
