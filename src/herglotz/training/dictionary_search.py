@@ -47,7 +47,7 @@ from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
 PART = 2000  # samples that a search begins with, where there are more than twice as many
-ADDED = 12  # terms that may join one after the other
+ADDED = 12  # rounds in which a term may join; one goes to friction that turns out to push
 FINER = 0.3  # halved steps that change the motion by more than this share of the misfit are worth their time
 BETTER = 0.8  # of the misfit at which shorter steps were in vain: other terms ask for them again
 FINEST = 16  # model steps in a recorded one
@@ -113,10 +113,12 @@ class DictionarySearch:
             return None
         start = smoothed(self.data, local)
         found, simpler = self._first(start, local)
+        if found is None:
+            return None
         for simple in simpler:
             other = self._grown(simple.terms, simple.values, 1, start)
             other = None if other is None else self._finer(self._held(other))
-            if other is not None and (found is None or other.instead_of(found, self.floor)):
+            if other is not None and other.instead_of(found, self.floor):
                 return other
         return found
 

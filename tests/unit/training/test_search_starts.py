@@ -200,7 +200,8 @@ def test_a_simpler_family_stands_in_where_residuals_are_no_noise():
 
 @pytest.mark.parametrize("lacking", [3, 9, 40])
 def test_terms_join_one_by_one(monkeypatch, lacking):
-    # fails if a search stops while its terms are still wanted: three pendulums from a poor start need ten
+    # fails if a search stops while its terms are still wanted: six joined for three pendulums, in seven rounds, for one
+    # went to friction that pushed
     def made(count):
         terms = stub(names=tuple(map(str, range(count))), dry=False, apart=False, features=())
         return stub(terms=terms, pushes=False, coloured=False, rms=1.0, joined_by=lambda *_: True)

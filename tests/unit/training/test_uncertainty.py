@@ -82,7 +82,7 @@ def test_standard_deviation_of_the_damping_rate(posteriors):
     ],
 )
 def test_a_block_that_alone_tells_a_number_widens_no_band(posteriors, monkeypatch, worst, factor):
-    # fails if the error of a block that nothing else foretells, 4000 times the noise where motion dies out within five
+    # fails if the error of a block that nothing else foretells, 4500 times the noise where motion dies out within five
     # periods of eight samples, is the factor of all deviations: the equation had no number left
     run, _, _ = posteriors[0]
     sigma = run.metrics["sigma"]
