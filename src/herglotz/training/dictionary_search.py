@@ -97,7 +97,7 @@ class DictionarySearch:
         self.all = replace(self.all, apart=found.terms.apart)
         for _ in range(ADDED):
             name = self._missing(found)
-            more = None if name is None else self._refit(found, self.all.only((*found.terms.names, name)))
+            more = None if name is None else self.refit(found, self.all.only((*found.terms.names, name)))
             if name == DRY and more is not None and more.pushes:
                 self.all = replace(self.all.joined(NamedTerms((), loads(self.data, one_way=True))), dry=False)
                 continue
@@ -105,7 +105,7 @@ class DictionarySearch:
                 break
             found = self._finer(self._held(self._longer(more)))
         found = self._last_terms(self._likeliest(self._pruned(found)))
-        return FewerNumbers(self.data, self.floor, self.order, self._refit, self._problem).of(found)
+        return FewerNumbers(self.data, self.floor, self.order, self.refit, self._problem).of(found)
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
@@ -166,7 +166,7 @@ class DictionarySearch:
             base = replace(found.base, max_step=self.base.max_step, model_step=self.base.model_step)
             return replace(found, every=kept, base=base, config=replace(found.config, substeps=1))
         self.order = found.config.order
-        dense = self._refit(found, found.terms, max(1, found.config.substeps // every), every)
+        dense = self.refit(found, found.terms, max(1, found.config.substeps // every), every)
         return None if dense is None else self._longer(dense)
 
     def kept_of(self, found: Found, every: int) -> int:
@@ -194,7 +194,7 @@ class DictionarySearch:
         """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
         same = same_as_friction(self.data, found.values[DRY])
         terms = replace(found.terms.joined(NamedTerms((), tuple(same))), dry=False)
-        return self._refit(replace(found, values=found.values | same), terms) or found
+        return self.refit(replace(found, values=found.values | same), terms) or found
 
     def _held(self, found: Found) -> Found:
         """With dry friction that can hold a joint still, unless smooth friction is worth its widths and its excess."""
@@ -212,7 +212,7 @@ class DictionarySearch:
     def _sticking(self, found: Found, excess: float) -> Found | None:
         """The fit with set-valued friction, from this excess at breakaway; at 0 there is none."""
         values, config = {**found.values, EXCESS: (excess,) * self.data.dof}, replace(found.config, sticking=True)
-        return self._refit(replace(found, values=values, config=config), found.terms)
+        return self.refit(replace(found, values=values, config=config), found.terms)
 
     def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
@@ -263,7 +263,7 @@ class DictionarySearch:
         problem.patient = False
         return stages, problem
 
-    def _refit(
+    def refit(
         self, found: Found, terms: NamedTerms, substeps: int | None = None, every: int = 1, states: Tensor | None = None
     ) -> Found | None:
         """The fit with other terms, steps or samples, from this one, or from these states (S, d) of its segments."""
@@ -282,7 +282,7 @@ class DictionarySearch:
         """Without the terms that the fit does not lose by, were residuals white noise."""
         count = self.data.q.numel()
         terms = found.needed(math.log(count), self.own, self.floor)
-        less = None if terms == found.terms else self._refit(found, terms)
+        less = None if terms == found.terms else self.refit(found, terms)
         allowed = (1 + len(found.terms.names) * math.log(count) / count) ** 0.5
         return less if less is not None and less.rms <= allowed * max(found.rms, self.floor) else found
 
@@ -292,7 +292,7 @@ class DictionarySearch:
             return found
         stages, problem = self._problem(found, self.all, found.config.substeps)
         for better in likelier(found, problem, self.all, stages.task.config, self.floor):
-            other = self._refit(replace(found, values=better.values), better.terms, states=better.states)
+            other = self.refit(replace(found, values=better.values), better.terms, states=better.states)
             if other is not None and not other.pushes and self._preferred(other, found):
                 return self._likeliest(self._held(self._longer(other)))
         return found
@@ -308,7 +308,7 @@ class DictionarySearch:
         count = self.data.q.numel()
         for worth in (4**self.order * count, count):  # as much as halved steps may bring, then twice the misfit
             terms = found.needed(worth, self.own, self.floor)
-            less = None if terms == found.terms or not found.coloured else self._refit(found, terms)
+            less = None if terms == found.terms or not found.coloured else self.refit(found, terms)
             if less is None or less.rms > (1 + worth / count) ** 0.5 * max(found.rms, self.floor):
                 continue  # far from the minimum it costs more
             less = self._finer(less)
@@ -320,7 +320,7 @@ class DictionarySearch:
         """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
         while found.terms.names and found.coloured:
             terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
-            less = None if terms == found.terms else self._refit(found, terms)
+            less = None if terms == found.terms else self.refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
             if less is None or not less.as_good(found, self.floor):
                 break
@@ -331,7 +331,7 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for."""
         while self._too_long(found):
             m, count = found.config.substeps, self.data.q.numel()
-            finer = (self._refit(found, found.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
+            finer = (self.refit(found, found.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
             lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
             other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
             if other is None:

@@ -7,7 +7,7 @@ residuals are no noise and held-out blocks of time do not ask for the richer one
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -17,11 +17,13 @@ from herglotz.training.found_terms import Found
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import prune
+from herglotz.training.subsets import best_of_each_size
 
 # Numbers that each coordinate has whether the data ask for them or not.
 OWN = ("potential.stiffness", "potential.tilt", "damping.rate", "friction.viscous", "coupling.viscous",
        "friction.input_map", "friction.input_zero")  # fmt: skip
 SHARED = ("kinetic.off_diagonal", "kinetic.base.off_diagonal", "coupling.viscous")  # what joints that are apart lack
+FEW = 10  # numbers of which all subsets are compared
 HOPELESS = 1.5  # times what the fit and its long steps miss: terms that miss so much more are not fitted in short steps
 
 
@@ -47,9 +49,22 @@ class FewerNumbers:
         free = [i for i, name in enumerate(parameters.numbers) if name.startswith(OWN)]
         x, A = found.information(self.floor)
         kept = prune(A, x, torch.tensor(free, dtype=torch.long), worth)[0].tolist()
-        absent = tuple(parameters.numbers[i] for i in free if i not in kept)
-        more = replace(found.terms, absent=(*found.terms.absent, *absent))
-        return self._simplified(found, more) if absent else found
+        less = found if len(kept) == len(free) else self._simplified(found, self._only(found, free, kept))
+        if found.coloured or len(free) > FEW:
+            return less
+        most = 4**self.order * self.data.q.numel() / 2  # another valley may hold less than the quadratic model has it
+        for few in best_of_each_size(A, x, free)[: len(kept)]:
+            terms = self._only(found, free, [free[k] for k in few.kept])
+            other = self.refit(found, terms) if few.criterion < most else None
+            if other is not None and other.whole and other.as_likely(less, self.floor):
+                less = other
+        return less
+
+    def _only(self, found: Found, free: Sequence[int], kept: Sequence[int]) -> NamedTerms:
+        """Its terms, with those of these numbers absent that are not kept."""
+        numbers = found.fit.problem.parameters.numbers
+        absent = tuple(numbers[i] for i in free if i not in kept)
+        return replace(found.terms, absent=(*found.terms.absent, *absent))
 
     def _one_rate(self, found: Found) -> Found:
         """With one rate for all coordinates, a contact model without forces, where its frictions say no more."""

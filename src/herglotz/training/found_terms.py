@@ -121,8 +121,8 @@ class Found:
         return self.whole and self.as_good(other, floor) if other.coloured else self.as_likely(other, floor)
 
     def as_likely(self, other: Found, floor: float) -> bool:
-        """Whether fewer terms follow as long segments, and miss the data by no more than the other terms are worth."""
-        count, fewer = self.fit.problem.data.q.numel(), len(other.terms.names) - len(self.terms.names)
+        """Whether fewer numbers follow as long segments, and miss the data by no more than the others are worth."""
+        count, fewer = self.fit.problem.data.q.numel(), len(other.fit.theta) - len(self.fit.theta)
         longer = self.fit.problem.grid.length >= other.fit.problem.grid.length
         return longer and gain(self.rms, other.rms, count, floor) < fewer * math.log(count) / 2
 

@@ -7,14 +7,20 @@ and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (
 
 is minimised, J_k being the J of the round before: a generalised eigenproblem, whose smallest eigenvalue is 0 where the
 features can make the motion exactly. (With one coefficient fixed instead, the others cancel it: trap 2. A search by
-least squares from a constant mass ends in other valleys.) Noise biases it, as it does total least squares: it starts a
-fit and does not end one.
+least squares from a constant mass ends in other valleys.) Noise makes its rounds wander, by masses of coordinates that
+hardly act on one another above all. From the best of them the likelihood of the errors e = J(x)⁻¹R(x), each coordinate
+having a size of its own,
+
+    Σ_i log Σ_k e_i²
+
+is minimised by Levenberg–Marquardt: it is the same in all units, and at all factors of an equation that no other shares
+a coefficient with. Noise biases it, as it does every linear regression: it starts a fit and does not end one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -31,6 +37,8 @@ from herglotz.training.parameter_vector import ParameterVector
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
+LEAST = 0.01  # of the largest error of a coordinate: smaller ones weigh no more
+STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
 
 
@@ -103,12 +111,23 @@ class LinearFit:
 
     def solve(self, columns: Tensor) -> Tensor:
         """Coefficients (F,) of unit size, zero outside `columns` (F,) bool; all are where none can be had."""
-        n = self.R.shape[1]
-        R, J = self.R[..., columns], self.J[..., columns]
-        Jk, x = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n), R.new_zeros(0)
+        own = LinearFit(self.R[..., columns], self.J[..., columns], ())
+        x = min(own._eigenvectors(), key=own._misfit, default=own.R.new_zeros(own.R.shape[-1]))
+        out = self.R.new_zeros(len(self.names))
+        out[columns] = own._polished(x)
+        return out
+
+    def _eigenvectors(self) -> Iterator[Tensor]:
+        """Coefficients of unit size by the ratio at the head of this module, after each round; none that is not finite.
+
+        Each coordinate's errors are over their size in the round before: else the coordinate that errs least would
+        count ever more, by a mass that grows where others hardly act on it.
+        """
+        R, J, n = self.R, self.J, self.R.shape[1]
+        Jk, error = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n), R.new_ones(n)
         for _ in range(ROUNDS):
             inverse = torch.linalg.pinv(Jk)
-            top = (inverse @ R).flatten(0, 1)
+            top = (inverse @ R / error[:, None]).flatten(0, 1)
             bottom = torch.einsum("tij,tjkf->tikf", inverse, J).flatten(0, 2)
             # In units of the motion: in others the smaller of both parts would be lost in the rounding of the larger.
             unit = float(top[:, 0].norm() / bottom[:, 0].norm())
@@ -118,13 +137,43 @@ class LinearFit:
             # All of R and J in one thin factor: R = Q₁ U, J = Q₂ U with Q₁ᵀQ₁ + Q₂ᵀQ₂ = 1; x = U⁻¹ y, least |Q₁ y|.
             Q, U = torch.linalg.qr(torch.cat([top, bottom]) / size)
             if not bool(torch.isfinite(Q).all()):  # each has a scale of its own, and some had none
-                return self.R.new_zeros(len(self.names))
+                return
             y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
             x = least_squares(U, y[:, None])[:, 0] / size
-            Jk = J @ x
-        out = self.R.new_zeros(len(self.names))
-        out[columns] = x
-        return out
+            yield x
+            Jk, error = J @ x, self.errors(x).square().mean(0).sqrt()
+            if not bool(torch.isfinite(error).all()):
+                return
+            error = (error / error.max().clamp_min(1e-300)).clamp_min(LEAST)
+
+    def _misfit(self, x: Tensor) -> float:
+        """What is minimised in the end: Σ_i log of the mean square error of coordinate i; inf without a mass matrix."""
+        M = -(self.J @ x) * x[0].sign()
+        if int(torch.linalg.cholesky_ex((M + M.mT) / 2)[1].sum()):
+            return math.inf
+        return float(self.errors(x).square().mean(0).clamp_min(1e-300).log().sum())
+
+    def _polished(self, x: Tensor) -> Tensor:
+        """The minimum of `_misfit` from x, the first mass being held; x where it has no mass matrix."""
+        best, damping, its = self._misfit(x), 1e-3, math.inf
+        for _ in range(STEPS if best < math.inf else 0):
+            e = self.errors(x)
+            size = e.square().mean(0).sqrt().clamp_min(1e-300)
+            D = torch.linalg.solve(self.J @ x, self.R - torch.einsum("tijf,tj->tif", self.J, e))[..., 1:]
+            D, e = (D / size[:, None]).flatten(0, 1), (e / size).flatten()
+            A = D.T @ D
+            scale = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
+            A = A / scale[:, None] / scale + damping * torch.eye(len(A)).to(A)
+            other = x.clone()
+            other[1:] -= torch.linalg.solve(A, D.T @ e / scale) / scale
+            gain = best - (its := self._misfit(other))
+            if not gain > 0:
+                damping *= 5
+                continue
+            x, best, damping = other, its, damping / 5
+            if gain < ENDS:
+                break
+        return x
 
     def errors(self, x: Tensor) -> Tensor:
         """J⁻¹R of every triple at x, (T, n), over the balance of the coordinates; inf where J is singular."""

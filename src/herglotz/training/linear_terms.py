@@ -32,6 +32,7 @@ class LinearStart(NamedTuple):
     terms: NamedTerms
     values: dict  # by the name of a term or of a parameter
     error: float  # J⁻¹R, RMS over the triples, in units of q
+    size: int  # coefficients of the linear problem, those of masses, springs and friction included
 
     @property
     def ways(self) -> list[NamedTerms]:
@@ -50,18 +51,19 @@ def linear_starts(
     data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials,
     one_of: Sequence[NamedTerms] = (),
 ) -> list[LinearStart]:  # fmt: skip
-    """The start with fewest terms whose error the best one does not undercut by more than a 20th, and simpler ones.
+    """The start with fewest coefficients which the best one does not undercut by more than a 20th, and simpler ones.
 
     Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind
-    the first have fewer terms than it, the fewest first: their errors may be noise, which whole trajectories tell.
+    the first have fewer than it, the fewest first: their errors may be noise, which whole trajectories tell.
     The best start `one_of` other families stands alone where it errs less than the first, or as little with fewer
-    terms.
+    of them.
     """
     if not families:
         return []
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
-    tried = [start for terms in families if (start := problem.start(terms)) is not None]
-    tried.sort(key=lambda start: len(start.terms.names))
+    starts = (start for terms in families if (start := problem.start(terms)) is not None)
+    tried = list({start.terms: start for start in starts}.values())
+    tried.sort(key=lambda start: start.size)
     least = min((start.error for start in tried), default=math.inf)
     fair = next((i for i, start in enumerate(tried) if start.error <= MARGIN * least), 0)
     tried = [*tried[fair : fair + 1], *tried[:fair]]
@@ -73,9 +75,8 @@ def linear_starts(
 
 
 def _better(first: LinearStart, other: LinearStart) -> bool:
-    """Whether the first start errs less, by more than a 20th where it has more terms."""
-    more = len(first.terms.names) > len(other.terms.names)
-    return first.error * (MARGIN if more else 1 / MARGIN) < other.error
+    """Whether the first start errs less, by more than a 20th where it has more coefficients."""
+    return first.error * (MARGIN if first.size > other.size else 1 / MARGIN) < other.error
 
 
 class LinearTerms:
@@ -104,7 +105,8 @@ class LinearTerms:
         for x in (fit.solve(left), alone):
             start = fit.start(self._regular(x))
             if start is not None:
-                return LinearStart(terms, self._named(start), float(fit.errors(x).square().mean().sqrt()))
+                error = float(fit.errors(x).square().mean().sqrt())
+                return LinearStart(terms, self._named(start), error, int(left.sum()))
         return None
 
     def _regular(self, x: Tensor) -> Tensor:

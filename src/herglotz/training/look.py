@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.holds import Arrival
+from herglotz.data.holds import HOLDS, Arrival
 from herglotz.data.roughness import roughness
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes, without
@@ -108,7 +109,7 @@ def look(
     """
     settings = user_settings.resolved(data)
     zeros = zeros if plan is None else plan.zeros
-    data, arrival, why_arrival = _read(measured(data, zeros), settings)
+    said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
     train, unseen = _split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
@@ -124,7 +125,13 @@ def look(
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
-        seen = _with_terms(seen, user_settings, stages, named)
+        holds = () if said.hold or any(arrival.late) or data.u is None else tuple(x for x in HOLDS if x != arrival.hold)
+        seen = _with_terms(seen, user_settings, stages, named, holds)
+        if seen.found is not None and (hold := seen.found.hold):
+            stages = stages.labelled(f", hold {hold}")
+            again = look(replace(said, hold=hold), user_settings, stages, named=named, zeros=zeros)
+            why = f"the terms that were found with hold {arrival.hold} miss the data by far less with {hold}"
+            return replace(again, why_arrival=why_arrival | {"hold": why})
     else:
         seen = replace(seen, base=plan.started(base))
         if plan.network == "covered":
@@ -145,7 +152,7 @@ def _split(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Traje
     return (data, None) if settings.train_fraction == 1 else data.split_time(settings.train_fraction)
 
 
-def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: bool) -> Look:
+def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: bool, holds: Sequence[str]) -> Look:
     """Terms from a dictionary of features, from the baseline that explains exact data, or from the search for terms."""
     kept, base, settings, first = seen.kept, seen.base, seen.settings, seen
     if structure_is_free(kept, user_settings):
@@ -156,16 +163,16 @@ def _with_terms(seen: Look, user_settings: FitConfig, stages: Stages, named: boo
     seen = replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
     if not named or not terms_are_free(kept, user_settings):
         return seen
-    return _searched(first, user_settings, stages, seen)
+    return _searched(first, user_settings, stages, seen, holds)
 
 
-def _searched(first: Look, user_settings: FitConfig, stages: Stages, seen: Look) -> Look:
+def _searched(first: Look, user_settings: FitConfig, stages: Stages, seen: Look, holds: Sequence[str]) -> Look:
     """Named terms that follow whole trajectories, or as `seen` where that explains exact data and those do not."""
     kept, base, settings = first.kept, first.base, first.settings
     exact = bool(seen.settings.features) and seen.settings.objective == "residual"
     # "not found" by the linear rule leaves sticking to the search; a user's "no" does not
     plain = replace(settings, sticking=settings.sticking or user_settings.sticking)
-    find = lambda: search(kept, base, plain, outliers=first.outliers)  # noqa: E731
+    find = lambda: search(kept, base, plain, outliers=first.outliers, holds=holds)  # noqa: E731
     found = kept_structure("terms", find, base, settings, stages)
     at_one_step = not (_fine(seen.base) or kept.irregular)  # a network may learn what the rule misses at this step
     if exact or (seen.baseline_motion is not None and at_one_step):

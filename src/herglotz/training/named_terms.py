@@ -162,7 +162,9 @@ def chains(data: Trajectories) -> list[NamedTerms]:
     if across and len(joints) == 1:
         return [NamedTerms(tuple(absolute), (), True, apart=True)]
     between = [name for name, f in every if _of_neighbours(f, joints)] + [x for x, f in across if _row(f, joints)]
-    return [NamedTerms(tuple(between), (), True), NamedTerms(tuple(absolute), (), True, apart=bool(across))]
+    twisted = [name for name, f in every if not f.velocities and sorted(_form(f).values()) == [-1.0, 1.0]]
+    turning = [NamedTerms(tuple(between), (), True), NamedTerms(tuple(absolute), (), True, apart=bool(across))]
+    return turning if across else [*turning, NamedTerms(tuple(twisted), (), True, apart=True)]
 
 
 def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[tuple[str, Product]]]:

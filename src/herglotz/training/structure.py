@@ -29,6 +29,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
+from herglotz.training.found_terms import Found
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.named_terms import MOVING, NamedTerms, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
@@ -45,12 +46,13 @@ NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
 THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
 MISSED = 2.0  # a residual above this multiple of the noise means that a force is missing from the dictionary
 BETTER = 0.5  # order 4 is kept where it lowers the one-step error below this share
+HELD_OTHERWISE = 0.8  # of the misfit: another hold of the inputs that leaves less is worth another search
 EXPLAINED = 1e-7  # a one-step error below this share of the motion's size needs no rule of order 4
 EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no other model to be tried
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
-TOLD = ("reason", "sigma", "doubt", "apart", "every")  # of `Structure`, as a checkpoint has it
+TOLD = ("reason", "sigma", "doubt", "apart", "every", "hold")  # of `Structure`, as a checkpoint has it
 
 COUPLING, VISCOUS = "coupling.viscous", "friction.viscous"
 
@@ -65,6 +67,7 @@ class Structure(NamedTuple):
     doubt: bool = False  # another model may fit better: held-out free runs decide
     apart: bool = False  # sensors whose zeros differ between recordings would lower the misfit
     every: int = 1  # how many recorded samples are one that is fitted
+    hold: str = ""  # of inputs, with which these terms miss the data by far less than with the one that was tried
 
 
 def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
@@ -113,8 +116,13 @@ def kept_structure(
     return Structure(found, replace(base, **kept["base"]), **{name: kept[name] for name in TOLD})
 
 
-def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool) -> Structure:
-    """The named terms that whole trajectories ask for (`dictionary_search`); unchanged where they follow no data."""
+def search(
+    data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool, holds: Sequence[str] = ()
+) -> Structure:
+    """The named terms that whole trajectories ask for (`dictionary_search`); unchanged where they follow no data.
+
+    Where they miss the data, inputs are tried with these other `holds`.
+    """
     found = DictionarySearch(data, base, config, outliers=outliers).run()
     if found is None:
         return Structure(config, base, "no dictionary of terms: its model cannot follow 20 steps")
@@ -125,7 +133,18 @@ def search(data: Trajectories, base: Baseline, config: FitConfig, *, outliers: b
     words = f"{named} miss the data by {miss}, whose precision is {least}"
     words += "" if found.whole else "; whole trajectories are not followed"
     doubt = not (found.whole and found.rms <= AT_THE_NOISE * limit)
-    return Structure(found.config, found.base, words, found.rms, doubt, found.apart, found.every)
+    hold = _better_hold(found, data, holds, outliers=outliers) if doubt and found.every == 1 else ""
+    return Structure(found.config, found.base, words, found.rms, doubt, found.apart, found.every, hold)
+
+
+def _better_hold(found: Found, data: Trajectories, holds: Sequence[str], *, outliers: bool) -> str:
+    """The hold of the inputs with which the terms found miss the data by far less; "" where there is none."""
+    misses = {"": HELD_OTHERWISE * found.rms}
+    for hold in holds:
+        search = DictionarySearch(replace(data, hold=hold), found.base, found.config, outliers=outliers)
+        other = search.refit(found, found.terms)
+        misses |= {} if other is None else {hold: other.rms}
+    return min(misses, key=misses.__getitem__)
 
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:

@@ -130,3 +130,11 @@ def subsets(
         moved[rest] = best[rest] + follow @ (c[k] - best[at])
         found.append(Subset(tuple(stays[k].nonzero()[:, 0].tolist()), float(cost[k]), moved / scale))
     return found
+
+
+def best_of_each_size(A: Tensor, x: Tensor, free: Sequence[int]) -> list[Subset]:
+    """The likeliest subset of these unknowns for each number of them, the smallest first, by JᵀJ at a minimum x."""
+    by_size: dict[int, Subset] = {}
+    for subset in subsets(A, torch.zeros_like(x), x, [[i] for i in free], 0.0):
+        by_size.setdefault(len(subset.kept), subset)
+    return [by_size[size] for size in sorted(by_size)]

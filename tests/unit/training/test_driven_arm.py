@@ -63,9 +63,12 @@ def test_an_arm_with_motors_starts_from_its_own_terms(seed):
 
 
 def test_chains_of_three_links():
-    # fails if a mass turns with an angle before both of its joints, or weight with no sum of angles from the base
+    # fails if a mass turns with an angle before both of its joints, weight with no sum of angles from the
+    # base, or joints that springs alone connect have masses between them
     data = Trajectories.of(torch.arange(9.0), torch.rand(9, 3), angles=(True,) * 3)
-    between, absolute = (set(terms.features) for terms in chains(data))
+    between, absolute, twisted = (set(terms.features) for terms in chains(data))
+    assert [terms.apart for terms in chains(data)] == [False, False, True]
+    assert twisted == {f"{f}(q{i} - q{j})" for f in ("cos", "sin") for i, j in ((1, 2), (1, 3), (2, 3))}
     assert len(between) == 20
     assert {"cos(q1 + q2 + q3)", "cos(q2 + q3) v1 v3", "cos(q3) v2 v2"} <= between
     assert not {"cos(q1) v1 v1", "cos(q2) v2 v2", "cos(q2 + q3)", "cos(q3) v1 v2"} & between

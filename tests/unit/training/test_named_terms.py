@@ -70,14 +70,14 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
         found = begin(self)
         if where == "begins":
             assert found is not None
-            found = self._refit(found, replace(found.terms, dry=True))
+            found = self.refit(found, replace(found.terms, dry=True))
             assert found is not None
             found = replace(found, values={**found.values, dry: (-1.0,)})
             assert found.pushes
         return found
 
     asked = iter([dry, None, None])
-    refit = DictionarySearch._refit
+    refit = DictionarySearch.refit
 
     def pushed(self, found, terms, *rest, **settings):
         more = refit(self, found, terms, *rest, **settings)
@@ -90,7 +90,7 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
     monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
     if where == "joins":
         monkeypatch.setattr(DictionarySearch, "_missing", lambda _self, _found: next(asked))
-        monkeypatch.setattr(DictionarySearch, "_refit", pushed)
+        monkeypatch.setattr(DictionarySearch, "refit", pushed)
     found = DictionarySearch(data, estimate_baseline(data), FitConfig()).run()
     assert found is not None
     assert not found.terms.dry
@@ -100,14 +100,14 @@ def test_dry_friction_that_pushes_is_no_term(where, monkeypatch):
     ("rms", "length", "taken"), [(1.0, 300, True), (1.02, 300, True), (1.1, 300, False), (1.0, 150, False)]
 )
 def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
-    # fails if what a term is worth, ½ log N, has another sign or size, or shorter segments count as whole trajectories:
-    # 900 samples, 8 terms less: misfits may grow by a factor of exp(27.2 / 900) = 1.031
-    def found(names, rms, length):
+    # fails if what a number is worth, ½ log N, has another sign or size, or shorter segments count as whole
+    # trajectories: 900 samples, 8 numbers less: misfits may grow by a factor of exp(27.2 / 900) = 1.031
+    def found(numbers, rms, length):
         data = SimpleNamespace(q=torch.zeros(450, 2))
-        fit = SimpleNamespace(problem=SimpleNamespace(grid=SimpleNamespace(length=length), data=data))
-        return SimpleNamespace(terms=SimpleNamespace(names=names), rms=rms, fit=fit)
+        problem = SimpleNamespace(grid=SimpleNamespace(length=length), data=data)
+        return SimpleNamespace(rms=rms, fit=SimpleNamespace(problem=problem, theta=torch.zeros(numbers)))
 
-    rich, simple = found("abcdefghi", 1.0, 300), found("a", rms, length)
+    rich, simple = found(9, 1.0, 300), found(1, rms, length)
     assert Found.as_likely(simple, rich, 0.0) is taken  # pyright: ignore
 
 
@@ -361,7 +361,7 @@ def test_likelier_terms_do_not_push(monkeypatch, pushes):  # fails if friction t
     found.config, other.pushes = SimpleNamespace(substeps=1), pushes
     search.data, search.all, search.floor = SimpleNamespace(dof=1), None, 0.0
     search._problem = lambda *_: (SimpleNamespace(task=SimpleNamespace(config=None)), None)
-    search._refit, search._preferred = lambda *_, **_settings: other, lambda *_: True
+    search.refit, search._preferred = lambda *_, **_settings: other, lambda *_: True
     search._held = search._longer = lambda it: it
     monkeypatch.setattr(dictionary_search, "likelier", lambda *_: [SimpleNamespace(values={}, terms=(), states=None)])
     monkeypatch.setattr(dictionary_search, "replace", lambda it, **_: it)
@@ -431,7 +431,7 @@ def test_shorter_steps_may_cost_what_one_number_is_worth(finer, most, substeps):
     search: Any = object.__new__(DictionarySearch)
     search.floor, search.finest, search.data = 0.0, most, SimpleNamespace(q=torch.zeros(60, 1))
     at = lambda m, rms: SimpleNamespace(rms=rms, terms=(), config=SimpleNamespace(substeps=m, sticking=None))  # noqa: E731
-    search._refit = lambda *steps: at(steps[-1], finer[steps[-1]])
+    search.refit = lambda *steps: at(steps[-1], finer[steps[-1]])
     search._longer = lambda found: found
     search._too_long = lambda found: found.config.substeps == 1 and not hasattr(search, "in_vain")
     assert search._finer(at(1, 1.0)).config.substeps == substeps
@@ -457,7 +457,7 @@ def test_what_pushes_on_a_joint_that_turns_one_way_is_a_load(way, monkeypatch):
     data = Trajectories.of(t, way * t[:, None], angles=(True,))
     search = object.__new__(DictionarySearch)
     search.data = data
-    monkeypatch.setattr(search, "_refit", lambda found, terms: SimpleNamespace(terms=terms, of=found), raising=False)
+    monkeypatch.setattr(search, "refit", lambda found, terms: SimpleNamespace(terms=terms, of=found), raising=False)
     start = Found(NamedTerms((), (), True), FitConfig(), {"friction.coulomb": (-3.0,)}, None, None, True, 1.0)  # type: ignore[arg-type]
     left: Any = search._braking(start)
     assert left.terms.drag == ("load 1",)
@@ -482,7 +482,7 @@ def test_a_load_is_asked_for_once_friction_that_joins_a_one_way_joint_pushes(mon
         return next(asked)
 
     search._begun, search._missing = lambda: start, missing
-    search._refit = lambda _found, terms: SimpleNamespace(terms=terms, pushes=True)
+    search.refit = lambda _found, terms: SimpleNamespace(terms=terms, pushes=True)
     for last in ("_pruned", "_likeliest", "_last_terms"):
         setattr(search, last, lambda found: found)
     search._problem, search.order = None, 2

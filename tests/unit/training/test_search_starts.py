@@ -25,7 +25,7 @@ CART = ("mass", "mass", "mass", MOVING)  # a cart, a pole, and a mass of both th
 @pytest.mark.parametrize(("friction", "dry"), [((-1.0, 0.0), [True, False]), ((-1.0, 0.1), [True])])
 def test_a_start_with_friction_that_pushes_is_tried_without_it(friction, dry):
     # fails if a cart with a pole whose smoothed accelerations show such friction is left without a start
-    start = LinearStart(NamedTerms(("cos(q2) v1 v2",), (), True), {DRY: friction}, 0.0)
+    start = LinearStart(NamedTerms(("cos(q2) v1 v2",), (), True), {DRY: friction}, 0.0, 9)
     assert [terms.dry for terms in start.ways] == dry
     assert all(terms.features == start.terms.features for terms in start.ways)
 
@@ -211,7 +211,7 @@ def test_terms_join_one_by_one(monkeypatch, lacking):
     search.all = NamedTerms(tuple(map(str, range(50))))
     search._begun = lambda: made(0)
     search._missing = lambda found: str(len(found.terms.names)) if len(found.terms.names) < lacking else None
-    search._refit = lambda found, terms: made(len(found.terms.names) + 1)  # noqa: ARG005
+    search.refit = lambda found, terms: made(len(found.terms.names) + 1)  # noqa: ARG005
     search._held = search._finer = search._longer = search._pruned = lambda found: found
     search._likeliest = search._last_terms = lambda found: found
     search._problem = None

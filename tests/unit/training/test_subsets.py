@@ -11,7 +11,7 @@ from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.pruning import prune
-from herglotz.training.subsets import subsets
+from herglotz.training.subsets import best_of_each_size, subsets
 
 
 def linear_problem(seed: int):
@@ -43,6 +43,17 @@ def test_every_subset_has_the_cost_of_its_own_fit():
                 value(z) + 2.3 * size + math.log(math.comb(4, size)), rel=1e-6
             )
             torch.testing.assert_close(found[kept].x, z, rtol=1e-5, atol=1e-5)
+
+
+def test_the_likeliest_subset_of_each_size():
+    # fails if sizes are missing or out of order, or another subset of that size costs less
+    A, b, _ = linear_problem(0)
+    best = -torch.linalg.solve(A, b)
+    every = subsets(A, torch.zeros_like(b), best, [[i] for i in (1, 2, 4)], worth=0.0)
+    found = best_of_each_size(A, best, [1, 2, 4])
+    assert [len(subset.kept) for subset in found] == [0, 1, 2, 3]
+    for size, subset in enumerate(found):
+        assert subset.criterion == min(other.criterion for other in every if len(other.kept) == size)
 
 
 @pytest.mark.parametrize("seed", [0, 2, 3])
