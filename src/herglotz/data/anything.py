@@ -56,7 +56,7 @@ def as_trajectories(
     data
         One of these, or `Trajectories`.
     h
-        Time between the samples of arrays.
+        Time between the samples of arrays, in s or the unit of your choice: the model has the same.
     time
         Of a table the name of its column; of an array the times (N,): numbers, dates or durations.
     coordinates
@@ -68,7 +68,8 @@ def as_trajectories(
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
     sensor_zeros, sensor_scales
-        q = scale · (reading − zero): n numbers, or n for each recording; None or () for none.
+        q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
+        for none.
     like
         Another recording: columns of a table that have its names mean the same.
 

@@ -63,7 +63,8 @@ def scene(name: str, **parameters: float) -> Scene:
     Returns
     -------
     Scene
-        L, H, the flow and the exact or reference L_d as functions of batched tensors.
+        L(q, v, s), H = v·L_v − L, the flow and the exact or reference L_d as functions of batched tensors (sections 1
+        and 3 of `docs/mathematics.md`), in the scene's units.
 
     Raises
     ------
