@@ -17,6 +17,7 @@ from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.units import common_unit
 from herglotz.errors import InputError, refuse
 from herglotz.models import LEVELS
+from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
@@ -212,7 +213,7 @@ class _Told:
         left = took / self.done * (self.total - self.done)
         error = "fails" if rms is None else f"{rms:.3g}"
         text = f"fit {self.done} of {self.total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
-        print(f"{text}; about {left:.0f} s left", file=sys.stderr, flush=True)
+        tell(f"{text}; about {left:.0f} s left")
 
 
 def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:
