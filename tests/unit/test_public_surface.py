@@ -86,7 +86,7 @@ def surface() -> list[str]:
 
 
 def test_every_public_name_is_in_the_reference():
-    # fails if a name becomes public and its docstring is on no page, or stands there under another name than users write
+    # fails if a name becomes public and its docstring is on no page, or not under the name that users write
     assert [name for name in hz.__all__ if f"herglotz.{name}" not in REFERENCE] == []
 
 

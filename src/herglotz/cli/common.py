@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, no_such_file
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -70,7 +70,7 @@ def seed(text: str) -> int:
 def existing(text: str) -> Path:
     """Parse the path of a file or folder that is there (argparse type): it is missed before any other flag is."""
     if not Path(text).exists():
-        raise argparse.ArgumentTypeError(f"{text}: there is no such file; check the name and the folder")
+        raise argparse.ArgumentTypeError(no_such_file(Path(text)))
     return Path(text)
 
 

@@ -47,12 +47,14 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.data.lock import locked
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
+    from herglotz.training.selection import check_levels
 
-    data, reading = data_of(arguments, columns_of(arguments))
-    config = settings_of(arguments)
     levels = None
     if arguments.levels is not None:
         levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
+    check_levels(levels)
+    data, reading = data_of(arguments, columns_of(arguments))
+    config = settings_of(arguments)
     with locked(out):
         found = select(
             data, levels, arguments.seeds, config, out=out, resume=arguments.resume, progress=progress(arguments)

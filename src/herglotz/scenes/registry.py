@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, did_you_mean
 from herglotz.scenes.cart_pole import cart_pole
 from herglotz.scenes.chain import chain
 from herglotz.scenes.double_pendulum import double_pendulum
@@ -72,7 +72,8 @@ def scene(name: str, **parameters: float) -> Scene:
         If there is no such scene or parameter, or a value is not a finite number.
     """
     if name not in SCENES:
-        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(scene_names())}")
+        known = scene_names()
+        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(known)}{did_you_mean(name, known)}")
     known = tuple(inspect.signature(SCENES[name]).parameters)
     for key, value in parameters.items():
         if key not in known:
