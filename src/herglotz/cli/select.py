@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from herglotz.cli.common import count, exit_code, print_json
+from herglotz.cli.common import count, exit_code, print_json, print_next_of
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, add_machine_flags, data_of, settings_of
 
@@ -69,5 +69,5 @@ def run(arguments: argparse.Namespace) -> int:
         print("The chosen run:")
         print(found.run.summary())
         print(f"Figure: {out / 'selection.png'}")
-        print(f"Next: herglotz verify {out}")
+        print_next_of(found.run, out, ["verify", out])
     return exit_code(found.run)
