@@ -34,9 +34,6 @@ plot_prediction(found)
 # And moving: `herglotz plot RUN --animate`, or
 
 # %%
-from pathlib import Path
-
 from herglotz.plots import save_animation
 
 save_animation(run, "motion.gif", trajectory=2)
-Path("motion.gif")

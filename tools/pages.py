@@ -1,8 +1,8 @@
 """Run the scripts of examples/ cell by cell and write each as a page: `python tools/pages.py [NAME ...]`.
 
 A cell begins with `# %%`; one with `# %% [markdown]` holds text behind `# `. What a cell prints stands below its code,
-and so does the value of its last line; a figure becomes a PNG beside the page, in docs/tutorials/, and the path of a
-GIF this animation. `make docs` offers each page as a notebook (`notebook`), with what was shown; `--notebooks FOLDER`
+and so does the value of its last line; a figure becomes a PNG beside the page, in docs/tutorials/, and an animation a
+GIF. `make docs` offers each page as a notebook (`notebook`), with what was shown; `--notebooks FOLDER`
 writes these files alone, and runs nothing.
 """
 
@@ -53,6 +53,7 @@ def page(name: str) -> str:
     from PIL import Image
 
     from herglotz.plots import save_figure
+    from herglotz.plots.animation import Animation
 
     script = (EXAMPLES / f"{name}.py").read_text(encoding="utf-8")
     parts, names, drawn = [], {"__name__": "__main__"}, 0
@@ -70,9 +71,9 @@ def page(name: str) -> str:
             few = Image.open("figure.png").convert("RGB").quantize(COLOURS, Image.Quantize.MAXCOVERAGE)
             few.save(PAGES / f"{name}-{drawn}.png", optimize=True)
             parts.append(f"![{value.get_suptitle()}]({name}-{drawn}.png)")
-        elif isinstance(value, Path) and value.suffix == ".gif":
-            (PAGES / f"{name}-{value.name}").write_bytes(value.read_bytes())
-            parts.append(f"![{value.stem}]({name}-{value.name})")
+        elif isinstance(value, Animation):
+            (PAGES / f"{name}-{value.path.name}").write_bytes(value.path.read_bytes())
+            parts.append(f"![{value.path.stem}]({name}-{value.path.name})")
         elif value is not None:
             parts.append(f"```text\n{value}\n```")
     parts.append(f"*This page is `examples/{name}.py`, executed by `python tools/pages.py {name}`.*")

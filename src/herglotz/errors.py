@@ -1,5 +1,9 @@
 """The one exception a user's mistake raises; the command line turns it into one line and exit code 2."""
 
+from collections.abc import Iterable
+from difflib import get_close_matches
+from pathlib import Path
+
 
 class InputError(ValueError):
     """Something the user gave is wrong. The message names what, where, the value and the remedy."""
@@ -10,3 +14,18 @@ def refuse(wrong: dict[str, object]) -> None:
     for message, holds in wrong.items():
         if holds:
             raise InputError(message)
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """The known word that this one resembles, as the end of a message; empty where it resembles none."""
+    near = get_close_matches(word, list(known), n=1, cutoff=0.65)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def no_such_file(path: Path) -> str:
+    """What to say of a file that is not there, and which file beside it was meant."""
+    try:
+        beside = [file.name for file in path.parent.iterdir()]
+    except OSError:
+        beside = []
+    return f"{path}: there is no such file; check the name and the folder{did_you_mean(path.name, beside)}"

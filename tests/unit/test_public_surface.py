@@ -40,6 +40,19 @@ PUBLIC |= {path: value for path, value in REFERENCE.items() if value not in PUBL
 OWNERS = (hz.Run, hz.Stepper, hz.Trajectories, hz.State, hz.FitConfig, hz.ModelConfig, Motion, Selection, Bands)
 
 
+UNIT = re.compile(r"\bunits?\b|\brad\b|dimensionless|relative to")
+# These read, write, draw, hold settings or repeat what another name computes; every other name follows an equation.
+WITHOUT_EQUATION = {
+    *("Run.export", "Run.last_fitted", "Run.plot", "Run.predict", "Run.report", "Run.rollout", "Run.save"),
+    *("Run.states_at_end", "Run.summary", "Run.verify", "hz.Run", "hz.FitConfig", "hz.ModelConfig", "hz.Trajectories"),
+    *("hz.compile", "hz.export_pt2", "hz.fit", "hz.load", "hz.load_pt2", "hz.load_run", "hz.save", "hz.save_run"),
+    *("hz.scene_names", "hz.simulate", "herglotz.data.anything.as_trajectories", "herglotz.plots.save_figures"),
+    *("herglotz.plots.animation.save_animation", "herglotz.report.write.write_report"),
+    *("herglotz.training.motion.Motion", "herglotz.training.selection.Selection"),
+    *("herglotz.training.selection.select", "herglotz.training.uncertainty.Bands"),
+}
+
+
 def methods(owner: type) -> dict[str, Any]:
     """Public functions of a class, class methods too; `Run` stands in the file with its properties besides."""
     own = {name: getattr(value, "__func__", value) for name, value in vars(owner).items() if not name.startswith("_")}
@@ -72,8 +85,9 @@ def surface() -> list[str]:
     return lines + [f"herglotz {name} {_flags(command)}" for name, command in sorted(commands.choices.items())]
 
 
-def test_every_public_name_is_in_the_reference():  # fails if a name becomes public and its docstring is on no page
-    assert [name for name in hz.__all__ if getattr(hz, name) not in REFERENCE.values()] == []
+def test_every_public_name_is_in_the_reference():
+    # fails if a name becomes public and its docstring is on no page, or not under the name that users write
+    assert [name for name in hz.__all__ if f"herglotz.{name}" not in REFERENCE] == []
 
 
 def test_public_names_and_flags_are_the_frozen_ones():
@@ -102,11 +116,33 @@ def test_a_public_docstring_is_whole(value):
     assert own <= words.keys()
     tensors = [name for name, p in parameters.items() if "Tensor" in str(p.annotation)]
     assert [name for name in tensors if "(" not in words[name]] == []
+    measured = [name for name, p in parameters.items() if re.search("float|Tensor|ndarray", str(p.annotation))]
+    without = [name for name in measured if name in words and not UNIT.search(words[name])]
+    assert without == [], "say its unit, or that it is dimensionless"
     if inspect.isfunction(value) and own:
         returned = inspect.signature(value).return_annotation
         assert "Raises\n------" in text
         assert returned == "None" or re.search(r"Returns\n-------\n.+\n {4}\S", text)
         assert "Tensor" not in str(returned) or re.search(r"[Ss]hape|\(", text.partition("Returns\n")[2])
+        assert not re.search("Tensor|Partials|Linearised|Step$|Prediction", str(returned)) or UNIT.search(
+            text.partition("Returns\n")[2]
+        )
+
+
+@pytest.mark.parametrize(("name", "value"), [pytest.param(*one, id=one[0]) for one in _callables()])
+def test_what_follows_an_equation_gives_it_and_its_source(name, value):
+    # fails if a public name that computes has no formula, or no page that derives it; or a new name is not decided on
+    text = inspect.getdoc(value) or ""
+    formula, pages = re.search(r"\S [=∘↦≈∈] \S|𝒩\(", text), re.findall(r"docs/([\w/]+\.md)", text)
+    if name in WITHOUT_EQUATION:
+        return
+    assert formula
+    assert pages
+    assert all((GOLDEN.parents[2] / "docs" / page).exists() for page in pages)
+
+
+def test_names_without_equation_are_public_names():  # fails if one is renamed and its line stays
+    assert {name for name, _ in _callables()} >= WITHOUT_EQUATION
 
 
 if __name__ == "__main__":

@@ -44,7 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     try:
         with _orderly(), _one_thread():
-            arguments = build_parser().parse_args(argv)
+            arguments = build_parser().parse_args(_asked(sys.argv[1:] if argv is None else argv))
             return int(arguments.run(arguments) or OK)
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
         return stop.code if isinstance(stop.code, int) else OK
@@ -59,6 +59,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         if _no_memory(error):
             return _say("error: out of memory; use fewer samples or a machine with more", WRONG_INPUT)
         return _say(_internal(error, argv), INTERNAL)
+
+
+def _asked(argv: Sequence[str]) -> Sequence[str]:
+    """Arguments, where `herglotz` alone and `herglotz help COMMAND` ask for help."""
+    return [*argv[1:], "--help"] if not argv or argv[0] == "help" else argv
 
 
 @contextmanager

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import shlex
 import sys
 import tempfile
 import textwrap
@@ -12,7 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, no_such_file
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -70,7 +71,7 @@ def seed(text: str) -> int:
 def existing(text: str) -> Path:
     """Parse the path of a file or folder that is there (argparse type): it is missed before any other flag is."""
     if not Path(text).exists():
-        raise argparse.ArgumentTypeError(f"{text}: there is no such file; check the name and the folder")
+        raise argparse.ArgumentTypeError(no_such_file(Path(text)))
     return Path(text)
 
 
@@ -127,6 +128,21 @@ def say(text: str, file: TextIO | None = None) -> None:
     """Print a sentence in lines that fit a terminal as it opens; names of files are not broken."""
     lines = textwrap.fill(text, COLUMNS, subsequent_indent="  ", break_long_words=False, break_on_hyphens=False)
     print(lines, file=file)
+
+
+def print_next(*commands: Sequence[object]) -> None:
+    """Print what comes next as a shell takes it: a name with blanks is quoted."""
+    for i, command in enumerate(commands):
+        print(f"{'      ' if i else 'Next: '}herglotz {shlex.join(map(str, command))}")
+
+
+def print_next_of(run: Run, out: Path, *commands: Sequence[object]) -> None:
+    """Print what comes next of a run in this folder: nothing is made of one that does not fit its data."""
+    if exit_code(run):
+        trust = shlex.join(["herglotz", "trust", str(out)])
+        say(f"Next: what the verdict says, or {trust}, which says what the data leave open")
+    else:
+        print_next(*commands)
 
 
 def complain(message: str) -> None:

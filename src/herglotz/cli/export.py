@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import KICKS, check_output_file, positive, print_json, warn_of_misfit
+from herglotz.cli.common import KICKS, check_output_file, positive, print_json, print_next, say, warn_of_misfit
 from herglotz.cli.flags import add_force_flag
 from herglotz.errors import InputError
 
@@ -88,8 +88,8 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.format != "c" and tuned.get("tol"):
             print(f"The tolerance {tuned['tol']:g} of tune applies to PyTorch and C only; this file solves to rounding")
         if arguments.format == "c":
-            print(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
-        print(f"Next: herglotz verify {arguments.out} --against {arguments.source}")
+            say(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
+        print_next(["verify", arguments.out, "--against", arguments.source])
     return 0
 
 

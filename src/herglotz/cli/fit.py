@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, exit_code, print_json, say
+from herglotz.cli.common import check_output_folder, exit_code, print_json, print_next_of, say
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import (
     add_expert_flags,
@@ -113,12 +113,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     print(result.summary())
     if drawn:
         say(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
-    if exit_code(result):
-        say(f"Next: what the verdict says, or herglotz trust {out}, which says what the data leave open")
-        return
-    print(f"Next: herglotz report {out}")
-    print(f"      herglotz verify {out}")
-    print(f"      herglotz export {out} --out {out.name}.pt2")
+    print_next_of(result, out, ["report", out], ["verify", out], ["export", out, "--out", f"{out.name}.pt2"])
 
 
 def _draw(result: Run, out: Path) -> list[Path]:

@@ -11,6 +11,7 @@ from typing import NoReturn
 import herglotz
 from herglotz.cli import export, fit, plot, predict, report, rollout, select, simulate, trust, tune, verify
 from herglotz.cli.common import complain
+from herglotz.errors import did_you_mean
 
 DESCRIPTION = """\
 From recorded positions to the equation of motion (a learned discrete contact Lagrangian), a fast time stepper, and a
@@ -67,13 +68,16 @@ class Parser(argparse.ArgumentParser):
         """Refuse what no flag takes here, where the subcommand's own help is the one to name."""
         found, rest = super().parse_known_args(args, namespace)
         if rest:
-            files = "; several recordings: name the folder they are in" if Path(rest[0]).exists() else ""
+            near = did_you_mean(rest[0], self._option_string_actions)
+            files = "; several recordings: name the folder they are in" if Path(rest[0]).exists() else near
             self.error(f"unrecognized arguments: {' '.join(rest)}{files}")
         return found, rest
 
     def error(self, message: str) -> NoReturn:
         """Print the mistake and where to read on; exit with code 2."""
-        complain(f"error: {message}; see '{self.prog} --help'")
+        if wrong := re.search(r"invalid choice: '(.*)' \(choose from (.*)\)$", message):
+            message += did_you_mean(wrong[1], re.findall(r"[\w-]+", wrong[2]))
+        complain(f"error: {message}; see '{self.prog} --help'".replace("?; see", "? See"))
         self.exit(2)
 
 

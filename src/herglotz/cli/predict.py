@@ -72,6 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     result = load_run(arguments.source)
     data = load(arguments.data, like=result.data, **columns_of(arguments))
+    _tell_of_names(data.names, result.data.names)
     if data.time_unit != result.data.time_unit:
         raise InputError(
             f"{arguments.data}: time is in {data.time_unit}, the run was fitted in {result.data.time_unit}; convert it"
@@ -93,6 +94,15 @@ def run(arguments: argparse.Namespace) -> int:
     if found.beyond:
         say(f"herglotz: note: {warning(found.beyond, found.data.time_unit)}", sys.stderr)
     return 0
+
+
+def _tell_of_names(names: tuple[str, ...], known: tuple[str, ...]) -> None:
+    """Say on stderr which coordinates of a recording are not those of the run."""
+    others = [name for name in names if name not in known]
+    if len(names) == len(known) == 1 and others:
+        say(f"herglotz: note: {names[0]} is taken for {known[0]}, the run's only coordinate", sys.stderr)
+    elif others:
+        say(f"herglotz: note: the run has no coordinate {', '.join(others)}: left aside", sys.stderr)
 
 
 def _report(found: Prediction, arguments: argparse.Namespace) -> None:

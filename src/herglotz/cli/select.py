@@ -7,7 +7,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from herglotz.cli.common import count, exit_code, print_json
+from herglotz.cli.common import count, exit_code, print_json, print_next_of
 from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, add_machine_flags, data_of, settings_of
 
@@ -47,12 +47,14 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.data.lock import locked
     from herglotz.plots import plot_selection, save_figure
     from herglotz.training import save_run, select
+    from herglotz.training.selection import check_levels
 
-    data, reading = data_of(arguments, columns_of(arguments))
-    config = settings_of(arguments)
     levels = None
     if arguments.levels is not None:
         levels = [name.strip() for name in arguments.levels.split(",") if name.strip()]
+    check_levels(levels)
+    data, reading = data_of(arguments, columns_of(arguments))
+    config = settings_of(arguments)
     with locked(out):
         found = select(
             data, levels, arguments.seeds, config, out=out, resume=arguments.resume, progress=progress(arguments)
@@ -67,5 +69,5 @@ def run(arguments: argparse.Namespace) -> int:
         print("The chosen run:")
         print(found.run.summary())
         print(f"Figure: {out / 'selection.png'}")
-        print(f"Next: herglotz verify {out}")
+        print_next_of(found.run, out, ["verify", out])
     return exit_code(found.run)

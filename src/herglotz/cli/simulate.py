@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_file, count, finite, positive, print_json, say, seed
+from herglotz.cli.common import check_output_file, count, finite, positive, print_json, print_next, say, seed
 from herglotz.cli.flags import add_force_flag
 from herglotz.errors import InputError
 
@@ -97,7 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
         )  # fmt: skip
     else:
         say(data.summary())
-        print(f"Next: herglotz fit {arguments.out} --out runs/{arguments.out.stem}")
+        print_next(["fit", arguments.out, "--out", f"runs/{arguments.out.stem}"])
     return 0
 
 

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, say, seed
+from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, print_next, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -133,8 +133,5 @@ def _report(found: Tuning, out: Path) -> None:
     for note in found.notes:
         say(f"  {note}")
     print(f"Figure: {out / 'tuned.png'}")
-    if c.kicks is not None:
-        print(f"Next: herglotz export {out} --format c --out kicks.h (the {c.setting.kicks} kicks)")
-        return
-    form = "c" if c.setting.artefact == "c" else "pt2"
-    print(f"Next: herglotz export {out} --format {form} --out stepper{'.h' if form == 'c' else '.pt2'}")
+    name = "stepper.pt2" if c.setting.artefact != "c" else "stepper.h" if c.kicks is None else "kicks.h"
+    print_next(["export", out, "--out", name])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Number
@@ -25,6 +24,7 @@ from herglotz.data.table import from_frame, plain, seconds
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError, refuse
+from herglotz.telling import tell
 
 TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
 OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "sensor_zeros", "sensor_scales")
@@ -56,7 +56,7 @@ def as_trajectories(
     data
         One of these, or `Trajectories`.
     h
-        Time between the samples of arrays.
+        Time between the samples of arrays, in s or the unit of your choice: the model has the same.
     time
         Of a table the name of its column; of an array the times (N,): numbers, dates or durations.
     coordinates
@@ -68,7 +68,8 @@ def as_trajectories(
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
     sensor_zeros, sensor_scales
-        q = scale · (reading − zero): n numbers, or n for each recording; None or () for none.
+        q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
+        for none.
     like
         Another recording: columns of a table that have its names mean the same.
 
@@ -216,12 +217,12 @@ def _marked(data: Trajectories, angles: Any) -> Trajectories:
 def _noted(found: Trajectories, data: Any) -> Trajectories:
     """The same; notes that were not of the data already are printed."""
     for note in found.notes[len(data.notes) if isinstance(data, Trajectories) else 0 :]:
-        print(f"{found.source or 'trajectories'}: {note}", file=sys.stderr)
+        tell(f"{found.source or 'trajectories'}: {note}")
     return found
 
 
 def _shown(data: Trajectories) -> Trajectories:
     """The same; what each column of its table was taken for is printed, after all that was said of the columns."""
     if data.columns:
-        print(data.table(), file=sys.stderr)
+        tell(data.table())
     return data

@@ -131,7 +131,7 @@ def assign(
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}
-    wanted = wanted.by_name(cells, names)
+    wanted = _dated(wanted.by_name(cells, names), names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
@@ -177,6 +177,14 @@ def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
     role = wanted.before(name) or (measured if role == "q" else "q" if moves else role)
     taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
     return "dropped" if taken.get(role) is not None else role
+
+
+def _dated(wanted: Wanted, names: Sequence[str]) -> Wanted:
+    """The same; a column `date` is the time where nothing else is: beside a time of day it is none."""
+    dates = [name for name in names if name.casefold() == "date"]
+    if wanted.time is not None or len(dates) != 1 or any(ROLES["time"].fullmatch(name.casefold()) for name in names):
+        return wanted
+    return replace(wanted, time=dates[0])
 
 
 def _clock(where: str, names: tuple[str, ...], found: list[int]) -> int:

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, no_such_file
 
 PathLike = str | os.PathLike[str]
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT)  # the disk is full, or what this user may take of it
@@ -37,7 +37,7 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
     except InputError:
         raise
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file; check the name and the folder") from None
+        raise InputError(no_such_file(path)) from None
     except IsADirectoryError:
         raise InputError(f"{path}: is a folder, not a file; name one file in it") from None
     except (OSError, ValueError) as error:

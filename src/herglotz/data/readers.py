@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ from herglotz.data.sensors import measured
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError
+from herglotz.telling import tell
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ def load(
     elif like is not None:
         found = angles_like(found, like)
     if show and found.columns:
-        print(found.table(), file=sys.stderr)
+        tell(found.table())
     return found.unwrapped() if unwrap else found
 
 

@@ -35,11 +35,13 @@ class Trajectories:
     t, q, lengths, names, units, angles
         (N,) time, (N, n) position, samples of each trajectory; of the coordinates names, units, and which are angles.
     s, p, u
-        (N,) action, (N, n) momentum and (N, m) control input, where they are known.
+        (N,) action and (N, n) momentum, as in `herglotz.State`, and (N, m) control input, in units of the recording,
+        where they are known.
     time_unit, source, columns, notes
         Of t; origin, for messages; name, role and unit of each column that was read, and what else was made of them.
     hold, delay, lag
-        What u does between samples, and the delay and the time constant with which it acts; 0: u is what acts.
+        What u does between samples, and the delay and the time constant with which it acts, in the
+        unit of t; 0: u is what acts.
 
     Raises
     ------

@@ -117,6 +117,7 @@ def partials(
 ) -> Partials:
     """Value, gradient (D1, D2, D3 L_d) and, at order 2, Hessian blocks of L_d.
 
+    p0 = −D1 L_d / (1 + D3 L_d) and p1 = D2 L_d follow (section 1 of `docs/mathematics.md`).
     Uses the closed form of L_d where it has one and autograd where it has not; both are differentiable again with
     respect to the arguments and the parameters.
 
@@ -125,18 +126,19 @@ def partials(
     L_d
         The discrete Lagrangian L_d(q0, q1, s0, h), which returns (...) numbers in units of action.
     q0, q1
-        (..., n) position and next position.
+        (..., n) position and next position, in the units of L_d, as all that follows.
     s0
-        (...) action variable.
+        (...) action variable, in the unit of L_d.
     h
-        () or (...) time step.
+        () or (...) time step, in the unit of time.
     order
         1, or 2 for second derivatives too.
 
     Returns
     -------
     Partials
-        D1 and D2 (..., n), D3 (...), and blocks such as D12 (..., n, n); second derivatives are None at order 1.
+        D1 and D2 (..., n), D3 (...), and blocks such as D12 (..., n, n), in units of action over those of
+        the arguments; second derivatives are None at order 1.
 
     Raises
     ------

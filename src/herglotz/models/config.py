@@ -29,7 +29,8 @@ class ModelConfig:
     scale, speed
         (n,) typical sizes of q and v, in the units of the data.
     stiffness, tilt, rate
-        Start of the baseline: kᵢ and bᵢ (n,) of V, and the damping rate γ in 1/time (`docs/trajectory.md`, section 4).
+        Start of the baseline: kᵢ and bᵢ (n,) of V, and the damping rate γ (`docs/trajectory.md`, section 4); the first
+        mass is 1: in units of 1/time², of the coordinate over time², and of 1/time.
     potential_width, potential_depth
         Units and layers of the network in V; a width of 0 leaves a network out.
     damping_width
@@ -47,8 +48,8 @@ class ModelConfig:
     coulomb, sticking
         Dry friction of each joint beside the viscous one (forced); set-valued: a joint can stand still.
     inputs, input_map, input_zero
-        Number m of inputs; the map to forces, n · m numbers row by row, left out: learned; whether each input has a
-        learned zero.
+        Number m of inputs; the map to forces, n · m numbers row by row, in units of force (mass 1) over input, left
+        out: learned; whether each input has a learned zero.
     features, known
         What a user guesses of L, with learned coefficients, and what is known of it, as text
         (`herglotz.models.features`).

@@ -71,6 +71,7 @@ class ContactLagrangian(nn.Module):
 
     Positions do not determine L_d (gauge): s′ = f(q, s) gives the same motion. The mass's first entry is fixed at 1,
     which leaves s′ = s + b(q) — within the span of the terms — and a constant shift of s. Only the priors hold those.
+    Source: traps 2, 3 and 4 of `docs/mathematics.md`.
 
     Parameters
     ----------

@@ -18,7 +18,8 @@ class Term(nn.Module):
 
     Write `potential` or `dissipation` in jets, which carry their derivatives along; everything else follows. The force
     acts in halves, F⁻ = c (h/2) f and F⁺ = (h/2) f at v = Δ/h, and so needs the forced level. Parameters are float64
-    and start where the term vanishes, so that a new model equals its baseline.
+    and start where the term vanishes, so that a new model equals its baseline. Source: trap 4 of
+    `docs/mathematics.md`.
 
     Parameters
     ----------

@@ -46,7 +46,9 @@ NAMED = {**FIGURES, **IDENTITIES}
 
 
 def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None, form: str = "png") -> list[Path]:
-    """Draw the figures of S^k and of the discrete Hamilton–Jacobi equation into `folder`, made if it is missing.
+    """Draw D2S^k = p_k and the discrete Hamilton–Jacobi equation of a source into `folder`, made if it is missing.
+
+    Source: section 1 and errata E5 to E7 of `docs/mathematics.md`.
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ def save_theory_figures(source: Any, folder: PathLike, *, h: float | None = None
     folder
         Where the files go.
     h
-        Step; default that of the source.
+        Step, in the source's unit of time; default that of the source.
     form
         png, svg or pdf.
 

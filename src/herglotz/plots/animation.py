@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import base64
 import io
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +28,17 @@ MOST_PANELS = 3  # more are too small to read
 Shape = tuple[np.ndarray, np.ndarray]  # x and y of the joints, (points,) each
 
 
-def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
+@dataclass(frozen=True)
+class Animation:
+    """A GIF that was written; a notebook shows it moving."""
+
+    path: Path
+
+    def _repr_html_(self) -> str:
+        return f'<img alt="animation" src="data:image/gif;base64,{base64.b64encode(self.path.read_bytes()).decode()}">'
+
+
+def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
     """Write a GIF of one trajectory: the recording in grey beside the model's free run, and both against time.
 
     Where all coordinates are angles, links of equal length hang from a point, each angle measured from the vertical;
@@ -41,6 +53,11 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
         The file, which ends in .gif.
     trajectory
         Which of `run.data`, from 0.
+
+    Returns
+    -------
+    Animation
+        Its `path`; as the last line of a notebook's cell it shows the GIF.
 
     Raises
     ------
@@ -84,6 +101,7 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> None:
                 ax.draw_artist(artist)
             images.append(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS))
     write_atomically(path, _gif(images))
+    return Animation(Path(path))
 
 
 def _gif(images: list[Image.Image]) -> bytes:

@@ -6,7 +6,7 @@ import inspect
 import math
 from collections.abc import Callable
 
-from herglotz.errors import InputError
+from herglotz.errors import InputError, did_you_mean
 from herglotz.scenes.cart_pole import cart_pole
 from herglotz.scenes.chain import chain
 from herglotz.scenes.double_pendulum import double_pendulum
@@ -63,7 +63,8 @@ def scene(name: str, **parameters: float) -> Scene:
     Returns
     -------
     Scene
-        L, H, the flow and the exact or reference L_d as functions of batched tensors.
+        L(q, v, s), H = v·L_v − L, the flow and the exact or reference L_d as functions of batched tensors (sections 1
+        and 3 of `docs/mathematics.md`), in the scene's units.
 
     Raises
     ------
@@ -71,7 +72,8 @@ def scene(name: str, **parameters: float) -> Scene:
         If there is no such scene or parameter, or a value is not a finite number.
     """
     if name not in SCENES:
-        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(scene_names())}")
+        known = scene_names()
+        raise InputError(f"unknown scene {name!r}; choose one of {', '.join(known)}{did_you_mean(name, known)}")
     known = tuple(inspect.signature(SCENES[name]).parameters)
     for key, value in parameters.items():
         if key not in known:

@@ -31,7 +31,7 @@ class StepError(RuntimeError):
 
 
 class State(NamedTuple):
-    """A point (q, p, s) of T*Q × R.
+    """A point (q, p, s) of T*Q × R, where the contact form is η = ds − p·dq (section 1 of `docs/mathematics.md`).
 
     Parameters
     ----------

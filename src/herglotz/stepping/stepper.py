@@ -24,7 +24,7 @@ from herglotz.stepping.state import (
 
 
 class Stepper(OneStepMethod):
-    """The flow Φ̃ = FL⁺ ∘ (FL⁻)⁻¹ of a discrete Lagrangian.
+    """The flow Φ̃ = FL⁺ ∘ (FL⁻)⁻¹ of a discrete Lagrangian (section 1 of `docs/mathematics.md`).
 
     Parameters
     ----------
@@ -62,18 +62,20 @@ class Stepper(OneStepMethod):
     def init(
         self, q0: Tensor, q1: Tensor, s0: Tensor | None = None, h: Tensor | float = 1.0, u: Tensor | None = None
     ) -> State:
-        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions.
+        """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions: p1 = D2 L_d, s1 = s0 + L_d.
+
+        Source: section 1 of `docs/mathematics.md`.
 
         Parameters
         ----------
         q0, q1
-            (..., n) positions h apart.
+            (..., n) positions h apart, in the units of L_d, as all that follows.
         s0
-            (...) action; left out: 0 (a choice of gauge).
+            (...) action, in the unit of L_d; left out: 0 (a choice of gauge).
         h
-            () or (...) step between them.
+            () or (...) step between them, in the unit of time.
         u
-            (..., m) input of this step, where L_d takes inputs.
+            (..., m) input of this step, in its own units, where L_d takes inputs.
 
         Returns
         -------
@@ -93,8 +95,9 @@ class Stepper(OneStepMethod):
         return check_started(State(*legendre_plus(driven_by(self.L_d, u), q0, q1, s0, h)))
 
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
-        """One step: guess → solve → momentum → action.
+        """One step: solve p = −D1 L_d / c for q1, then p1 = D2 L_d and s1 = s + L_d.
 
+        Source: section 1 of `docs/mathematics.md`.
         Differentiable with respect to the state, h, u and the parameters of L_d by the implicit-function theorem,
         whatever the number of Newton iterations was (once: second derivatives stop at the solve).
 
@@ -103,16 +106,16 @@ class Stepper(OneStepMethod):
         state
             (q, p, s) with shapes (..., n), (..., n), (...).
         h
-            Time step > 0, scalar or (...).
+            Time step > 0, scalar or (...), in the unit of time.
         guess
-            (..., n) start of the Newton iteration for q1; default q.
+            (..., n) start of the Newton iteration for q1, in the units of q; default q.
         u
-            (m,) or (..., m) input of this step, for an L_d with `at(u)`: a motor's torque, or the time.
+            (m,) or (..., m) input of this step in its own units, for an L_d with `at(u)`: a motor's torque, or time.
 
         Returns
         -------
         Step
-            NaN in the samples whose status is not `Status.CONVERGED`.
+            In the units of the state; NaN in the samples whose status is not `Status.CONVERGED`.
 
         Raises
         ------
@@ -128,15 +131,18 @@ class Stepper(OneStepMethod):
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
         """One step with its derivatives d(q, p, s)′ / d(q, p, s), d/dh and d/du, by the implicit-function theorem.
 
+        That is ∂q1/∂p = −c M⁻¹ and what follows from it (erratum E4 of `docs/mathematics.md`).
+
         Parameters
         ----------
         state, h, u
-            As in `step`: q, p (..., n) and s (...); () or (...); (..., m).
+            As in `step`, units too: q, p (..., n) and s (...); () or (...); (..., m).
 
         Returns
         -------
         Linearised
-            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, and the step itself.
+            `by_state` (..., 2n+1, 2n+1), `by_h` (..., 2n+1), `by_input` (..., 2n+1, m) or None, and the step itself;
+            a derivative has the unit of what is derived over that of what it is derived by.
 
         Raises
         ------
@@ -150,21 +156,21 @@ class Stepper(OneStepMethod):
     def step_pair(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h0: Tensor | float, h1: Tensor | float | None = None
     ) -> tuple[Tensor, Tensor, Tensor]:
-        """Φ: (q_k, q_{k+1}, s_k) → (q_{k+1}, q_{k+2}, s_{k+1}).
+        """Φ: (q_k, q_{k+1}, s_k) → (q_{k+1}, q_{k+2}, s_{k+1}), where R_{k+1} = 0 (section 1 of `docs/mathematics.md`).
 
         Parameters
         ----------
         q0, q1
-            (..., n) positions h0 apart.
+            (..., n) positions h0 apart, in the units of L_d, as all that follows.
         s0
-            (...) action at q0.
+            (...) action at q0, in the unit of L_d.
         h0, h1
-            () or (...) steps before and after q1; h1 is h0 by default.
+            () or (...) steps before and after q1, in the unit of time; h1 is h0 by default.
 
         Returns
         -------
         tuple of Tensor
-            Shapes as q0, q1, s0; NaN where the step fails.
+            Shapes and units as q0, q1, s0; NaN where the step fails.
 
         Raises
         ------

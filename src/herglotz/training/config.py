@@ -47,7 +47,7 @@ class FitConfig:
     optimiser
         "lm" (Levenberg–Marquardt), or "adam" or "adamw" for the residual objectives.
     train_fraction
-        Part of every trajectory, in time, that is trained on; the rest tests. 1 trains on everything.
+        Part of every trajectory, in time, that is trained on, dimensionless; the rest tests. 1 trains on everything.
     seed
         Of the initial weights.
     dtype, device
@@ -59,14 +59,14 @@ class FitConfig:
         Random initialisations of the one-step objective; the best after 30 iterations is kept. None: 4 where the
         correction is a single layer (`baseline_motion`), else 1.
     departures
-        Prior strengths τ tried for the networks' departure from the baseline; held-out blocks of time choose. One
-        value fixes it.
+        Prior strengths τ, dimensionless, tried for the networks' departure from the baseline; held-out blocks of time
+        choose. One value fixes it.
     potential_width, damping_width, correction_width
         Hidden units of the networks; the correction is used by the residual objectives, the potential's network by
         trajectory fitting. The correction has two layers, or one of three times as many units where the baseline's
         equation of motion explains exact data and its motions fill their holes (`herglotz.training.baseline_motion`).
     learning_rate
-        Of Adam.
+        Of Adam, dimensionless.
     batch
         Triples of samples in one step of Adam; None: all. Levels whose motion has no s, or with s recorded.
     activation

@@ -31,9 +31,10 @@ class Motion:
     Parameters
     ----------
     t, q, p, s
-        (K+1,) time; (..., K+1, n) position, and momentum, of which the first mass is 1; (..., K+1) action.
+        (K+1,) time; (..., K+1, n) position, and momentum, of which the first mass is 1; (..., K+1) action. In the units
+        of the data and, p and s, of `herglotz.State`.
     status
-        (..., K) of every step, 0 where it was solved (`herglotz.Status`).
+        (..., K) of every step, dimensionless, 0 where it was solved (`herglotz.Status`).
     names, units, time_unit
         Of the coordinates, and of t.
     beyond

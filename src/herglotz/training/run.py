@@ -69,7 +69,7 @@ class Run:
         return self.states.q
 
     def states_at_end(self) -> State:
-        """Return the state at the last sample of every trajectory, (B, n), (B, n), (B,), to continue from."""
+        """Return the state at the last sample of every trajectory, (B, n), (B, n), (B,), to go on from."""
         last = [first + length - 1 for first, length in zip(self.data.offsets, self.data.lengths, strict=True)]
         return State(*(x[last] for x in self.states))
 
@@ -117,8 +117,8 @@ class Run:
     def at_step(self, h: float) -> OneStepMethod:
         """The model's motion at any step h > 0: a stepper, exact for the motion that the model has at its own step.
 
-        Inside `h_range` it is `stepper`. Elsewhere a step is whole steps of the typical step and a part of one
-        (`theory.FractionalStepper`), with status UNRESOLVED where the recorded step is too long for the motion.
+        Inside `h_range` it is `stepper`. Elsewhere Φ̃_h = Φ̃_r ∘ Φ̃_H^k for h = kH + r: steps of the typical H and a part
+        (`theory.FractionalStepper`, docs/theory.md), UNRESOLVED where the recorded step is too long for the motion.
 
         Parameters
         ----------
@@ -143,7 +143,7 @@ class Run:
     def energy(self, state: State) -> Tensor:
         """The energy H̃(q, p, s) of the model at states; dH̃/dt = −(∂H̃/∂s) H̃.
 
-        With friction or other forces H̃ changes by their power, too.
+        With friction or other forces H̃ changes by their power, too (section 1 of `docs/mathematics.md`).
 
         Parameters
         ----------
@@ -167,7 +167,7 @@ class Run:
         return H
 
     def equation(self) -> Equation:
-        """The learned equation of motion; with standard deviations where the model is made of named terms alone."""
+        """M q̈ = forces as learned, in the data's units; ± where all terms are named (docs/tutorials/duffing.md)."""
         stored = self.metrics.get("equation")
         return Equation.from_dict(stored) if stored else equation_of(self)
 
@@ -206,7 +206,7 @@ class Run:
         t0
             Time of the start; left out, that of the fitted state, or 0.
         h
-            Step; left out, the model's own, or those of recorded inputs.
+            Step, in the data's unit of time; left out, the model's own, or those of recorded inputs.
         inputs
             Held (m,), a step each (K, m), or a recording (path or trajectories) whose inputs act at their own times.
         trajectory
@@ -306,7 +306,7 @@ class Run:
     def symmetries(self, **settings: Any) -> Any:
         """Find translations, rotations and other affine symmetries, and what they keep; `print(run.symmetries())`.
 
-        A symmetry is one within the error of the run's own free run (`herglotz.verify.symmetries`).
+        J_{k+1} = c_k J_k within the error of the run's own free run (section 6 of `docs/mathematics.md`).
         """
         return _above("verify").symmetries(self, **settings)
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from herglotz.data import Trajectories, as_trajectories
 from herglotz.data.units import common_unit
-from herglotz.errors import InputError, refuse
+from herglotz.errors import InputError, did_you_mean, refuse
 from herglotz.models import LEVELS
+from herglotz.telling import tell
 from herglotz.threads import one_thread
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import beaten
@@ -169,14 +170,13 @@ def select(
         If a level is unknown or nothing is held out, or no level has a finite held-out error.
     """
     config = config or FitConfig()
-    data = as_trajectories(data, **reading)
-    levels = levels_for(data, config) if levels is None else levels
-    unknown = [level for level in levels if level not in LADDER]
+    check_levels(levels)
     refuse({
-        f"unknown level {unknown or 'list'}; choose some of {', '.join(LADDER)}": unknown or not levels,
         f"seeds must be >= 1, got {seeds}": seeds < 1,
         "train fraction 1 holds nothing out to compare levels on; use 0.667, say": config.train_fraction == 1,
     })  # fmt: skip
+    data = as_trajectories(data, **reading)
+    levels = levels_for(data, config) if levels is None else levels
     candidates, ladder = [], [level for level in LADDER if level in levels]
     told = _Told(len(ladder) * seeds, progress)
 
@@ -212,7 +212,17 @@ class _Told:
         left = took / self.done * (self.total - self.done)
         error = "fails" if rms is None else f"{rms:.3g}"
         text = f"fit {self.done} of {self.total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
-        print(f"{text}; about {left:.0f} s left", file=sys.stderr, flush=True)
+        tell(f"{text}; about {left:.0f} s left")
+
+
+def check_levels(levels: Sequence[str] | None) -> None:
+    """Raise unless all levels are known and one is named; None stands for those that fit the data."""
+    unknown = [level for level in levels or () if level not in LADDER]
+    names, near = ", ".join(LADDER), did_you_mean("".join(unknown[:1]), LADDER)
+    refuse({
+        f"unknown level {', '.join(map(repr, unknown))}; choose some of {names}{near}": unknown,
+        f"no level is named; choose some of {names}": levels is not None and not levels,
+    })  # fmt: skip
 
 
 def levels_for(data: Trajectories, config: FitConfig) -> tuple[str, ...]:

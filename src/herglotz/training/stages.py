@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
 from copy import copy
@@ -18,6 +17,7 @@ from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
 from herglotz.schema import check_entries
+from herglotz.telling import tell
 from herglotz.training.distributed import is_first
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
 from herglotz.training.tensorboard import TensorboardLog
@@ -58,7 +58,7 @@ class Callback:
         share = f"cost {cost / self.start:.3g} of its start" if self.start else ""
         self.bar.set_postfix_str(share, refresh=False)
         if self.named:
-            print(f"{self.named}, iteration {iteration}: {share}", file=sys.stderr, flush=True)
+            tell(f"{self.named}, iteration {iteration}: {share}")
         if self.log is not None:
             self.log(iteration, cost)
         if iteration % EVERY == 0:
@@ -150,7 +150,7 @@ class Stages:
             if self.lines:
                 count, seconds = result.iterations, time.monotonic() - began
                 took = f"{count} iteration{'' if count == 1 else 's'}, {seconds:.1f} s"
-                print(f"{name}: {took}", file=sys.stderr, flush=True)
+                tell(f"{name}: {took}")
             self.done[name] = {**vars(result), "x": result.x.detach().cpu(), "done": True}
             self._write()
         start = len(self.history)

@@ -41,11 +41,11 @@ class Bands:
     Parameters
     ----------
     q
-        (N, n) free run.
+        (N, n) free run, in the units of the data, as both that follow.
     std
-        (N, n) standard deviation of the model's position.
+        (N, n) standard deviation of the model's position, in the units of q.
     sigma
-        (n,) standard deviation of the noise of a measurement.
+        (n,) standard deviation of the noise of a measurement, in the units of q.
     """
 
     q: Tensor
@@ -231,7 +231,9 @@ class Laplace:
 
 @one_thread()
 def laplace(run: Run) -> Laplace:
-    """The Gauss–Newton posterior of a run: 𝒩(θ̂, (JᵀJ)⁻¹), J the derivatives of residuals over their σ.
+    """The Gauss–Newton posterior of a run: 𝒩(θ̂, f² (JᵀJ)⁻¹), J the derivatives of residuals over their σ.
+
+    f is the error over held-out blocks of time over σ (section 7 of `docs/trajectory.md`; head of this module).
 
     Parameters
     ----------

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.simulate import uniform
-from herglotz.errors import InputError
+from herglotz.errors import InputError, did_you_mean
 from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
 from herglotz.mechanics import DiscreteLagrangian
@@ -137,7 +137,9 @@ def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
         return load_run(path)
     if path.suffix == ".pt2" or path.is_file():
         return load_exported(path)
-    raise InputError(f"{target}: no such scene ({', '.join(scene_names())}), run folder or .pt2, .onnx or .h file")
+    known = scene_names()
+    near = did_you_mean(str(target), known)
+    raise InputError(f"{target}: no such scene ({', '.join(known)}), run folder or .pt2, .onnx or .h file{near}")
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:

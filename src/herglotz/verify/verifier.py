@@ -72,13 +72,13 @@ def verify(
         states are drawn), or a pair (L_d, states) or (stepper, states), with states (q, p, s) of shapes (B, n), (B, n),
         (B,).
     h
-        Step; default that of the target, required for a pair.
+        Step, in the target's unit of time; default that of the target, required for a pair.
     samples, steps, seed
         Number of states, number of steps from each state, and seed of the drawn states.
     tolerance
-        Bound on every identity, instead of 1e-11 (contact, with L_d) and 1e-10 in float64, 5e-4 and 1e-3 in float32;
-        1e-9 and 2e-3 for a file without derivatives (ONNX, machine code, C), whose map is differentiated by
-        differences.
+        Bound on every identity, relative to the size of its terms, instead of 1e-11 (contact, with L_d) and 1e-10 in
+        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (ONNX, machine code, C), whose
+        map is differentiated by differences.
     model
         The model that a file was exported from. The map of a forced file is no contact map, and its steps do not tell
         the forces: with the model it is checked as a forced map, without it by the checks that need no forces.

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.cli import SIGNALS, _internal, _orderly, rollout
-from herglotz.cli.common import exit_code, print_table, warn_of_misfit
+from herglotz.cli import SIGNALS, _internal, _orderly, main, rollout
+from herglotz.cli.common import exit_code, print_next_of, print_table, warn_of_misfit
 from herglotz.cli.tune import _whole
 from herglotz.data import driving
 from herglotz.data.holds import Arrival
@@ -95,3 +95,17 @@ def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothin
     assert (found.names, found.units, found.angles, found.time_unit) == (("q1", "q2"), ("1", "1"), (False, False), "s")
     file.metadata = {"box": None, "angles": [True, False]}
     assert rollout.read_source(Path("a.onnx"), 0).units == ("rad", "1")
+
+
+def test_what_comes_next_can_be_pasted(tmp_path, capsys):  # fails if a name with a blank stands there without quotes
+    out = tmp_path / "my motion.csv"
+    assert main(["simulate", "damped_pendulum", "--out", str(out)]) == 0
+    assert f"Next: herglotz fit '{out}' --out 'runs/my motion'\n" in capsys.readouterr().out
+
+
+def test_nothing_is_made_of_a_run_that_does_not_fit(capsys):  # fails if `select` sends a misfit on to verification
+    verdicts = {"does not fit: 1 m": "what the verdict says, or herglotz trust 'my run'", "fits": "herglotz x"}
+    for verdict, said in verdicts.items():
+        run: Any = SimpleNamespace(metrics={"verdict": verdict})
+        print_next_of(run, Path("my run"), ["x"])
+        assert capsys.readouterr().out.startswith(f"Next: {said}")

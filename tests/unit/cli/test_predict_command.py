@@ -44,6 +44,22 @@ def test_files_and_words(tiny_run, other_csv, tmp_path, capsys):
     assert (tmp_path / "motion.png").read_bytes()[:4] == b"\x89PNG"
 
 
+def test_columns_of_other_names_are_said(tiny_run, other_csv, tmp_path, capsys):
+    # fails if another coordinate is taken for the run's, or one is left aside, without a word
+    (tmp_path / "a.csv").write_text(text := other_csv.read_text().replace("theta", "phi"))
+    rows = text.splitlines()
+    (tmp_path / "b.csv").write_text(
+        f"{rows[0].replace('phi', 'theta')},y[m]\n" + "".join(f"{row},{k}\n" for k, row in enumerate(rows[1:]))
+    )
+    said = []
+    for file in (other_csv, tmp_path / "a.csv", tmp_path / "b.csv"):
+        assert main(["predict", str(tiny_run), str(file)]) == 0
+        said.append(" ".join(capsys.readouterr().err.split()))
+    assert not any(words in said[0] for words in ("taken for theta", "left aside"))
+    assert "note: phi is taken for theta, the run's only coordinate" in said[1]
+    assert "note: the run has no coordinate y: left aside" in said[2]
+
+
 def test_windows(tiny_run, other_csv, capsys):
     # fails if --windows does not reach the function
     assert main(["predict", str(tiny_run), str(other_csv), "--windows", "4", "--horizon", "2", "--json"]) == 0

@@ -135,13 +135,38 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
         (["rollout", "missing.pt2", "--steps", "5", "--out", "OUT.csv"], "no such file"),
         (["export", "missing", "--out", "OUT.pt2"], "no such folder"),
         (["export", "missing", "--out", "OUT.txt"], "must end in .pt2"),
-        ([], "required"),
+        (["fit"], "required"),
         (["train"], "invalid choice"),
+        (["ftt", "a.csv"], "'plot'); did you mean fit? See 'herglotz --help'"),
+        (
+            ["fit", "OUT.csv", "--out", "OUT", "--level", "afine"],
+            "'forced'); did you mean affine? See 'herglotz fit --help'",
+        ),
+        (
+            ["fit", "OUT.csv", "--out", "OUT", "--levle", "full"],
+            "--levle full; did you mean --level?",
+        ),
+        (
+            ["fit", "OUT.cvs", "--out", "OUT"],
+            "the folder; did you mean OUT.csv?",
+        ),
+        (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "unknown level 'afine'; choose some of"),
+        (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "auto; did you mean affine?"),
+        (["simulate", "dufing", "--out", "OUT.csv"], "van_der_pol; did you mean duffing?"),
+        (["verify", "kepller"], ".h file; did you mean kepler?"),
     ],
 )
 def test_wrong_names(tmp_path, capsys, monkeypatch, arguments, message):  # fails if one of them ends in a traceback
     monkeypatch.chdir(tmp_path)
-    assert message in mistake(capsys, tmp_path, *arguments)
+    (tmp_path / "OUT.csv").write_text(GOOD)
+    said = mistake(capsys, tmp_path, *arguments, *(["--force"] if arguments[:1] in (["simulate"], ["rollout"]) else []))
+    assert message in said
+
+
+@pytest.mark.parametrize("asked", [[], ["help"], ["help", "fit"]])
+def test_help_is_asked_for_in_words(capsys, asked):  # fails if a newcomer who types the name alone is told off
+    assert main(asked) == 0
+    assert capsys.readouterr().out.startswith("usage: herglotz fit" if asked[1:] else "usage: herglotz [-h]")
 
 
 @pytest.mark.parametrize(

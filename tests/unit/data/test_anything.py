@@ -1,5 +1,7 @@
 """Recordings as users have them: arrays, lists, Series, DataFrames, paths."""
 
+import sys
+
 import numpy as np
 import pytest
 import torch
@@ -109,6 +111,15 @@ def test_what_a_frame_is_taken_for_is_printed(capsys):  # fails if the columns o
     as_trajectories(Frame({"t": T, "load": Q[:, 0], "F": Q[:, 1]}))
     lines = [line.split() for line in capsys.readouterr().err.splitlines()]
     assert lines[2:] == [["t", "time", "-", "(taken", "for", "s)"], ["load", "coordinate", "-"], ["F", "input", "-"]]
+
+
+def test_a_notebook_is_told_without_red_ground(capsys, monkeypatch):
+    # fails if the table of columns goes to stderr in a notebook, where it looks like a failure
+    monkeypatch.setitem(sys.modules, "ipykernel", sys)
+    as_trajectories(Frame({"t": T, "load": Q[:, 0]}))
+    out, err = capsys.readouterr()
+    assert "coordinate" in out
+    assert err == ""
 
 
 @pytest.mark.parametrize("kind", ["frame", "dict", "path"])

@@ -202,6 +202,15 @@ def test_clocks(kind, tmp_path, capsys):  # fails if nanoseconds are taken for s
         assert load(written(tmp_path, "time,x\n" + text)).t.tolist() == T.tolist()
 
 
+def test_a_column_called_date(tmp_path):
+    # fails if a column `date` is no time where it is the only one, or is the time beside a time of day
+    rows = "".join(f"2026-03-0{1 + t},{x}\n" for t, x in enumerate(X))
+    data = load(written(tmp_path, "Date,x\n" + rows))
+    assert (data.t.tolist(), data.names) == ([86400.0 * k for k in range(len(X))], ("x",))
+    with pytest.raises(InputError, match="'2026-03-01' is not a number; leave the column out with --drop date"):
+        load(written(tmp_path, "date,time,x\n" + "".join(f"2026-03-01,{t},{x}\n" for t, x in zip(T, X, strict=True))))
+
+
 @pytest.mark.parametrize("kind", CLOCKS)
 def test_clocks_with_a_unit(kind, tmp_path):  # fails if dates below t[ms] are divided by 1000, or the delay is not
     clock = CLOCKS[kind]

@@ -1,5 +1,6 @@
 """Every figure is drawn from a run, says what it should, and is written as a PNG; nothing global changes."""
 
+import base64
 import math
 import os
 import struct
@@ -152,7 +153,8 @@ def test_animation(tmp_path, angles, monkeypatch):
     names, units = tuple("abc"[:n]), tuple("rad" if angle else "m" for angle in angles)
     data = replace(run.data, q=run.data.q.repeat(1, n), names=names, units=units, angles=angles)
     states = State(run.states.q.repeat(1, n), run.states.p.repeat(1, n), run.states.s)
-    save_animation(replace(run, data=data, states=states), tmp_path / "a.gif", trajectory=1)
+    shown = save_animation(replace(run, data=data, states=states), tmp_path / "a.gif", trajectory=1)._repr_html_()
+    assert base64.b64encode((tmp_path / "a.gif").read_bytes()).decode() in shown  # of a notebook, which sees no files
     with Image.open(tmp_path / "a.gif") as image:
         assert image.n_frames == 5  # pyright: ignore[reportAttributeAccessIssue]
         frames = []

@@ -31,7 +31,8 @@ def export_pt2(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     h
         Typical step of the model, in the data's time unit: recorded, not imposed.
     box
-        Where the model was fitted: q_low, q_high, p_low, p_high (n numbers each), s_low, s_high (one each).
+        Where the model was fitted: q_low, q_high, p_low, p_high (n numbers each), s_low, s_high (one each), in
+        the units of the model.
     units
         Unit of each coordinate.
     metadata
