@@ -97,8 +97,6 @@ MUTANTS = [
     ("stepping/rollout.py", "sigma = step.state, sigma * step.c", "sigma = step.state, step.c"),
     ("theory/evolution.py", "split(x0 + 0.5 * delta)", "split(x0)"),
     ("theory/evolution.py", "mean = 0.5 * (H(x0) + H(x1))", "mean = H(x0)"),
-    ("stepping/composition.py", "c * part.c", "part.c"),
-    ("theory/splitting.py", "p = c0[..., None] * p + half", "p = p + half"),
     ("theory/rigid_body.py", "c[..., None] * (F.mT @ M", "(F.mT @ M"),
     ("theory/rigid_body.py", "g = (h * root)[..., None] * M", "g = h[..., None] * M"),
     ("theory/constrained.py", "(Dg0.mT @ x[..., n:, None])", "(Dg1.mT @ x[..., n:, None])"),

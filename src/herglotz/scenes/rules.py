@@ -115,7 +115,7 @@ def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rul
     """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, explicit to step.
 
     It generates the splitting damp(h/2) ∘ kick(h/2) ∘ drift(h) ∘ kick(h/2) ∘ damp(h/2) of H = |p|²/2m + V(q) + γs into
-    γs, V and |p|²/2m; `herglotz.theory.ContactSplitting` steps it without a solve. c = E, exactly.
+    γs, V and |p|²/2m. c = E, exactly.
     """
 
     def L_d(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
