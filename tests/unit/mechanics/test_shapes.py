@@ -58,7 +58,7 @@ def test_a_stepper_in_place_of_its_L_d_is_refused():
         return (q1 - q0).square().sum(-1) / (2 * h) - 0.02 * h * s0
 
     with pytest.raises(InputError, match="got a Stepper; of a Stepper, give its L_d"):
-        Stepper(Stepper(free)).step(State(Q, P, S), 0.1)
+        Stepper(Stepper(free)).step(State(Q, P, S), 0.1)  # pyright: ignore[reportArgumentType]
 
 
 def test_a_step_that_is_not_broadcast_is_refused():
