@@ -28,7 +28,6 @@ ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
 DATA = ROOT.parent / "shared" / "data"  # measured recordings; data/README.md says where to get them
 DIGITS = 6  # significant ones of a stored number: more than any table shows
-PACKED, ABSENT = 30, "-"  # dictionaries from which on they are stored as a table; what a row has not
 COLOURS, DPI = 32, 100  # of pictures: enough for lines and text, a third of the size
 
 
@@ -94,7 +93,7 @@ def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_ti
 
 def load(path: Path, empty: dict[str, Any]) -> dict[str, Any]:
     """What earlier runs stored, or `empty`."""
-    return json.loads(path.read_text(encoding="utf-8"), object_hook=_unpacked) if path.is_file() else empty
+    return json.loads(path.read_text(encoding="utf-8")) if path.is_file() else empty
 
 
 def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
@@ -105,21 +104,11 @@ def store(path: Path, result: dict[str, Any], text: str | None = None) -> None:
 
 
 def _json(value: Any, depth: int) -> str:
-    """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper; many alike as a table."""
+    """Numbers in `DIGITS` digits, null for what is not finite, one line for what lies deeper."""
     inside = list(value.values()) if isinstance(value, dict) else value if isinstance(value, list) else []
     alike = bool(inside) and all(isinstance(x, dict) for x in inside)
-    if alike and len(inside) >= PACKED:
-        return _packed(value, inside)
     opened = depth < 2 and value if isinstance(value, dict) else alike
     return _lines(value, depth + 1) if opened else json.dumps(_rounded(value), ensure_ascii=False)
-
-
-def _packed(value: Any, inside: list[dict]) -> str:
-    """Dictionaries alike as a table: their keys once, and a row each."""
-    columns = list(dict.fromkeys(k for x in inside for k in x))
-    rows = [[x.get(k, ABSENT) for k in columns] for x in inside]
-    packed = dict(zip(value, rows, strict=True)) if isinstance(value, dict) else rows
-    return f'{{"columns": {json.dumps(columns)}, "rows": {_lines(packed, 9)}}}'
 
 
 def _lines(value: Any, depth: int) -> str:
@@ -136,18 +125,6 @@ def _rounded(value: Any) -> Any:
     if isinstance(value, dict):
         return {k: _rounded(v) for k, v in value.items()}
     return [_rounded(x) for x in value] if isinstance(value, list | tuple) else value
-
-
-def _unpacked(found: dict[str, Any]) -> Any:
-    """The dictionaries of a table."""
-    if found.keys() != {"columns", "rows"}:
-        return found
-
-    def one(row: list[Any]) -> dict[str, Any]:
-        return {k: v for k, v in zip(found["columns"], row, strict=True) if v != ABSENT}
-
-    rows = found["rows"]
-    return {k: one(row) for k, row in rows.items()} if isinstance(rows, dict) else [one(row) for row in rows]
 
 
 def table(head: Sequence[str], rows: Iterable[Iterable[Any]]) -> list[str]:

@@ -16,7 +16,6 @@ from herglotz.models.feature_potential import FeaturePotential
 from herglotz.models.network import Network
 from herglotz.stepping import Stepper
 from herglotz.stepping.field import FieldOf
-from herglotz.theory import ContactSplitting
 
 # What each scene names, and the parameters that this brings.
 BASE = {"kinetic", "potential"}
@@ -159,14 +158,6 @@ def test_a_separable_scene_solves_nothing(name, monkeypatch):
     else:
         assert solves == 10
         assert model.dof > 1 or calls["solve_ex"] == 0  # n = 1: a division
-
-
-def test_splittings_solve_nothing(monkeypatch):
-    # fails if the explicit splitting of a separable H goes through Newton
-    calls = count_calls(monkeypatch, (newton, "solve"), (torch.linalg, "solve_ex"))
-    splitting = ContactSplitting(lambda q: (1 - torch.cos(q)).sum(-1), 1.0, 0.2, force=lambda q: -torch.sin(q))
-    splitting.rollout(*starts(3), h=0.1, steps=10)
-    assert not calls
 
 
 def test_the_conservative_level_computes_no_damping():

@@ -63,17 +63,12 @@ def test_every_scene_verifies(name):
 
 
 # A rule takes any L, so a fault of a rule or of a scene shows in a third of the pairs, every rule and every scene among
-# them; the slow suite has all. Lobatto rules solve for internal nodes, which takes seconds: here on two scenes, one of
-# which is driven and the other not linear in v.
-LOBATTO = ("quadratic_drag", "driven_pendulum")
+# them; the slow suite has all.
 RULES = [
-    pytest.param(
-        name, rule,
-        marks=pytest.mark.slow if (name not in LOBATTO if rule.startswith("lobatto") else (i + j) % 3) else (),
-    )
+    pytest.param(name, rule, marks=pytest.mark.slow if (i + j) % 3 else ())
     for i, name in enumerate(scene_names())
     for j, rule in enumerate(scene(name).L_d_rules)
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("name", "rule"), RULES)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import KICKS, check_output_file, positive, print_json, print_next, say, warn_of_misfit
-from herglotz.cli.flags import add_force_flag
+from herglotz.cli.common import KICKS, check_output_file, flag, positive, print_json, print_next, say, warn_of_misfit
+from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError
 
 # File extension of each format.
@@ -29,26 +29,18 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("export", help="write a model as one file", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` wrote")
-    parser.add_argument(
-        "--out", required=True, type=Path, metavar="FILE", help="file to write, ending in .pt2, .onnx or (C) .h"
-    )
-    parser.add_argument("--format", choices=tuple(SUFFIX), help="kind of file (default: as the name says)")
-    parser.add_argument(
-        "--h-range", type=positive, nargs=2, metavar=("LOW", "HIGH"),
-        help="range of steps h (default: that of the data); C flags other steps, Python refuses them",
-    )  # fmt: skip
-    parser.add_argument(
-        "--name", metavar="PREFIX",
-        help="what every name in a C header begins with, so that headers of two models fit into one program (default: "
-        "the name of the file)",
-    )  # fmt: skip
-    add_force_flag(parser)
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
-    parser.set_defaults(run=run)
+HELP = "write a model as one file"
+FLAGS = (
+    flag("source", "folder that `herglotz fit` wrote", metavar="RUN", type=Path),
+    flag("--out", "file to write, ending in .pt2, .onnx or (C) .h", required=True, type=Path, metavar="FILE"),
+    flag("--format", "kind of file (default: as the name says)", choices=tuple(SUFFIX)),
+    flag("--h-range", "range of steps h (default: that of the data); C flags other steps, Python refuses them",
+         type=positive, nargs=2, metavar=("LOW", "HIGH")),
+    flag("--name", "what every name in a C header begins with, so that headers of two models fit into one program "
+         "(default: the name of the file)", metavar="PREFIX"),
+    FORCE,
+    flag("--json", "print what was written as JSON", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -8,16 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_folder, exit_code, print_json, print_next_of, say
-from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
-from herglotz.cli.settings import (
-    add_expert_flags,
-    add_machine_flags,
-    add_model_flags,
-    add_optimiser_flags,
-    data_of,
-    settings_of,
-)
+from herglotz.cli.common import check_output_folder, exit_code, flag, print_json, print_next_of, say
+from herglotz.cli.flags import CSV, PROGRESS, RUN, check_run_folder, columns_of, progress
+from herglotz.cli.settings import EXPERT, MACHINE, MODEL, OPTIMISER, data_of, settings_of
 
 if TYPE_CHECKING:
     from herglotz.data import Trajectories
@@ -39,23 +32,15 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand; its flags stand in groups, the most used first."""
-    parser = commands.add_parser("fit", help="train a model on measured positions", description=DESCRIPTION)
-    add_run_flags(parser)
-    add_progress_flags(parser)
-    parser.add_argument("--no-plots", action="store_true", help="do not draw figures")
-    parser.add_argument(
-        "--tensorboard",
-        type=Path,
-        metavar="FOLDER",
-        help="log for TensorBoard, as the fit runs (RUN holds history.csv too)",
-    )
-    add_machine_flags(parser)
-    add_model_flags(parser.add_argument_group("model"))
-    add_optimiser_flags(parser.add_argument_group("objective and optimiser"))
-    add_expert_flags(parser.add_argument_group("what is known (expert)"))
-    parser.set_defaults(run=run)
+USAGE = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
+HELP = "train a model on measured positions"
+FLAGS = (
+    *RUN, *PROGRESS,
+    flag("--no-plots", "do not draw figures", action="store_true"),
+    flag("--tensorboard", "log for TensorBoard, as the fit runs (RUN holds history.csv too)",
+         type=Path, metavar="FOLDER"),
+    *MACHINE, *CSV, *MODEL, *OPTIMISER, *EXPERT,
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

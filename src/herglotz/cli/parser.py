@@ -5,12 +5,13 @@ from __future__ import annotations
 import argparse
 import re
 import textwrap
+from collections.abc import Iterable
 from pathlib import Path
 from typing import NoReturn
 
 import herglotz
 from herglotz.cli import export, fit, plot, predict, report, rollout, select, simulate, trust, tune, verify
-from herglotz.cli.common import complain
+from herglotz.cli.common import Flag, complain
 from herglotz.errors import did_you_mean
 
 DESCRIPTION = """\
@@ -87,5 +88,21 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"herglotz {herglotz.__version__}")
     commands = parser.add_subparsers(title="subcommands", metavar="COMMAND", required=True)
     for module in (simulate, fit, select, predict, rollout, export, verify, trust, report, tune, plot):
-        module.add(commands)
+        own = vars(module)  # the description of `simulate` is made when its help is asked for
+        command = commands.add_parser(
+            module.__name__.rpartition(".")[2], help=module.HELP, description=own.get("DESCRIPTION"),
+            usage=own.get("USAGE"), add_help=module is not simulate,
+        )  # fmt: skip
+        _add(command, module.FLAGS)
+        command.set_defaults(run=module.run)
     return parser
+
+
+def _add(command: argparse.ArgumentParser, flags: Iterable[Flag | str]) -> None:
+    """Add the flags of a command; a text among them is the title of the group of those after it."""
+    place: argparse._ActionsContainer = command
+    for one in flags:
+        if isinstance(one, str):
+            place = command.add_argument_group(one)
+        else:
+            place.add_argument(*one.names, **one.options)

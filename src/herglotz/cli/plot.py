@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder
-from herglotz.cli.flags import add_column_flags, columns_of
+from herglotz.cli.common import check_output_folder, flag
+from herglotz.cli.flags import CSV, SENSORS, columns_of
 from herglotz.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
@@ -24,19 +24,16 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("plot", help="draw a run, data or the theory of a scene", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN|DATA|SCENE", type=Path, help="folder of a run, a data file, or a scene")
-    parser.add_argument("--theory", action="store_true", help="figures of the generating function, of a scene or a run")
-    parser.add_argument(
-        "--out", type=Path, metavar="FOLDER",
-        help="folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
-    )  # fmt: skip
-    parser.add_argument("--format", choices=FORMATS, default="png", help="kind of file (default %(default)s)")
-    parser.add_argument("--animate", action="store_true", help="of a run: animation.gif, of its first trajectory")
-    add_column_flags(parser)
-    parser.set_defaults(run=run)
+HELP = "draw a run, data or the theory of a scene"
+FLAGS = (
+    flag("source", "folder of a run, a data file, or a scene", metavar="RUN|DATA|SCENE", type=Path),
+    flag("--theory", "figures of the generating function, of a scene or a run", action="store_true"),
+    flag("--out", "folder for the figures, made if missing (default: RUN itself, or the current folder for DATA)",
+         type=Path, metavar="FOLDER"),
+    flag("--format", "kind of file (default %(default)s)", choices=FORMATS, default="png"),
+    flag("--animate", "of a run: animation.gif, of its first trajectory", action="store_true"),
+    *SENSORS, *CSV,
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

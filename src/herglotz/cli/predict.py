@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, existing, positive, print_json, print_table, say
-from herglotz.cli.flags import add_column_flags, add_force_flag, columns_of
+from herglotz.cli.common import check_output_file, count, existing, flag, positive, print_json, print_table, say
+from herglotz.cli.flags import CSV, FORCE, SENSORS, columns_of
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -38,26 +38,20 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("predict", help="score a run on another recording", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
-    parser.add_argument(
-        "data", metavar="DATA", type=existing, help="recording of the same coordinates, in the same units"
-    )
-    parser.add_argument(
-        "--warmup", type=count, default=WARMUP, metavar="K",
-        help="samples that the state is estimated from, at least 3 (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--windows", type=count, metavar="W", help="score W windows (with --horizon)")
-    parser.add_argument(
-        "--horizon", type=positive, metavar="T", help="time of the free run in a window, in the data's unit of time"
-    )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="write the predicted motion: .csv or .npz, and a .png")
-    add_column_flags(parser)
-    add_force_flag(parser)
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
-    parser.set_defaults(run=run)
+HELP = "score a run on another recording"
+FLAGS = (
+    flag("source", "folder that `herglotz fit` or `select` wrote", metavar="RUN", type=Path),
+    flag("data", "recording of the same coordinates, in the same units", metavar="DATA", type=existing),
+    flag("--warmup", "samples that the state is estimated from, at least 3 (default %(default)s)",
+         type=count, default=WARMUP, metavar="K"),
+    flag("--windows", "score W windows (with --horizon)", type=count, metavar="W"),
+    flag("--horizon", "time of the free run in a window, in the data's unit of time", type=positive, metavar="T"),
+    flag("--out", "write the predicted motion: .csv or .npz, and a .png", type=Path, metavar="FILE"),
+    *SENSORS,
+    FORCE,
+    flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
+    *CSV,
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from herglotz.cli.common import check_output_folder, existing
-from herglotz.cli.flags import add_column_flags, columns_of
+from herglotz.cli.common import check_output_folder, existing, flag
+from herglotz.cli.flags import CSV, SENSORS, columns_of
 
 DESCRIPTION = """\
 Write report.html, one self-contained page, and report.md, its words and tables: the verdict first, then the learned
@@ -19,14 +19,13 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("report", help="write an HTML report of a run", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
-    parser.add_argument("--against", type=existing, metavar="DATA", help="another recording to score the model on")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for both files (default: RUN)")
-    add_column_flags(parser)
-    parser.set_defaults(run=run)
+HELP = "write an HTML report of a run"
+FLAGS = (
+    flag("source", "folder that `herglotz fit` or `select` wrote", metavar="RUN", type=Path),
+    flag("--against", "another recording to score the model on", type=existing, metavar="DATA"),
+    flag("--out", "folder for both files (default: RUN)", type=Path, metavar="FOLDER"),
+    *SENSORS, *CSV,
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

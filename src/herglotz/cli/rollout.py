@@ -11,8 +11,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import check_output_file, count, existing, finite, positive, print_json, say
-from herglotz.cli.flags import add_force_flag, add_trust_flag
+from herglotz.cli.common import check_output_file, count, existing, finite, flag, positive, print_json, say
+from herglotz.cli.flags import FORCE, TRUST
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -61,39 +61,28 @@ class Source:
     columns: Sequence[Sequence[str]] = ()  # name, role and unit of each column of the fit's table
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("rollout", help="step a model and write the motion", description=DESCRIPTION)
-    parser.add_argument(
-        "source", metavar="RUN|FILE", type=Path,
-        help="folder of a run, or an exported model: .pt2, .onnx or a C header .h",
-    )  # fmt: skip
-    parser.add_argument("--steps", required=True, type=count, metavar="K", help="number of steps, at least 2")
-    parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
-    parser.add_argument("--h", type=positive, help="step, in the data's unit of time (default: the model's)")
-    parser.add_argument("--q0", type=finite, nargs="+", help="initial position, one number a coordinate")
-    parser.add_argument("--p0", type=finite, nargs="+", help="initial momentum, one number a coordinate (with --q0)")
-    parser.add_argument("--s0", type=finite, help="initial action (default 0 with --q0, else the fitted one)")
-    parser.add_argument(
-        "--trajectory", type=count, default=0, metavar="B",
-        help="trajectory of the run whose last fitted state to start from, counted from 0 (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--u", type=finite, nargs="+", metavar="U",
-        help="constant input of a driven model, one number an input (default: no input acts)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--inputs", type=existing, metavar="FILE",
-        help="times and inputs (positions may stand beside them) that drive the model, each at its own time: K samples "
-        "from the start's time on (with --q0: from the first), at their own steps unless --h",
-    )  # fmt: skip
-    parser.add_argument(
-        "--t0", type=finite, metavar="T", help="time of the start (default: of the fitted state; 0 with --q0)"
-    )
-    add_force_flag(parser)
-    add_trust_flag(parser)
-    parser.add_argument("--json", action="store_true", help="print a summary as JSON")
-    parser.set_defaults(run=run)
+HELP = "step a model and write the motion"
+FLAGS = (
+    flag("source", "folder of a run, or an exported model: .pt2, .onnx or a C header .h",
+         metavar="RUN|FILE", type=Path),
+    flag("--steps", "number of steps, at least 2", required=True, type=count, metavar="K"),
+    flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),
+    flag("--h", "step, in the data's unit of time (default: the model's)", type=positive),
+    flag("--q0", "initial position, one number a coordinate", type=finite, nargs="+"),
+    flag("--p0", "initial momentum, one number a coordinate (with --q0)", type=finite, nargs="+"),
+    flag("--s0", "initial action (default 0 with --q0, else the fitted one)", type=finite),
+    flag("--trajectory", "trajectory of the run whose last fitted state to start from, counted from 0 (default "
+         "%(default)s)", type=count, default=0, metavar="B"),
+    flag("--u", "constant input of a driven model, one number an input (default: no input acts)",
+         type=finite, nargs="+", metavar="U"),
+    flag("--inputs", "times and inputs (positions may stand beside them) that drive the model, each at its own time: K "
+         "samples from the start's time on (with --q0: from the first), at their own steps unless --h",
+         type=existing, metavar="FILE"),
+    flag("--t0", "time of the start (default: of the fitted state; 0 with --q0)", type=finite, metavar="T"),
+    FORCE,
+    TRUST,
+    flag("--json", "print a summary as JSON", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,9 +7,9 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from herglotz.cli.common import count, exit_code, print_json, print_next_of
-from herglotz.cli.flags import add_progress_flags, add_run_flags, check_run_folder, columns_of, progress
-from herglotz.cli.settings import LEVELS, add_machine_flags, data_of, settings_of
+from herglotz.cli.common import count, exit_code, flag, print_json, print_next_of
+from herglotz.cli.flags import CSV, PROGRESS, RUN, check_run_folder, columns_of, progress
+from herglotz.cli.settings import LEVELS, MACHINE, data_of, settings_of
 
 DESCRIPTION = """\
 Fit every level of the ladder from several seeds on the first part of each trajectory, compare free runs over the rest,
@@ -23,19 +23,17 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("select", help="compare kinds of damping, keep the simplest", description=DESCRIPTION)
-    add_run_flags(parser)
-    parser.add_argument(
-        "--levels",
-        help=f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); default: all "
-        "but full, and auto where nothing is said of the terms; with recorded inputs u: forced and auto",
-    )
-    parser.add_argument("--seeds", type=count, default=3, help="fits a level (default %(default)s)")
-    add_progress_flags(parser)
-    add_machine_flags(parser)
-    parser.set_defaults(run=run)
+USAGE = "%(prog)s DATA --out RUN [flag ...]"  # all of the flags are twenty lines
+HELP = "compare kinds of damping, keep the simplest"
+FLAGS = (
+    *RUN,
+    flag("--levels", f"levels to compare, with commas, of {', '.join(LEVELS)}, auto (what fit does by itself); "
+         "default: all but full, and auto where nothing is said of the terms; with recorded inputs u: forced and auto"),
+    flag("--seeds", "fits a level (default %(default)s)", type=count, default=3),
+    *PROGRESS,
+    *MACHINE,
+    *CSV,
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -9,7 +9,7 @@ from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import count, existing, finite, positive, say, seed
+from herglotz.cli.common import Flag, count, existing, finite, flag, positive, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -86,166 +86,6 @@ def _read(path: Path) -> tuple[FitConfig, dict[str, Any]]:
         raise InputError(f"--config {file}: {line}; give the config.json of a run, or the run's folder") from None
 
 
-def add_data_settings(parser: argparse._ActionsContainer) -> None:
-    """Add --config and --train-fraction."""
-    parser.add_argument(
-        "--config", type=existing, metavar="FILE",
-        help="settings that another run was told, and how its data were read: its folder or its config.json; flags "
-        "that are given stand over them. On the same data it is the same fit",
-    )  # fmt: skip
-    _setting(
-        parser, "--train-fraction", type=finite, metavar="F",
-        help="part of every trajectory, in time, to train on, 0 < F <= 1 (default 0.667)",
-    )  # fmt: skip
-
-
-def add_machine_flags(parser: argparse._ActionsContainer) -> None:
-    """Add --seed, --device, --dtype and --json."""
-    _setting(parser, "--seed", type=seed, help="seed of the initial weights (default 0)")
-    _setting(parser, "--device", metavar="D", help="cpu or cuda (default cpu)")
-    _setting(parser, "--dtype", choices=DTYPES, help="precision (default float64)")
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
-
-
-def add_model_flags(parser: argparse._ActionsContainer) -> None:
-    """What the Lagrangian may hold."""
-    _setting(
-        parser, "--level", choices=("auto", *LEVELS),
-        help="auto: forced with dry friction where inputs u are recorded, else linear; for two or three joints what "
-        "the data show. conservative: no damping. linear: one damping rate. affine: damping depends on position and "
-        "velocity. full: on s as well. forced: one rate, and friction of each joint (default auto)",
-    )  # fmt: skip
-    _setting(
-        parser, "--order", type=int, choices=(2, 4),
-        help="of the rule; 4: from the features alone, without networks (default 2)",
-    )  # fmt: skip
-    _setting(
-        parser, "--sticking", action=argparse.BooleanOptionalAction,
-        help="dry friction that can hold a joint still (forced); default: where driven data show it",
-    )  # fmt: skip
-    _setting(
-        parser, "--term", field="terms", action="append", metavar="NAME",
-        help="a term of herglotz.models.TERMS; may be repeated",
-    )  # fmt: skip
-    _setting(parser, "--coupled", action="store_true", help="friction of differences of speeds: hinges (forced)")
-    _setting(
-        parser, "--drag", action="append", metavar="TEXT",
-        help="a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', '(v1 - v2)' of a "
-        "damper between two, '|v| v' of air, or a constant one, 'load 1' (forced); may be given again",
-    )  # fmt: skip
-    _setting(parser, "--diagonal", action="store_true", help="a mass for each coordinate, none between two: bodies")
-    _setting(
-        parser, "--absent", action="append", metavar="NUMBER",
-        help="a number of the model that is 0 and not learned, 'potential.tilt[0]'; may be given again",
-    )  # fmt: skip
-    _setting(parser, "--alike", action="store_true", help="one mass for all, a potential of features alone: chains")
-
-
-def add_optimiser_flags(parser: argparse._ActionsContainer) -> None:
-    """How it is fitted."""
-    _setting(
-        parser, "--objective", choices=OBJECTIVES,
-        help="residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. smoothing: "
-        "every state, and a little noise in every step, for pushes and chaos. auto: the first or the "
-        "second, by the noise. raw: a plain network on |R|, which collapses, for demonstration (default auto)",
-    )  # fmt: skip
-    _setting(
-        parser, "--optimiser", choices=OPTIMISERS,
-        help="lm: Levenberg–Marquardt. adam, adamw: for residual and raw only (default lm)",
-    )  # fmt: skip
-    _setting(
-        parser, "--batch", type=count, metavar="B", help="triples of samples in a step of adam or adamw (default: all)"
-    )
-    _setting(
-        parser, "--robust", choices=ROBUST,
-        help="a loss that outliers cannot pull, and spikes left out. auto: where the data show outliers "
-        "(default auto)",
-    )  # fmt: skip
-    _setting(
-        parser, "--find-zeros", action="store_true",
-        help="look for zeros of the sensors that differ between recordings, kept where free runs over held-out time "
-        "ask for them (default: all recordings agree, or --sensor-zeros says it)",
-    )  # fmt: skip
-    _setting(
-        parser, "--supervision", choices=SUPERVISION,
-        help="what the one-step objective is fitted to: positions, s beside them, or momenta as well, where they are "
-        "recorded (default q)",
-    )  # fmt: skip
-    _setting(
-        parser, "--restarts", type=count, metavar="R",
-        help="random initialisations of the one-step fit; the best after 30 iterations is kept (default: 4 for a "
-        "correction of one layer, else 1)",
-    )  # fmt: skip
-    _add_amount_flags(parser)
-
-
-def _add_amount_flags(parser: argparse._ActionsContainer) -> None:
-    """How many samples, steps and iterations, and how strong a prior."""
-    _setting(
-        parser, "--substeps", type=count, metavar="M",
-        help="model steps in a recorded step, for samples far apart; with --objective trajectory (default 1)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--every", type=count, metavar="M",
-        help="use every M-th sample only; inputs are averaged over the steps (default 1)",
-    )  # fmt: skip
-    _setting(
-        parser, "--iterations", type=count, metavar="K",
-        help="bound on the iterations of the one-step objectives (default 400)",
-    )  # fmt: skip
-    _setting(
-        parser, "--departures", type=positive, nargs="+", metavar="TAU",
-        help="prior strengths on the networks that held-out blocks choose from; one fixes it (default: 2e-4 to 6e-3)",
-    )  # fmt: skip
-
-
-def add_expert_flags(parser: argparse._ActionsContainer) -> None:
-    """What the user knows of the system."""
-    _setting(
-        parser, "--feature", field="features", action="append", metavar="TEXT",
-        help="what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of K), "
-        "'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics, revolute, lengths); may be "
-        "given again",
-    )  # fmt: skip
-    _setting(
-        parser, "--known", action="append", metavar="TEXT",
-        help="what is known of L = K - V, with its numbers (the first mass is 1): --known='-9.81 cos(q1)' is a "
-        "pendulum's V: no velocity is in it. May be given again",
-    )  # fmt: skip
-    _setting(
-        parser, "--frequency", field="frequencies", type=positive, action="append", metavar="NU",
-        help="angular frequency, in rad per unit of time, of a periodic force whose amplitude and phase are learned; "
-        "for a recording without inputs. May be given again",
-    )  # fmt: skip
-    _setting(
-        parser, "--translation", field="translations", action="append", metavar="TEXT",
-        help="a symmetry that the model is to have, named by what moves together: 'q1 + q2 + q3', or 'q1' alone; what "
-        "herglotz verify RUN --symmetries finds. May be given again",
-    )  # fmt: skip
-    _setting(
-        parser, "--ignore-inputs", field="use_inputs", action="store_false", help="fit as if no input u were recorded"
-    )
-    _setting(
-        parser, "--input-map", type=finite, nargs="+", metavar="G",
-        help="the map from inputs to forces, row by row, where it is known (default: learned); the first mass is 1",
-    )  # fmt: skip
-    parser.add_argument(
-        "--hold", choices=HOLDS,
-        help="what the inputs do between samples: nothing, straight lines or polynomials (default: what the file says, "
-        "or what explains the data best)",
-    )  # fmt: skip
-
-    for flag, what in (
-        ("--input-delay", "time by which inputs act later"),
-        ("--actuator-lag", "time constant of the actuator"),
-    ):
-        _setting(
-            parser, flag, type=_duration, metavar="T",
-            help=f"{what}, in the data's unit; none, or auto, as without this flag: what the file says or else what "
-            "explains the data best",
-        )  # fmt: skip
-
-
 def _duration(text: str) -> float | None:
     """None for auto, 0 for none, or a time that is not negative (argparse type)."""
     known = {"auto": None, "none": 0.0}
@@ -256,7 +96,98 @@ def _duration(text: str) -> float | None:
     return value
 
 
-def _setting(parser: argparse._ActionsContainer, flag: str, *, field: str | None = None, **options: Any) -> None:
+def setting(name: str, text: str, *, field: str | None = None, **options: Any) -> Flag:
     """A flag of one field of `FitConfig`, in the namespace only where it is given."""
-    dest = field or flag.removeprefix("--").replace("-", "_")
-    parser.add_argument(flag, dest=dest, default=argparse.SUPPRESS, **options)
+    dest = field or name.removeprefix("--").replace("-", "_")
+    return flag(name, text, dest=dest, default=argparse.SUPPRESS, **options)
+
+
+# Whose settings, and on what part of the data.
+DATA = (
+    flag("--config", "settings that another run was told, and how its data were read: its folder or its config.json; "
+         "flags that are given stand over them. On the same data it is the same fit", type=existing, metavar="FILE"),
+    setting("--train-fraction", "part of every trajectory, in time, to train on, 0 < F <= 1 (default 0.667)",
+            type=finite, metavar="F"),
+)  # fmt: skip
+# Where and how it runs.
+MACHINE = (
+    setting("--seed", "seed of the initial weights (default 0)", type=seed),
+    setting("--device", "cpu or cuda (default cpu)", metavar="D"),
+    setting("--dtype", "precision (default float64)", choices=DTYPES),
+    flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
+)  # fmt: skip
+# What the Lagrangian may hold.
+MODEL = (
+    "model",
+    setting("--level", "auto: forced with dry friction where inputs u are recorded, else linear; for two or three "
+            "joints what the data show. conservative: no damping. linear: one damping rate. affine: damping depends on "
+            "position and velocity. full: on s as well. forced: one rate, and friction of each joint (default auto)",
+            choices=("auto", *LEVELS)),
+    setting("--order", "of the rule; 4: from the features alone, without networks (default 2)",
+            type=int, choices=(2, 4)),
+    setting("--sticking", "dry friction that can hold a joint still (forced); default: where driven data show it",
+            action=argparse.BooleanOptionalAction),
+    setting("--term", "a term of herglotz.models.TERMS; may be repeated",
+            field="terms", action="append", metavar="NAME"),
+    setting("--coupled", "friction of differences of speeds: hinges (forced)", action="store_true"),
+    setting("--drag", "a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', '(v1 - "
+            "v2)' of a damper between two, '|v| v' of air, or a constant one, 'load 1' (forced); may be given again",
+            action="append", metavar="TEXT"),
+    setting("--diagonal", "a mass for each coordinate, none between two: bodies", action="store_true"),
+    setting("--absent", "a number of the model that is 0 and not learned, 'potential.tilt[0]'; may be given again",
+            action="append", metavar="NUMBER"),
+    setting("--alike", "one mass for all, a potential of features alone: chains", action="store_true"),
+)  # fmt: skip
+# How it is fitted: the objective; samples, steps and iterations; how strong a prior.
+OPTIMISER = (
+    "objective and optimiser",
+    setting("--objective", "residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. "
+            "smoothing: every state, and a little noise in every step, for pushes and chaos. auto: the first or the "
+            "second, by the noise. raw: a plain network on |R|, which collapses, for demonstration (default auto)",
+            choices=OBJECTIVES),
+    setting("--optimiser", "lm: Levenberg–Marquardt. adam, adamw: for residual and raw only (default lm)",
+            choices=OPTIMISERS),
+    setting("--batch", "triples of samples in a step of adam or adamw (default: all)", type=count, metavar="B"),
+    setting("--robust", "a loss that outliers cannot pull, and spikes left out. auto: where the data show outliers "
+            "(default auto)", choices=ROBUST),
+    setting("--find-zeros", "look for zeros of the sensors that differ between recordings, kept where free runs over "
+            "held-out time ask for them (default: all recordings agree, or --sensor-zeros says it)",
+            action="store_true"),
+    setting("--supervision", "what the one-step objective is fitted to: positions, s beside them, or momenta as well, "
+            "where they are recorded (default q)", choices=SUPERVISION),
+    setting("--restarts", "random initialisations of the one-step fit; the best after 30 iterations is kept (default: "
+            "4 for a correction of one layer, else 1)", type=count, metavar="R"),
+    setting("--substeps", "model steps in a recorded step, for samples far apart; with --objective trajectory (default "
+            "1)", type=count, metavar="M"),
+    flag("--every", "use every M-th sample only; inputs are averaged over the steps (default 1)",
+         type=count, metavar="M"),
+    setting("--iterations", "bound on the iterations of the one-step objectives (default 400)",
+            type=count, metavar="K"),
+    setting("--departures", "prior strengths on the networks that held-out blocks choose from; one fixes it (default: "
+            "2e-4 to 6e-3)", type=positive, nargs="+", metavar="TAU"),
+)  # fmt: skip
+AS_TOLD = (
+    "in the data's unit; none, or auto, as without this flag: what the file says or else what explains the data best"
+)
+# What the user knows of the system.
+EXPERT = (
+    "what is known (expert)",
+    setting("--feature", "what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of "
+            "K), 'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics, revolute, "
+            "lengths); may be given again", field="features", action="append", metavar="TEXT"),
+    setting("--known", "what is known of L = K - V, with its numbers (the first mass is 1): --known='-9.81 cos(q1)' is "
+            "a pendulum's V: no velocity is in it. May be given again", action="append", metavar="TEXT"),
+    setting("--frequency", "angular frequency, in rad per unit of time, of a periodic force whose amplitude and phase "
+            "are learned; for a recording without inputs. May be given again",
+            field="frequencies", type=positive, action="append", metavar="NU"),
+    setting("--translation", "a symmetry that the model is to have, named by what moves together: 'q1 + q2 + q3', or "
+            "'q1' alone; what herglotz verify RUN --symmetries finds. May be given again",
+            field="translations", action="append", metavar="TEXT"),
+    setting("--ignore-inputs", "fit as if no input u were recorded", field="use_inputs", action="store_false"),
+    setting("--input-map", "the map from inputs to forces, row by row, where it is known (default: learned); the first "
+            "mass is 1", type=finite, nargs="+", metavar="G"),
+    flag("--hold", "what the inputs do between samples: nothing, straight lines or polynomials (default: what the file "
+         "says, or what explains the data best)", choices=HOLDS),
+    setting("--input-delay", f"time by which inputs act later, {AS_TOLD}", type=_duration, metavar="T"),
+    setting("--actuator-lag", f"time constant of the actuator, {AS_TOLD}", type=_duration, metavar="T"),
+)  # fmt: skip

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_file, count, finite, positive, print_json, print_next, say, seed
-from herglotz.cli.flags import add_force_flag
+from herglotz.cli.common import check_output_file, count, finite, flag, positive, print_json, print_next, say, seed
+from herglotz.cli.flags import FORCE
 from herglotz.errors import InputError
 
 ABOUT = """\
@@ -40,37 +40,24 @@ class Help(argparse.Action):
         parser.exit()
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("simulate", help="write data of a scene with a known answer", add_help=False)
-    parser.add_argument("-h", "--help", action=Help, nargs=0, help="show this help message and exit")
-    parser.add_argument("scene", metavar="SCENE", help="name of the scene")
-    parser.add_argument("--out", required=True, type=Path, metavar="FILE", help="file to write: .csv or .npz")
-    parser.add_argument(
-        "--trajectories", type=count, default=4, metavar="N", help="number of motions (default %(default)s)"
-    )
-    parser.add_argument(
-        "--steps", type=count, default=100, metavar="K", help="steps of each, so K + 1 samples (default %(default)s)"
-    )
-    parser.add_argument(
-        "--h", type=positive, metavar="H", help="time between samples, in the scene's unit of time (default: its own)"
-    )
-    parser.add_argument(
-        "--noise", type=finite, default=0.0, metavar="S",
-        help="standard deviation of Gaussian noise on the positions, in their unit (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--gaps", type=count, default=0, metavar="G",
-        help="runs of 1 to 3 samples deleted from each motion (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--seed", type=seed, default=0, help="seed of starts, noise and gaps (default %(default)s)")
-    parser.add_argument(
-        "--param", action="append", default=[], metavar="NAME=VALUE",
-        help="parameter of the scene, for example gamma=0.3; may come more than once",
-    )  # fmt: skip
-    add_force_flag(parser)
-    parser.add_argument("--json", action="store_true", help="print what was written as JSON")
-    parser.set_defaults(run=run)
+HELP = "write data of a scene with a known answer"
+FLAGS = (
+    flag("-h", "--help", "show this help message and exit", action=Help, nargs=0),
+    flag("scene", "name of the scene", metavar="SCENE"),
+    flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),
+    flag("--trajectories", "number of motions (default %(default)s)", type=count, default=4, metavar="N"),
+    flag("--steps", "steps of each, so K + 1 samples (default %(default)s)", type=count, default=100, metavar="K"),
+    flag("--h", "time between samples, in the scene's unit of time (default: its own)", type=positive, metavar="H"),
+    flag("--noise", "standard deviation of Gaussian noise on the positions, in their unit (default %(default)s)",
+         type=finite, default=0.0, metavar="S"),
+    flag("--gaps", "runs of 1 to 3 samples deleted from each motion (default %(default)s)",
+         type=count, default=0, metavar="G"),
+    flag("--seed", "seed of starts, noise and gaps (default %(default)s)", type=seed, default=0),
+    flag("--param", "parameter of the scene, for example gamma=0.3; may come more than once",
+         action="append", default=[], metavar="NAME=VALUE"),
+    FORCE,
+    flag("--json", "print what was written as JSON", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

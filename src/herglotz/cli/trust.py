@@ -7,7 +7,7 @@ from pathlib import Path
 from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import COLUMNS, check_output_folder, finite, print_json, print_table, warn_of_misfit
+from herglotz.cli.common import COLUMNS, check_output_folder, finite, flag, print_json, print_table, warn_of_misfit
 
 if TYPE_CHECKING:
     from herglotz.training import Bands, Laplace, Run
@@ -26,18 +26,15 @@ examples:
 UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("trust", help="how far to trust a run", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` or `select` wrote")
-    parser.add_argument(
-        "--with", dest="others", type=Path, nargs="+", default=[], metavar="RUN",
-        help="fits of the same data from other seeds: bands of the ensemble instead of one run's",
-    )  # fmt: skip
-    parser.add_argument("--level", type=finite, default=0.9, help="of the bands, in (0, 1) (default %(default)s)")
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for bands.png (default: RUN)")
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
-    parser.set_defaults(run=run)
+HELP = "how far to trust a run"
+FLAGS = (
+    flag("source", "folder that `herglotz fit` or `select` wrote", metavar="RUN", type=Path),
+    flag("--with", "fits of the same data from other seeds: bands of the ensemble instead of one run's",
+         dest="others", type=Path, nargs="+", default=[], metavar="RUN"),
+    flag("--level", "of the bands, in (0, 1) (default %(default)s)", type=finite, default=0.9),
+    flag("--out", "folder for bands.png (default: RUN)", type=Path, metavar="FOLDER"),
+    flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from herglotz.cli.common import KICKS, check_output_folder, count, positive, print_json, print_next, say, seed
+from herglotz.cli.common import KICKS, check_output_folder, count, flag, positive, print_json, print_next, say, seed
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -31,36 +31,26 @@ examples:
 """
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("tune", help="trade speed for accuracy", description=DESCRIPTION)
-    parser.add_argument("source", metavar="RUN", type=Path, help="folder that `herglotz fit` wrote")
-    parser.add_argument("--max-error", type=positive, metavar="E", help="largest error of a position, in its unit")
-    parser.add_argument("--budget-us", type=positive, metavar="C", help="microseconds per unit of simulated time")
-    parser.add_argument(
-        "--horizon", type=positive, metavar="T",
-        help="length of the motions, in the data's unit of time (default: a typical trajectory, at most 200 steps)",
-    )  # fmt: skip
-    parser.add_argument("--out", type=Path, metavar="FOLDER", help="folder for the result (default: RUN/tuned)")
-    parser.add_argument(
-        "--multiples", default="1,2,4,8", metavar="M",
-        help="steps to try, in steps of the run, with commas (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--widths", default="8,16", metavar="W",
-        help="hidden units of the re-trained corrections, with commas, or none (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--kicks", default="5,7", metavar="K",
-        help="numbers of kicks in an explicit large step, with commas, or none; tried in C where the model has one "
-        "coordinate and one damping rate (default %(default)s)",
-    )  # fmt: skip
-    parser.add_argument("--no-c", action="store_true", help="PyTorch only")
-    parser.add_argument("--starts", type=count, default=128, help="number of motions that choose (default %(default)s)")
-    parser.add_argument("--iterations", type=count, default=80, help="most in a re-training (default %(default)s)")
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the starts (default %(default)s)")
-    parser.add_argument("--json", action="store_true", help="print the numbers as JSON, and nothing else")
-    parser.set_defaults(run=run)
+HELP = "trade speed for accuracy"
+FLAGS = (
+    flag("source", "folder that `herglotz fit` wrote", metavar="RUN", type=Path),
+    flag("--max-error", "largest error of a position, in its unit", type=positive, metavar="E"),
+    flag("--budget-us", "microseconds per unit of simulated time", type=positive, metavar="C"),
+    flag("--horizon", "length of the motions, in the data's unit of time (default: a typical trajectory, at most 200 "
+         "steps)", type=positive, metavar="T"),
+    flag("--out", "folder for the result (default: RUN/tuned)", type=Path, metavar="FOLDER"),
+    flag("--multiples", "steps to try, in steps of the run, with commas (default %(default)s)",
+         default="1,2,4,8", metavar="M"),
+    flag("--widths", "hidden units of the re-trained corrections, with commas, or none (default %(default)s)",
+         default="8,16", metavar="W"),
+    flag("--kicks", "numbers of kicks in an explicit large step, with commas, or none; tried in C where the model has "
+         "one coordinate and one damping rate (default %(default)s)", default="5,7", metavar="K"),
+    flag("--no-c", "PyTorch only", action="store_true"),
+    flag("--starts", "number of motions that choose (default %(default)s)", type=count, default=128),
+    flag("--iterations", "most in a re-training (default %(default)s)", type=count, default=80),
+    flag("--seed", "seed of the starts (default %(default)s)", type=seed, default=0),
+    flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

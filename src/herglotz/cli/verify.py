@@ -8,8 +8,8 @@ import math
 from pathlib import Path
 from typing import Any
 
-from herglotz.cli.common import check_output_folder, count, positive, print_json, seed
-from herglotz.cli.flags import add_trust_flag
+from herglotz.cli.common import check_output_folder, count, flag, positive, print_json, seed
+from herglotz.cli.flags import TRUST
 from herglotz.errors import InputError
 
 DESCRIPTION = """\
@@ -29,29 +29,20 @@ examples:
 AGREEMENT = {"float64": 1e-9, "float32": 1e-3}
 
 
-def add(commands: argparse._SubParsersAction) -> None:
-    """Add the subcommand."""
-    parser = commands.add_parser("verify", help="check the identities of the theory", description=DESCRIPTION)
-    parser.add_argument("target", metavar="SCENE|RUN|FILE", help="a scene, the folder of a run, or an exported file")
-    parser.add_argument("--h", type=positive, help="step (default: the scene's or the model's own)")
-    parser.add_argument("--samples", type=count, default=64, help="states to check at (default %(default)s)")
-    parser.add_argument(
-        "--steps", type=count, default=8, help="steps of the checks along motions (default %(default)s)"
-    )
-    parser.add_argument("--seed", type=seed, default=0, help="seed of the states (default %(default)s)")
-    parser.add_argument(
-        "--against",
-        type=Path,
-        metavar="RUN",
-        help="run that a file was exported from (default: a run with its weights nearby)",
-    )
-    parser.add_argument("--plots", type=Path, metavar="FOLDER", help="draw the identities of S^k of a SCENE or RUN too")
-    parser.add_argument(
-        "--symmetries", action="store_true", help="find translations, rotations and their momenta J of a SCENE or RUN"
-    )
-    add_trust_flag(parser)
-    parser.add_argument("--json", action="store_true", help="print the report as JSON, and nothing else")
-    parser.set_defaults(run=run)
+HELP = "check the identities of the theory"
+FLAGS = (
+    flag("target", "a scene, the folder of a run, or an exported file", metavar="SCENE|RUN|FILE"),
+    flag("--h", "step (default: the scene's or the model's own)", type=positive),
+    flag("--samples", "states to check at (default %(default)s)", type=count, default=64),
+    flag("--steps", "steps of the checks along motions (default %(default)s)", type=count, default=8),
+    flag("--seed", "seed of the states (default %(default)s)", type=seed, default=0),
+    flag("--against", "run that a file was exported from (default: a run with its weights nearby)",
+         type=Path, metavar="RUN"),
+    flag("--plots", "draw the identities of S^k of a SCENE or RUN too", type=Path, metavar="FOLDER"),
+    flag("--symmetries", "find translations, rotations and their momenta J of a SCENE or RUN", action="store_true"),
+    TRUST,
+    flag("--json", "print the report as JSON, and nothing else", action="store_true"),
+)  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

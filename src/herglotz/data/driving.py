@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 CLOSE = 1e-3  # of a step: a start this near to a recorded time is at that time
 
 
-def clean(values: Tensor, digits: int = 14) -> Tensor:
+def clean(values: Tensor) -> Tensor:
     """Numbers without the last two digits of float64, so that 0.1 + 0.2 prints as 0.3."""
-    return torch.tensor([float(f"{x:.{digits}g}") for x in values.double().tolist()], dtype=torch.float64)
+    return torch.tensor([float(f"{x:.14g}") for x in values.double().tolist()], dtype=torch.float64)
 
 
 def even_times(t0: float, h: float, steps: int) -> Tensor:

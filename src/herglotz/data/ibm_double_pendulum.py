@@ -16,7 +16,7 @@ MARKERS = ("x_red", "y_red", "x_green", "y_green", "x_blue", "y_blue")
 RATE = 400.0  # frames per second
 
 
-def read_ibm_double_pendulum(path: PathLike, *, rate: float = RATE) -> Trajectories:
+def read_ibm_double_pendulum(path: PathLike) -> Trajectories:
     """Read one run: rows of six integers without a header, one row a video frame.
 
     Returns
@@ -30,8 +30,6 @@ def read_ibm_double_pendulum(path: PathLike, *, rate: float = RATE) -> Trajector
     InputError
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
-    if not rate > 0:
-        raise InputError(f"rate must be > 0 frames per second, got {rate:g}")
     path, rows = Path(path), []
     for i, line in enumerate(read_lines(path), 1):
         if not line.strip():
@@ -53,7 +51,7 @@ def read_ibm_double_pendulum(path: PathLike, *, rate: float = RATE) -> Trajector
         at = int(flat.nonzero()[0]) + 1
         raise InputError(f"{path}, row {at}: two markers lie on one point, so an arm has no angle; delete the row")
     return Trajectories.of(
-        torch.arange(len(rows), dtype=torch.float64) / rate,
+        torch.arange(len(rows), dtype=torch.float64) / RATE,
         torch.atan2(arms[..., 1], arms[..., 0]),
         names=("theta1", "theta2"),
         angles=(True, True),

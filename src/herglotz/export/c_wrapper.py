@@ -23,23 +23,28 @@ from herglotz.export.trusted import private_folder
 # No -ffast-math: a shared library built with it flushes denormals of the whole process, and drops the compensation of
 # rounding. Fused multiply-adds are what -std=c99 alone would turn off.
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast")
+# By the variable that names a compiler: its language, the names that are looked for, and the one to install.
+COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", "clang++", "c++"), "g++")}
 
 
-def compiler() -> list[str]:
-    """The C compiler: $CC, or cc, gcc or clang from the PATH.
+def compiler(variable: str = "CC") -> list[str]:
+    """The compiler of C (or, of `COMPILERS`, another): what the variable names, or the first that is in the PATH.
 
     Raises
     ------
     InputError
         If there is none.
     """
-    given = shlex.split(os.environ.get("CC", ""))
-    for words in [given] if given else [["cc"], ["gcc"], ["clang"]]:
+    language, names, wanted = COMPILERS[variable]
+    given = shlex.split(os.environ.get(variable, ""))
+    for words in [given] if given else [[name] for name in names]:
         found = shutil.which(words[0])
         if found:
             return [found, *words[1:]]
-    missing = f"$CC names '{given[0]}', which is not there" if given else "no C compiler (cc, gcc, clang) in the PATH"
-    raise InputError(f"{missing}; install one, for example with: apt install gcc")
+    missing = f"no {language} compiler ({', '.join(names)}) in the PATH"
+    if given:
+        missing = f"${variable} names '{given[0]}', which is not there"
+    raise InputError(f"{missing}; install one, for example with: apt install {wanted}")
 
 
 def build(header: str, loops: str) -> ctypes.CDLL:

@@ -97,9 +97,9 @@ def describe(
         If h, box, units or further entries are not usable.
     """
     dtype, n = next(model.parameters()).dtype, model.config.dof
+    wrong_dtype = dtype not in (torch.float32, torch.float64)
     refuse({
-        f"export needs a float32 or float64 model, got {dtype}; convert it with .double()":
-            dtype not in (torch.float32, torch.float64),
+        f"export needs a float32 or float64 model, got {dtype}; convert it with .double()": wrong_dtype,
         f"h must be a finite number > 0, got {h}": not 0 < float(h) < float("inf"),
         f"units needs one entry a coordinate ({n}), got {list(units)}": units and len(units) != n,
         f"newton_iterations must be at least 2, got {newton_iterations}; 30 suits most models": newton_iterations < 2,
@@ -122,8 +122,7 @@ def describe(
         "newton_iterations": newton_iterations,
         "newton_tolerance": TOLERANCE * torch.finfo(dtype).eps,
     }
-    taken = sorted(set(extra) & set(entries))
-    if taken:
+    if taken := sorted(set(extra) & set(entries)):
         raise InputError(f"metadata may not replace {', '.join(taken)}; use another name")
     entries.update(extra)
     if (span := entries.get("h_range")) is not None and not (len(span) == 2 and 0 < span[0] <= h <= span[1]):

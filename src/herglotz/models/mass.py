@@ -28,10 +28,8 @@ class PositionKinetic(nn.Module):
         n = config.dof
         self.angles, self.scale = config.angles, config.scale
         self.constant = Kinetic(n)
-        self.network = Network(
-            feature_count(config.angles), config.mass_width, config.mass_depth, 0.3, generator,
-            outputs=n * (n + 1) // 2, activation=config.activation,
-        )  # fmt: skip
+        sizes = [feature_count(config.angles), *[config.mass_width] * config.mass_depth]
+        self.network = Network(sizes, 0.3, generator, outputs=n * (n + 1) // 2, activation=config.activation)
         row, column = torch.tril_indices(n, n, -1)
         place = torch.zeros(n, len(row), dtype=torch.float64)
         place[column, torch.arange(len(row))] = 1.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -20,9 +21,7 @@ class Network(nn.Module):
 
     def __init__(
         self,
-        inputs: int,  # m
-        width: int,  # hidden units a layer
-        depth: int,  # hidden layers
+        sizes: Sequence[int],  # m, then the hidden units of each layer
         gain: float,  # size of the initial weights relative to 1/√inputs: below 1 the network starts smooth
         generator: torch.Generator,
         *,
@@ -32,16 +31,15 @@ class Network(nn.Module):
     ):
         super().__init__()
         self.activation, self.scalar = activation, outputs is None
-        sizes = [inputs] + [width] * depth
         self.weights = nn.ParameterList()
         self.biases = nn.ParameterList()
         for a, b in pairwise(sizes):
             weight, bias = (torch.randn(b, k, generator=generator, dtype=torch.float64) for k in (a, 1))
             self.weights.append(nn.Parameter(weight * (gain / a**0.5)))
             self.biases.append(nn.Parameter(bias[:, 0] * gain))
-        last = torch.zeros(outputs or 1, width, dtype=torch.float64)
+        last = torch.zeros(outputs or 1, sizes[-1], dtype=torch.float64)
         if not zero:
-            last = torch.randn(outputs or 1, width, generator=generator, dtype=torch.float64) / width**0.5
+            last = torch.randn(outputs or 1, sizes[-1], generator=generator, dtype=torch.float64) / sizes[-1] ** 0.5
         self.weights.append(nn.Parameter(last))
         self.blind: Tensor | None
         self.register_buffer("blind", None, persistent=False)

@@ -95,8 +95,8 @@ class Potential(nn.Module):
         self.more: tuple[Term, ...] = ()  # the model's terms by name, which it holds itself
         self.network: Network | None = None
         if config.potential_width:
-            count, width, depth = feature_count(config.angles), config.potential_width, config.potential_depth
-            self.network = Network(count, width, depth, 1.0, generator, activation=config.activation)
+            sizes = [feature_count(config.angles), *[config.potential_width] * config.potential_depth]
+            self.network = Network(sizes, 1.0, generator, activation=config.activation)
             self.network.blind = blind(config, 0)
 
     def baseline(self, q: Jet) -> Jet:
@@ -196,6 +196,6 @@ def _of_position_and_velocity(
 ) -> Network:
     """A scalar network of the features of q̄ and v, which does not see the model's translations."""
     inputs = feature_count(config.angles) + config.dof
-    network = Network(inputs, width, depth, gain, generator, zero=zero, activation=config.activation)
+    network = Network([inputs, *[width] * depth], gain, generator, zero=zero, activation=config.activation)
     network.blind = blind(config, config.dof)
     return network

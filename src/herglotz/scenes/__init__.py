@@ -11,7 +11,6 @@ from herglotz.scenes.exact import (
     exact_discrete_lagrangian as exact_discrete_lagrangian,
 )
 from herglotz.scenes.forced_oscillator import ExactForcedOscillator as ExactForcedOscillator
-from herglotz.scenes.galerkin import GalerkinLobatto as GalerkinLobatto, lobatto4 as lobatto4, lobatto6 as lobatto6
 from herglotz.scenes.kepler import kepler as kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag as ExactLinearDrag, linear_drag as linear_drag
 from herglotz.scenes.motion import (

@@ -56,14 +56,11 @@ def _rules(
         system = system_at(u)
         return forced(strang(system.potential, system.m, system.gamma))
 
-    rules: dict[str, DiscreteLagrangian] = {}
-    for name, rule in RULES.items():
-        if name.startswith("lobatto"):  # evaluates L at several nodes at once: no broadcast of u
-            rules[name] = forced(rule(system_at(amplitude).lagrangian))
-        else:
-            rules[name] = DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
-    rules["strang"] = DrivenRule(composed, amplitude)
-    return rules
+    rules: dict[str, DiscreteLagrangian] = {
+        name: DrivenRule(lambda u, r=rule: forced(r(system_at(u).lagrangian)), amplitude)
+        for name, rule in RULES.items()
+    }
+    return rules | {"strang": DrivenRule(composed, amplitude)}
 
 
 def driven_scene(

@@ -21,12 +21,8 @@ from herglotz.scenes.motion import Motion, lagrangian_motion
 from herglotz.scenes.scene import StateFunction
 from herglotz.scenes.special import as_step
 
-NODES = (
-    9,
-    17,
-    33,
-    65,
-)  # in a step, the fewest that reach the tolerance; between two neighbours comes one to judge them
+# In a step, the fewest that reach the tolerance; between two neighbours comes one to judge them.
+NODES = (9, 17, 33, 65)
 
 
 class Reason(IntEnum):

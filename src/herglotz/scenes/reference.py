@@ -23,6 +23,7 @@ Derivative = Callable[[Tensor], Tensor]
 # |weights|: 26 with these six columns; two more would gain order and make it 119, above the tolerance at h ≥ 5.
 SEQUENCE = (2, 4, 6, 8, 10, 12)
 
+TOLERANCE = 1e-13  # of a sample, relative to 1 + |component|: a hundred times the rounding of a step
 HOPELESS = 8  # a sample that is not finite with this many substeps is given up
 
 
@@ -42,12 +43,11 @@ def reference_solve(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
     h: Tensor | float,  # () or (...), of either sign
-    tolerance: float = 1e-13,
     max_substeps: int = 128,
 ) -> ReferenceSolution:
     """Integrate (q, p, s) over time h, and estimate the error.
 
-    A sample keeps the first result that agrees with the one of half its substeps to `tolerance`, so it does not depend
+    A sample keeps the first result that agrees with the one of half its substeps to `TOLERANCE`, so it does not depend
     on the rest of its batch; after `max_substeps` it keeps the last, with whatever `error` says. The result is in the
     dtype of q, and differentiable if the vector field is. `error` belongs to the coarser of the last two results: the
     one returned is better.
@@ -61,18 +61,12 @@ def reference_solve(
         q_dot, p_dot, s_dot = vector_field(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
         return torch.cat([q_dot, p_dot, s_dot[..., None]], -1)
 
-    x, error = integrate(f, x0, h.expand(batch), tolerance, max_substeps)
+    x, error = _integrated(f, x0, h.expand(batch), max_substeps)
     x = x.to(dtype)
     return ReferenceSolution(x[..., :n], x[..., n : 2 * n], x[..., 2 * n], error)
 
 
-def integrate(
-    f: Derivative,  # (..., d) → (..., d)
-    x0: Tensor,  # (..., d)
-    span: Tensor,  # (...)
-    tolerance: float = 1e-13,
-    max_substeps: int = 128,
-) -> tuple[Tensor, Tensor]:
+def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> tuple[Tensor, Tensor]:
     """ẋ = f(x) integrated, the number of substeps doubled from 2 until a sample agrees with itself.
 
     x at the end, (..., d), and the error of the coarser of its last two results, (...).
@@ -84,39 +78,33 @@ def integrate(
     error = torch.full(x0.shape[:-1], torch.inf, dtype=x0.dtype, device=x0.device)
     while True:
         difference = ((finer - x).abs() / (1.0 + finer.abs())).amax(-1).detach()
-        done = error <= tolerance
+        done = error <= TOLERANCE
         x = torch.where(done[..., None], x, finer)
         error = torch.where(done, error, difference)
         hopeless = ~torch.isfinite(error) & (substeps >= HOPELESS)
-        if substeps >= max_substeps or bool(((error <= tolerance) | hopeless).all()):
+        if substeps >= max_substeps or bool(((error <= TOLERANCE) | hopeless).all()):
             return x, error
         substeps *= 2
         finer = _integrate(f, x0, span, substeps)
 
 
 def reference_flow(
-    vector_field: VectorField,
-    q: Tensor,
-    p: Tensor,
-    s: Tensor,
-    h: Tensor | float,
-    tolerance: float = 1e-13,
-    max_substeps: int = 128,
+    vector_field: VectorField, q: Tensor, p: Tensor, s: Tensor, h: Tensor | float, max_substeps: int = 128
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The state of `reference_solve`, or an error where it has not converged.
 
     Raises
     ------
     InputError
-        If the estimated error of a sample is not below `tolerance` (or is NaN).
+        If the estimated error of a sample is not below `TOLERANCE` (or is NaN).
     """
-    solution = reference_solve(vector_field, q, p, s, h, tolerance, max_substeps)
-    failed = ~(solution.error <= tolerance)
+    solution = reference_solve(vector_field, q, p, s, h, max_substeps)
+    failed = ~(solution.error <= TOLERANCE)
     if bool(failed.any()):
         sample = int(failed.flatten().nonzero()[0])
         raise InputError(
-            f"reference flow: estimated error {float(solution.error.flatten()[sample]):.1e} > {tolerance:.1e} at "
-            f"sample {sample} with {max_substeps} substeps; use a smaller h, more substeps or a larger tolerance"
+            f"reference flow: estimated error {float(solution.error.flatten()[sample]):.1e} > {TOLERANCE:.1e} at "
+            f"sample {sample} with {max_substeps} substeps; use a smaller h or more substeps"
         )
     return solution.q1, solution.p1, solution.s1
 

@@ -91,11 +91,6 @@ class Scene:
         """Which coordinates are angles: those in rad."""
         return tuple(unit == "rad" for unit in self.units)
 
-    @property
-    def L_d_exact(self) -> DiscreteLagrangian | None:
-        """The exact discrete Lagrangian: `L_d` where it is one, else the numerical one, else None."""
-        return self.L_d if self.exact else self.numerical
-
 
 def require_positive(scene: str, **numbers: float) -> None:
     """Refuse a parameter of a scene that is not positive; blanks in its name are written as `_`."""

@@ -98,9 +98,9 @@ def _flow(axis: Axis, force: Tensor | float, q: Tensor, p: Tensor, s: Tensor, h:
     way = torch.where(v == 0, _pushed(F, axis.dry), v.sign())
     first = torch.minimum(_time_to_rest(axis, F - way * axis.dry, v), h)
     rests = first < h
-    x, v, s = _piece(axis, F, way, x, v, s, first)
+    x, v, s = _piece(axis, F, way, (x, v, s), first)
     v = torch.where(rests, 0.0, v)
-    x, v, s = _piece(axis, F, torch.where(rests, _pushed(F, axis.dry), way), x, v, s, h - first)
+    x, v, s = _piece(axis, F, torch.where(rests, _pushed(F, axis.dry), way), (x, v, s), h - first)
     return tuple(y.to(dtype) for y in (x[..., None], axis.m * v[..., None], s))  # type: ignore[return-value]
 
 
@@ -118,10 +118,9 @@ def _time_to_rest(axis: Axis, F: Tensor, v: Tensor) -> Tensor:
     return torch.where(brakes, time, torch.inf)
 
 
-def _piece(
-    axis: Axis, F: Tensor, way: Tensor, x: Tensor, v: Tensor, s: Tensor, t: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+def _piece(axis: Axis, F: Tensor, way: Tensor, start: State, t: Tensor) -> State:
     """Position, velocity and action after a time t of slip one way, or of rest (way and v are 0)."""
+    x, v, s = start
     rests = (way == 0) & (v == 0)
     a = torch.where(rests, 0.0, (F - way * axis.dry) / axis.m)
 

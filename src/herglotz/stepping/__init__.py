@@ -1,11 +1,6 @@
 """Time steppers: batched Newton, steps, rollouts."""
 
 from herglotz.mechanics.newton import solve as solve
-from herglotz.stepping.composition import (
-    Composition as Composition,
-    adjoint_pair as adjoint_pair,
-    suzuki as suzuki,
-)
 from herglotz.stepping.events import Event as Event
 from herglotz.stepping.explain import explain_step as explain_step
 from herglotz.stepping.linearise import Linearised as Linearised

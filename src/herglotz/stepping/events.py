@@ -70,8 +70,8 @@ class Watch:
         first = torch.full_like(self.t, torch.inf)
         if any(bool(mask.any()) for mask in crossed):
             located = [
-                self._locate(e, a, b, mask, old, step, h, step_by)
-                for e, a, b, mask in zip(self.events, self.values, values, crossed, strict=True)
+                self._locate(e, ends, mask, (old, step), h, step_by)
+                for e, *ends, mask in zip(self.events, self.values, values, crossed, strict=True)
             ]
             for event, (tau, _) in zip(self.events, located, strict=True):
                 first = torch.minimum(first, tau) if event.terminal else first
@@ -101,9 +101,10 @@ class Watch:
         return value.to(state.s)
 
     def _locate(
-        self, event: Event, g0: Tensor, g1: Tensor, mask: Tensor, old: State, step: Step, h: Tensor, step_by: StepBy
+        self, event: Event, ends: list[Tensor], mask: Tensor, known: tuple[State, Step], h: Tensor, step_by: StepBy
     ) -> tuple[Tensor, Step]:
-        """τ (inf where there is no crossing) and the step by it."""
+        """τ (inf where there is no crossing) and the step by it; `ends` are the values before and after `known`."""
+        (g0, g1), (old, step) = ends, known
         if not bool(mask.any()):
             return torch.full_like(h, torch.inf), step
         q0, q1 = old.q.detach(), torch.where(mask[..., None], step.state.q.detach(), old.q.detach())

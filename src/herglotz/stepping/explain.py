@@ -28,13 +28,14 @@ def explain_step(
 
     Source: erratum E4 and the critical steps of section 4 of `docs/mathematics.md`.
     """
-    q, p, s = (x.detach() for x in state)
+    state = State(*(x.detach() for x in state))
+    q = state.q
     sizes = torch.as_tensor(h, dtype=q.dtype, device=q.device)
     if not bool((sizes > 0).all()):
         raise InputError(f"h must be > 0, got {float(sizes.min()):g}")
     with torch.no_grad():
-        solution = solve_step(L_d, q, p, s, sizes, q, 64 * torch.finfo(q.dtype).eps, max_iterations)
-        at = regularity(L_d, q, solution.q1, s, sizes)
+        solution = solve_step(L_d, state, sizes, q, 64 * torch.finfo(q.dtype).eps, max_iterations)
+        at = regularity(L_d, q, solution.q1, state.s, sizes)
         failed = solution.status != Status.CONVERGED
         reach, escapes = longest_step(L_d, state, at.h, max_iterations) if bool(failed.any()) else (at.h, failed)
     lost = {name: at.lost(name) for name in STEPPING}
@@ -75,14 +76,15 @@ def longest_step(
 
 def _continued(L_d: DiscreteLagrangian, state: State, h: Tensor, max_iterations: int) -> tuple[Tensor, Tensor]:
     """The largest h' ≤ h to which q1(h') can be continued from q1(0) = q0, and that q1; strides in h, extrapolated."""
-    q, p, s = (x.detach() for x in state)
+    state = State(*(x.detach() for x in state))
+    q = state.q
     tol, most = 64 * torch.finfo(q.dtype).eps, min(max_iterations, CORRECTIONS)
     at, stride = torch.zeros_like(h), h / 4
     q1, slope = q.expand(*h.shape, q.shape[-1]), torch.zeros_like(q)
     for _ in range(ATTEMPTS):
         trial = torch.minimum(at + stride, h)
         moved = (trial - at)[..., None]
-        solution = solve_step(L_d, q, p, s, trial, q1 + slope * moved, tol, most)
+        solution = solve_step(L_d, state, trial, q1 + slope * moved, tol, most)
         good = (solution.status == Status.CONVERGED) & (at < h)
         slope = torch.where(good[..., None], (solution.q1 - q1) / moved, slope)
         q1 = torch.where(good[..., None], solution.q1, q1)

@@ -9,7 +9,6 @@ from typing import Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials
 from herglotz.mechanics.newton import Found, Point, Rules, largest, newton, newton_step, norm, solve
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
@@ -33,52 +32,37 @@ class Solution:
     """The solved step; `P` is evaluated at q1, so nothing has to be computed again."""
 
     q1: Tensor  # (..., n)
-    P: Partials  # of order 2 unless `order=1` was asked for
+    P: Partials  # of order 2
     status: Tensor  # (...) Status values, uint8
     residual: Tensor  # (...) |J⁻¹F|, the error left in q1, in units of q
     iterations: int
-    increment: Tensor | None = None  # (..., n) Δ = q1 − q0 before rounding, where it was the unknown
 
 
 def solve_step(
     L_d: DiscreteLagrangian,
-    q0: Tensor,  # (..., n)
-    p0: Tensor,  # (..., n)
-    s0: Tensor,  # (...)
+    state: State,
     h: Tensor,  # () or (...)
     guess: Tensor,  # (..., n) where the iteration starts
     tol: float,
     max_iterations: int = 30,
-    order: int = 2,
-    increments: bool = False,
 ) -> Solution:
     """Solve F(q1) = D1 L_d(q0, q1, s0) + c p0 = 0 for q1 (FL⁻ inverted; never through H⁺, erratum E4).
 
     A sample has converged when its next Newton step is below `tol` times the size of its positions. Samples do not
     influence one another: each has its own Jacobian, its own step length and its own status.
-
-    With `order` 1, an iteration that starts close to the solution keeps its Jacobian and costs first derivatives only;
-    the answer is the same to `tol`. With `increments` Δ = q1 − q0 is the unknown, for an L_d with
-    `partials_increment`: nothing cancels at small h, and convergence is relative to the size of Δ.
-
-    Raises
-    ------
-    InputError
-        If `increments` is asked for and L_d has none.
     """
-    if increments and not isinstance(L_d, Increments):
-        raise InputError("this L_d has no partials_increment; leave increments=False, or use a model or a rule with it")
-    equation = PartialsEquation(L_d, State(q0, p0, s0), h, order, increments)
-    found = find_root(equation, guess, tol, max_iterations, order)
+    found = find_root(PartialsEquation(L_d, state, h, 2, False), guess, tol, max_iterations, 2)
     P = found.point.rest
     status, _ = status_of(found, End(P.D2, P.L, P.c))
-    if increments:
-        return Solution(q0 + found.x, P, status, found.residual, found.iterations, found.x)
     return Solution(found.x, P, status, found.residual, found.iterations)
 
 
 def find_root(equation: StepEquation, guess: Tensor, tol: float, max_iterations: int, order: int) -> Found:
-    """The iteration of `solve_step` for an equation; with `order` 2 every Jacobian is fresh, the last one too."""
+    """The iteration of a step for its equation.
+
+    With `order` 2 every Jacobian is fresh, the last one too. With `order` 1, an iteration that starts close to the
+    solution keeps its Jacobian and costs first derivatives only; the answer is the same to `tol`.
+    """
     sizes = _Sizes(equation)
     if sticks(equation):
         assert isinstance(equation, PartialsEquation)

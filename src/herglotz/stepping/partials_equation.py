@@ -62,7 +62,7 @@ class PartialsEquation:
         """See `StepEquation`."""
         order = 2 if second else self.order
         if self.increments:
-            form: Any = self.L_d  # `solve_step` checked
+            form: Any = self.L_d  # whoever asks for increments has checked
             P: Partials = form.partials_increment(self.q0, x, self.s0, self.h, order)
         else:
             P = partials(self.L_d, self.q0, x, self.s0, self.h, order)

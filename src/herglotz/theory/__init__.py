@@ -110,7 +110,6 @@ from herglotz.theory.rigid_body import (
     RigidBodyStepper as RigidBodyStepper,
 )
 from herglotz.theory.rotations import cayley as cayley, hat as hat
-from herglotz.theory.splitting import ContactSplitting as ContactSplitting, linear_damping as linear_damping
 from herglotz.theory.symmetries import Symmetries as Symmetries, symmetries as symmetries
 from herglotz.theory.tulczyjew import (
     TulczyjewTriple as TulczyjewTriple,

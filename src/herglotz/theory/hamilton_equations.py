@@ -45,7 +45,6 @@ def right_step(
     p0: Tensor,  # (..., n)
     s0: Tensor,  # (...)
     h: Tensor | float,
-    guess: Tensor | None = None,  # (..., n) near p1; default p0
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(q1, p1, s1) by the right equations: D1H⁺(q0, p1, s0) = (1 − D3H⁺) p0 is solved for p1; NaN without one."""
 
@@ -53,7 +52,7 @@ def right_step(
         P = partials(H_plus, q0, p1, s0, h, order=2)
         return P.D1 - (1 - P.D3)[..., None] * p0, P.D12 + p0[..., :, None] * P.D23[..., None, :]
 
-    p1 = find_root(equations, p0 if guess is None else guess).solved
+    p1 = find_root(equations, p0).solved
     q1, _, s1 = right_equations(partials(H_plus, q0, p1, s0, h), p1, s0)
     return q1, p1, s1
 
@@ -64,7 +63,6 @@ def left_step(
     p0: Tensor,  # (..., n)
     s0: Tensor,  # (...)
     h: Tensor | float,
-    guess: tuple[Tensor, Tensor] | None = None,  # (..., n), (...) near (q1, s1); default (q0, s0)
 ) -> tuple[Tensor, Tensor, Tensor]:
     """(q1, p1, s1) by the left equations: those for q0, s0 are solved for (q1, s1) together; NaN without any."""
     n = q0.shape[-1]
@@ -77,8 +75,7 @@ def left_step(
         s_row = torch.cat([s_q, (1 + P.D3 - (p0 * P.D13).sum(-1))[..., None]], -1)
         return torch.cat([q - q0, (s - s0)[..., None]], -1), torch.cat([q_row, s_row[..., None, :]], -2)
 
-    q_guess, s_guess = (q0, s0) if guess is None else guess
-    start = torch.cat([q_guess, s_guess[..., None]], -1)
+    start = torch.cat([q0, s0[..., None]], -1)
     # positions and actions have different units, so each has a size of its own
     action = s0.abs() + (p0 * q0).sum(-1).abs()
     scale = torch.cat([q0.abs().amax(-1, keepdim=True).expand(q0.shape), action[..., None]], -1)

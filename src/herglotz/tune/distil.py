@@ -24,14 +24,15 @@ from herglotz.stepping import State, solve
 from herglotz.training import Prior, levenberg_marquardt
 from herglotz.training.parameter_vector import ParameterVector
 
+CHUNK = 1024  # pairs whose Jacobians are held at once
 EXACT = 1e-8  # σ of the residuals relative to the motion's size
 
 
 class FlowProblem:
     """½ Σ |r|²/σ² + prior over the parameters of a model, for T pairs of states a time H = h apart."""
 
-    def __init__(self, model: ContactLagrangian, before: State, after: State, h: float, chunk: int = 1024):
-        self.parameters, self.before, self.after, self.chunk = ParameterVector(model), before, after, chunk
+    def __init__(self, model: ContactLagrangian, before: State, after: State, h: float):
+        self.parameters, self.before, self.after = ParameterVector(model), before, after
         self.h = before.s.new_tensor(h)
         self.momentum = float(before.p.square().mean().sqrt().clamp(min=1e-12))
         self.sigma = EXACT * float(max(model.config.scale))
@@ -55,7 +56,7 @@ class FlowProblem:
         """Return (cost, JᵀJ, Jᵀr), accumulated over chunks of pairs."""
         cost, A, b = self.prior.normal_equations(x)
         slopes = vmap(jacrev(lambda *x: (r := self._local(*x), r), has_aux=True), (None, 0, 0))
-        for part in torch.arange(len(self.before.s)).split(self.chunk):
+        for part in torch.arange(len(self.before.s)).split(CHUNK):
             pair = (State(*(y[part] for y in one)) for one in (self.before, self.after))
             J, r = slopes(x, *pair)
             J, r = J.reshape(-1, len(x)) / self.sigma, r.reshape(-1) / self.sigma

@@ -14,7 +14,7 @@ from herglotz.stepping.state import check_h, step_sizes
 
 
 class Steps(Protocol):
-    """A stepper that takes any h, such as `Stepper`, `Composition` or `ContactSplitting`."""
+    """A stepper that takes any h, such as `Stepper`."""
 
     def step(self, state: State, h: Any, /) -> Step:
         """One step."""

@@ -59,7 +59,6 @@ def test_the_flow_is_no_contact_map():
     (_, p1, _), D = flow_derivative(lambda q, p, s: system.flow(q, p, s, 0.2), q, p, s)
     assert float(contact_defect(D, p, p1, torch.ones_like(s)).abs().max()) > 1e-2
     assert system.numerical is None
-    assert system.L_d_exact is None
 
 
 def test_rules_carry_their_forces_and_inputs():

@@ -6,11 +6,10 @@ import torch
 from herglotz.errors import InputError
 from herglotz.mechanics import autograd_partials
 from herglotz.models import ContactLagrangian, ModelConfig
-from herglotz.stepping import Event, State, Status, StepError, Stepper, suzuki
+from herglotz.stepping import Event, State, Status, StepError, Stepper
 from herglotz.theory import (
     BodyState,
     ConstrainedStepper,
-    ContactSplitting,
     EvolutionStepper,
     LegendrianStepper,
     RigidBodyStepper,
@@ -37,13 +36,9 @@ def kicks():
     return KickStepper(H, 0.2, True, 0.0, 1.0, drifts, cosines, sines)
 
 
-SPLITTING = ContactSplitting(lambda q: (1 - q.cos()).sum(-1), 1.0, 0.2)
 STEPPERS = {
     "a discrete Lagrangian": Stepper(pendulum),
     "a model, explicit": Stepper(ContactLagrangian(ModelConfig())),
-    "a composition": suzuki(pendulum),
-    "a splitting": SPLITTING,
-    "a composed splitting": suzuki(SPLITTING),
     "discrete gradients": EvolutionStepper(energy, field="contact"),
     "a Legendrian relation": LegendrianStepper(pendulum, ahead=0),
     "kicks": kicks(),
@@ -92,11 +87,11 @@ def test_events_stop_every_stepper(name):
 
 def test_inputs_and_failures_are_named_by_every_stepper():
     # fails if inputs are dropped by a stepper that has none, or a failed step does not say which it was
-    with pytest.raises(InputError, match="Composition takes no inputs"):
-        suzuki(pendulum).rollout(*starts(), h=H, inputs=torch.zeros(4, 1, dtype=torch.float64))
-    steep = ContactSplitting(lambda q: -(q**4).sum(-1), 1.0, 0.0)
+    with pytest.raises(InputError, match="EvolutionStepper takes no inputs"):
+        STEPPERS["discrete gradients"].rollout(*starts(), h=H, inputs=torch.zeros(4, 1, dtype=torch.float64))
+    steep = EvolutionStepper(lambda q, p, s: 0.5 * p.square().sum(-1) - (q**4).sum(-1) + 0 * s, field="contact")
     steep.throw = True
-    with pytest.raises(StepError, match=r"step \d+: step failed at sample \(1,\): DIVERGED"):
+    with pytest.raises(StepError, match=r"step \d+: step failed at sample \(1,\): "):
         steep.rollout(10 * starts().q, starts().p, h=1.0, steps=12)
 
 

@@ -74,8 +74,8 @@ def test_both_equations_give_one_motion():
         return v, herglotz_acceleration(L, q, v, s), L(q, v, s)
 
     p = fiber_derivative(L, q, v, s)
-    q1, v1, s1 = reference_flow(herglotz, q, v, s, 0.2, 1e-11)
-    Q1, P1, S1 = reference_flow(partial(contact_vector_field, legendre_dual(L)), q, p, s, 0.2, 1e-11)
+    q1, v1, s1 = reference_flow(herglotz, q, v, s, 0.2)
+    Q1, P1, S1 = reference_flow(partial(contact_vector_field, legendre_dual(L)), q, p, s, 0.2)
     close((q1, fiber_derivative(L, q1, v1, s1), s1), (Q1, P1, S1), 1e-10)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import tempfile
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from torch.export import ExportedProgram
 
 from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
+from herglotz.export.c_wrapper import compiler
 from herglotz.export.compare import compare
 from herglotz.export.load import load_pt2
 from herglotz.export.metadata import AOTI, KEY, to_json
@@ -40,7 +39,7 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     from torch._inductor.package.package import package_aoti  # seconds, which only this format costs
 
     settings = {"aot_inductor.metadata": {KEY: to_json(entries)}}
-    check_compiler()
+    compiler("CXX")
     with quiet(), torch.no_grad(), tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
         package = str(Path(folder, "code.pt2"))
         programs = programs_of(model, entries, tuple(AOTI))
@@ -72,18 +71,3 @@ def _check(package: str, model: ContactLagrangian) -> None:
     worst = max(found[key] for key in ("q", "p", "s"))  # NaN, which is not larger, where every start fails
     if worst > (1e-6 if next(model.parameters()).dtype == torch.float64 else 1e-2):
         raise InputError(f"the compiled code differs from the model by {worst:.1e}; export to --format c or onnx")
-
-
-def check_compiler() -> None:
-    """Raise unless a C++ compiler is there.
-
-    Raises
-    ------
-    InputError
-        Saying what to install.
-    """
-    given = os.environ.get("CXX", "")
-    names = [given.split()[0]] if given.split() else ["g++", "clang++", "c++"]
-    if not any(shutil.which(name) for name in names):
-        missing = f"$CXX names '{given}', which is not there" if given else "no C++ compiler (g++, clang++) in the PATH"
-        raise InputError(f"{missing}; install one, for example with: apt install g++, or export to --format c")

@@ -120,7 +120,7 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n]
     tol = 64 * torch.finfo(x.dtype).eps
-    solution = solve_step(L_d, q0, p0, s0, h, x[:, 1:, :n], tol)
+    solution = solve_step(L_d, State(q0, p0, s0), h, x[:, 1:, :n], tol)
     if not bool((solution.status == Status.CONVERGED).all()):
         return None
     P = solution.P
