@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -152,19 +152,27 @@ def chains(data: Trajectories) -> list[NamedTerms]:
     Between neighbours the mass of speeds i and j turns with sums of the angles behind the first of the two, and weight
     with the sums of all angles up to a joint; by absolute angles the mass turns with q_i − q_j alone. Where the chain
     hangs on slides, the mass of a slide and a joint turns with the angle of a link; by absolute angles no other mass
-    and no friction is shared.
+    and no friction is shared. Joints that springs alone connect have potentials of q_i − q_j, and no mass between them.
     """
     if data.dof < 2 or not any(data.angles):
         return []
     joints = [i for i, angle in enumerate(data.angles) if angle]
     across, every = _by_slides(data.angles)
-    absolute = [name for name, f in every if _form(f) == _difference(f)] + [x for x, f in across if _of_own(f)]
+    absolute = _where(lambda f: _form(f) == _difference(f), every) + _where(_of_own, across)
     if across and len(joints) == 1:
-        return [NamedTerms(tuple(absolute), (), True, apart=True)]
-    between = [name for name, f in every if _of_neighbours(f, joints)] + [x for x, f in across if _row(f, joints)]
-    twisted = [name for name, f in every if not f.velocities and sorted(_form(f).values()) == [-1.0, 1.0]]
-    turning = [NamedTerms(tuple(between), (), True), NamedTerms(tuple(absolute), (), True, apart=bool(across))]
-    return turning if across else [*turning, NamedTerms(tuple(twisted), (), True, apart=True)]
+        return [NamedTerms(absolute, (), True, apart=True)]
+    between = _where(lambda f: _of_neighbours(f, joints), every) + _where(lambda f: _row(f, joints), across)
+    turning = [NamedTerms(between, (), True), NamedTerms(absolute, (), True, apart=bool(across))]
+    return turning if across else [*turning, NamedTerms(_where(_of_springs, every), (), True, apart=True)]
+
+
+def _where(rule: Callable[[Product], bool], terms: Sequence[tuple[str, Product]]) -> tuple[str, ...]:
+    return tuple(name for name, f in terms if rule(f))
+
+
+def _of_springs(f: Product) -> bool:
+    """Whether it is a potential of the difference of two angles."""
+    return not f.velocities and sorted(_form(f).values()) == [-1.0, 1.0]
 
 
 def _by_slides(angles: Sequence[bool]) -> tuple[list[tuple[str, Product]], list[tuple[str, Product]]]:
