@@ -107,6 +107,19 @@ def look(
     InputError
         If the data cannot be used, or do not suit the settings.
     """
+    seen = _seen(data, user_settings, stages, plan, named, zeros)
+    hold = "" if seen.found is None else seen.found.hold
+    if not hold:
+        return seen
+    again = _seen(replace(data, hold=hold), user_settings, stages.labelled(f", hold {hold}"), plan, named, zeros)
+    why = f"the terms that were found with hold {seen.arrival.hold} miss the data by far less with {hold}"
+    return replace(again, why_arrival=seen.why_arrival | {"hold": why})
+
+
+def _seen(
+    data: Trajectories, user_settings: FitConfig, stages: Stages, plan: Plan | None, named: bool,
+    zeros: tuple[float, ...],
+) -> Look:  # fmt: skip
     settings = user_settings.resolved(data)
     zeros = zeros if plan is None else plan.zeros
     said, (data, arrival, why_arrival) = data, _read(measured(data, zeros), settings)
@@ -125,13 +138,7 @@ def look(
         noise=roughness(kept), settings=settings, base=base,
     )  # fmt: skip
     if plan is None:
-        holds = () if said.hold or any(arrival.late) or data.u is None else tuple(x for x in HOLDS if x != arrival.hold)
-        seen = _with_terms(seen, user_settings, stages, named, holds)
-        if seen.found is not None and (hold := seen.found.hold):
-            stages = stages.labelled(f", hold {hold}")
-            again = look(replace(said, hold=hold), user_settings, stages, named=named, zeros=zeros)
-            why = f"the terms that were found with hold {arrival.hold} miss the data by far less with {hold}"
-            return replace(again, why_arrival=why_arrival | {"hold": why})
+        seen = _with_terms(seen, user_settings, stages, named, _other_holds(said, arrival))
     else:
         seen = replace(seen, base=plan.started(base))
         if plan.network == "covered":
@@ -139,6 +146,12 @@ def look(
     if seen.leaves_objective if plan is None else plan.continues_probe:
         seen = replace(seen, probe=_probe(seen.task(stages)))
     return seen
+
+
+def _other_holds(said: Trajectories, arrival: Arrival) -> tuple[str, ...]:
+    """The holds that inputs may have beside the one that was chosen, where nothing says it and they are not late."""
+    open_to_choice = said.u is not None and not said.hold and not any(arrival.late)
+    return tuple(hold for hold in HOLDS if hold != arrival.hold) if open_to_choice else ()
 
 
 def _read(data: Trajectories, settings: FitConfig) -> tuple[Trajectories, Arrival, dict[str, str]]:
