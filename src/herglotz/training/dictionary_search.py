@@ -22,6 +22,7 @@ from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, sparsest
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.found_terms import Found, gain
 from herglotz.training.linear_terms import LinearStart, starts_of
@@ -201,7 +202,7 @@ class DictionarySearch:
         if not found.terms.dry or found.pushes or found.config.sticking or self.config.sticking is False:
             return found
         count, plain = self.data.q.numel(), self._sticking(found, 0.0)
-        plain = plain and self._finer(plain)  # where a joint turns back its steps are of order 1
+        plain = plain and self._finer(plain, longer=False)  # where a joint turns back its steps are of order 1
         worth = self.data.dof * math.log(count) / 2  # of one number for each coordinate
         if plain is None or (gain(plain.rms, found.rms, count, self.floor) > SHAPES * worth and plain.rms > self.noise):
             return found
@@ -327,8 +328,8 @@ class DictionarySearch:
             found = less
         return found
 
-    def _finer(self, found: Found) -> Found:
-        """With as many model steps in a recorded one as the misfit asks for."""
+    def _finer(self, found: Found, *, longer: bool = True) -> Found:
+        """With as many model steps in a recorded one as the misfit asks for, over `longer` segments where it can be."""
         while self._too_long(found):
             m, count = found.config.substeps, self.data.q.numel()
             finer = (self.refit(found, found.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
@@ -337,7 +338,9 @@ class DictionarySearch:
             if other is None:
                 self.in_vain = (m, found.config.sticking), found.rms
                 break  # the terms make up for the longer steps
-            found = self._longer(other)
+            if found.rms < MARGIN * other.rms and other.rms > AT_THE_NOISE * max(self.noise, FINE * self.floor):
+                break  # something else is missing, and shorter steps would only take their time
+            found = self._longer(other) if longer else other
         return found
 
     def _too_long(self, found: Found) -> bool:

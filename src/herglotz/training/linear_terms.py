@@ -51,22 +51,19 @@ def linear_starts(
     data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials,
     one_of: Sequence[NamedTerms] = (),
 ) -> list[LinearStart]:  # fmt: skip
-    """The start with fewest coefficients which the best one does not undercut by more than a 20th, and simpler ones.
+    """The likeliest start, and those of fewer coefficients.
 
-    Of many candidates noise determines some so poorly that no mass fits, or that they stay for nothing. Those behind
-    the first have fewer than it, the fewest first: their errors may be noise, which whole trajectories tell.
-    The best start `one_of` other families stands alone where it errs less than the first, or as little with fewer
-    of them.
+    The Bayesian information criterion decides: of many candidates noise determines some so poorly that no mass fits,
+    or that they stay for nothing. Those behind the first have fewer coefficients than it, the fewest first: their
+    errors may be noise, which whole trajectories tell. The best start `one_of` other families stands alone where it
+    errs less than the first, or as little with fewer of them.
     """
     if not families:
         return []
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
     starts = (start for terms in families if (start := problem.start(terms)) is not None)
-    tried = list({start.terms: start for start in starts}.values())
-    tried.sort(key=lambda start: start.size)
-    least = min((start.error for start in tried), default=math.inf)
-    fair = next((i for i, start in enumerate(tried) if start.error <= MARGIN * least), 0)
-    tried = [*tried[fair : fair + 1], *tried[:fair]]
+    tried = sorted({start.terms: start for start in starts}.values(), key=lambda start: start.size)
+    tried = [*tried[(best := problem.likeliest(tried)) : best + 1], *tried[:best]]
     others = [start for terms in one_of if (start := problem.start(terms)) is not None and start.terms.features]
     other = min(others, key=lambda start: start.error, default=None)
     if other is None or (tried and _better(tried[0], other)):
@@ -88,6 +85,7 @@ class LinearTerms:
         self.held = holders([x for x in every.features if x not in self.own], every.drag)
         self.overlap = max(1.0, local.width / 2)
         self.fit = self._problem(local)
+        self.count = max(3, int(self.fit.R[..., 0].numel() / self.overlap))  # residuals that do not say the same
 
     def start(self, of: NamedTerms) -> LinearStart | None:
         """The terms of a family that the linear problem needs, their values and its error; None where no mass fits."""
@@ -108,6 +106,11 @@ class LinearTerms:
                 error = float(fit.errors(x).square().mean().sqrt())
                 return LinearStart(terms, self._named(start), error, int(left.sum()))
         return None
+
+    def likeliest(self, starts: Sequence[LinearStart]) -> int:
+        """The place of the start that the Bayesian information criterion prefers; 0 of none."""
+        of = [self.count * math.log(max(x.error, 1e-300)) + x.size * math.log(self.count) / 2 for x in starts]
+        return min(range(len(of)), key=of.__getitem__, default=0)
 
     def _regular(self, x: Tensor) -> Tensor:
         """With masses that turn with angles made smaller until no mass matrix of the data is nearly singular.
@@ -144,7 +147,7 @@ class LinearTerms:
         place = self._linear_places(columns)
         free = torch.tensor([i for own in place.values() for i in own])
         simplest = torch.tensor([i for name in self.own for i in place.get(name, ())], dtype=torch.long)
-        worth = math.log(max(3, int(r.numel() / overlap)))
+        worth = math.log(self.count)
         kept, less = prune(X.T @ X / size / overlap, x[columns][1:], free, worth, simplest=simplest)
         stay = set(kept.tolist())
         terms = of.only([name for name, own in place.items() if stay & set(own)])
