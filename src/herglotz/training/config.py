@@ -36,7 +36,7 @@ class FitConfig:
         "conservative" (no damping), "linear" (one damping rate), "affine" (damping depends on position and velocity),
         "full" (on s as well; s at the start is unknown, so fit several seeds) or "forced" (one rate, and friction of
         each joint). "auto": "forced" with dry friction where inputs u are recorded, else "linear"; and for two or three
-        coordinates with an angle among them, or two to twelve without, where nothing is told, what the data say
+        coordinates with an angle among them, or several without, where nothing is told, what the data say
         (`herglotz.training.structure`).
     objective
         "residual": one-step error ‖M⁻¹R‖², for data without noise. "trajectory": multiple shooting, for noisy data.

@@ -39,6 +39,7 @@ LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "p
           "drag.coefficient")  # fmt: skip
 LEAST = 0.01  # of the largest error of a coordinate: smaller ones weigh no more
 STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
+AT_ONCE = 1_000_000  # derivatives of J that are formed at the same time: 8 MB, and 25 times as much that leads to them
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
 
 
@@ -64,16 +65,18 @@ class LinearFit:
         cls, angles: Sequence[bool], features: Sequence[str], t: Triples, balance: Tensor,
         forces: NamedForces | None = None,
     ) -> LinearFit:  # fmt: skip
-        """The columns of a model of order 2 with these features, coupled friction and no other damping but `forces`.
+        """The columns of a model of order 2 with these features, viscous friction and no other damping but `forces`.
+
+        Friction between coordinates is a column where one of them is an angle.
 
         Forces and positions are over the `balance` (n,) of the coordinates: the errors of all of them count alike.
         """
         n, forces = len(angles), forces or NamedForces()
         zero = (0.0,) * n
         model = ContactLagrangian(
-            ModelConfig(angles=tuple(angles), level="forced", coupled=True, features=tuple(features), potential_width=0,
-                        stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=forces.dry or (1.0,) * n, rate=0.0,
-                        drag=forces.drag, coulomb=bool(forces.dry),
+            ModelConfig(angles=tuple(angles), level="forced", coupled=any(angles), features=tuple(features),
+                        potential_width=0, stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=forces.dry or (1.0,) * n,
+                        rate=0.0, drag=forces.drag, coulomb=bool(forces.dry),
                         inputs=0 if forces.u is None else forces.u.shape[1])
         ).to(t.q0)  # fmt: skip
         parameters = ParameterVector(model)
@@ -92,7 +95,8 @@ class LinearFit:
             return momentum_residual(after, p), momentum_jacobian(after, p)
 
         inputs = () if forces.u is None else (forces.u,)
-        derivatives = vmap(jacrev(both), (None, *(0,) * (5 + len(inputs))))
+        axes = (None, *(0,) * (5 + len(inputs)))
+        derivatives = vmap(jacrev(both), axes, chunk_size=max(1, AT_ONCE // (n * n * len(columns))))
         R, J = derivatives(parameters.get(), t.q0, t.q1, t.q2, t.h0, t.h1, *inputs)
         i, j = pairs(n, t.q0.device)
         eye = torch.eye(n, dtype=t.q0.dtype, device=t.q0.device)

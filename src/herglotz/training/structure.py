@@ -40,7 +40,7 @@ from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 from herglotz.training.stages import Stages
 from herglotz.training.task import EXACT, NOISY, build_model
 
-MOST, MOST_LENGTHS = 3, 12  # most coordinates with and without an angle: the dictionary of joints grows as 3ⁿ n²
+MOST = 3  # most coordinates with an angle among them: the dictionary of joints grows as 3ⁿ n²
 TRIPLES, ENOUGH = 4000, 5  # most triples in the linear problem, and least number of residuals for each coefficient
 NUMBERS = 3e7  # most numbers in the derivatives of the linear problem: 240 MB
 THINNED = (1, 2, 4)  # thinnings that are tried: noise asks for long steps, the rule of order 2 for short ones
@@ -54,7 +54,7 @@ NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulo
          "coupled", "absent")  # fmt: skip
 TOLD = ("reason", "sigma", "doubt", "apart", "every", "hold")  # of `Structure`, as a checkpoint has it
 
-COUPLING, VISCOUS = "coupling.viscous", "friction.viscous"
+VISCOUS = "friction.viscous"
 
 
 class Structure(NamedTuple):
@@ -74,7 +74,7 @@ def structure_is_free(data: Trajectories, user_settings: FitConfig) -> bool:
     """Whether the structure of these data is left to `structured`: several coordinates, no motors, nothing said."""
     c = user_settings
     driven = data.u is not None and c.use_inputs
-    several = 1 < data.dof <= (MOST if any(data.angles) else MOST_LENGTHS)
+    several = data.dof > 1 and (data.dof <= MOST or not any(data.angles))
     return _nothing_named(c) and not driven and several
 
 
@@ -97,6 +97,17 @@ def dictionary(data: Trajectories) -> tuple[str, ...]:
         return tuple(revolute(data.angles))
     away = distances(data)
     return tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
+
+
+def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
+    """The dictionary and, of coordinates without an angle, the springs between them alone, which need fewer samples.
+
+    A dictionary takes part where the samples suffice for its coefficients and their derivatives take no more than
+    `NUMBERS`: at 200 samples the whole one up to 14 coordinates, springs up to 22.
+    """
+    names = dictionary(data)
+    springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
+    return [names] if any(data.angles) else [names, springs]
 
 
 def kept_structure(
@@ -149,14 +160,15 @@ def _better_hold(found: Found, data: Trajectories, holds: Sequence[str], *, outl
 
 def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structure:
     """Settings and starting values with the structure that the data show; unchanged where they show none."""
-    joints, names, size = any(data.angles), dictionary(data), max(base.scale)
+    joints, size = any(data.angles), max(base.scale)
 
     def without(reason: str) -> Structure:
         return Structure(config, base, f"no dictionary of features: {reason}")
 
-    linear = _linear(data, base, names)
+    tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
+    names, linear = next(((names, found) for names, found in tried if found), ((), None))
     if linear is None:
-        return without(f"too few samples for its {len(names)} coefficients")
+        return without("too few samples for its coefficients")
     every, fit, x = linear
     start = fit.start(x)
     if start is None:
@@ -203,8 +215,8 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
     start = None if linear is None else linear[1].start(linear[2])
     if start is None:
         return base
-    joints = any(data.angles)  # others have no mass and no friction between them in the linear problem
-    start = {name: x for name, x in start.items() if joints or name not in ("kinetic.base.off_diagonal", COUPLING)}
+    if not any(data.angles):  # there is no mass between them in the linear problem
+        start.pop("kinetic.base.off_diagonal")
     found = started(base, data, by_term(start, holders(names)), replace(config, features=names))
     viscous = {VISCOUS: tuple(start[VISCOUS].tolist())} if config.level == "forced" else {}
     return replace(found, rate=base.rate, start={**found.start, **viscous})
@@ -213,11 +225,12 @@ def start_of_features(data: Trajectories, base: Baseline, config: FitConfig) -> 
 def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple[int, LinearFit, Tensor] | None:
     """The thinning whose one-step errors are least beside the motion's curvature, the linear problem, its solution."""
     best: tuple[float, int, LinearFit, Tensor] | None = None
+    n = data.dof
+    coefficients = len(names) + (n * n if any(data.angles) else 4 * n)  # lengths: mass, spring, tilt, friction of each
     for every in THINNED:
-        n = data.dof
         most = min(TRIPLES, int(NUMBERS / (n * n * (len(names) + n * (n + 4)))))
         t = data.thinned(every).triples(every * base.max_step).spread_out(most)
-        if len(t) * n < ENOUGH * (len(names) + n * n):
+        if len(t) * n < ENOUGH * coefficients:
             break
         fit = LinearFit.of(data.angles, names, t, data.balance)
         (x,) = of_first(fit.solve(_columns(fit, data.angles)))
@@ -229,7 +242,7 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
 
 
 def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
-    """The columns that these coordinates may have, (F,) bool: joints all, others no mass or friction between them.
+    """The columns that these coordinates may have, (F,) bool: joints all, others no mass between them.
 
     A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has masses
     between all coordinates and no springs; of its diagonal masses one set alone will do.
@@ -238,7 +251,7 @@ def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
         return torch.ones(len(fit.names), dtype=torch.bool)
     i, j = pairs(len(angles), torch.device("cpu"))
     diagonal = iter((i == j).tolist())
-    return torch.tensor([next(diagonal) if name == "mass" else name != COUPLING for name in fit.names])
+    return torch.tensor([next(diagonal) if name == "mass" else True for name in fit.names])
 
 
 def _mass_turns(fit: LinearFit) -> bool:

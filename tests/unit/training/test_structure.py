@@ -23,6 +23,7 @@ from herglotz.training.linear_start import LinearFit
 from herglotz.training.named_terms import MOVING
 from herglotz.training.pruning import prune
 from herglotz.training.structure import (
+    dictionaries,
     dictionary,
     explains_steps,
     start_of_features,
@@ -130,7 +131,6 @@ def test_one_joint_masses_and_motors_are_left_alone():
     # fails if data without joints that share a mass, or with motors, are given the dictionary
     data = double_pendulum()
     assert not structure_is_free(simulate(scene("damped_pendulum"), trajectories=2, steps=10, h=0.1), FitConfig())
-    assert not structure_is_free(bodies(13), FitConfig())
     assert not structure_is_free(replace(data, u=torch.zeros_like(data.q)), FitConfig())
 
 
@@ -169,6 +169,23 @@ def test_bodies_find_their_masses_and_springs(noise):
     assert config.objective == ("residual" if not noise else "trajectory")
     if noise:
         assert len(config.features) < 8
+
+
+def test_few_samples_of_many_bodies_show_their_springs():
+    # fails if coordinates that have too few samples for the whole dictionary (81 coefficients) go without springs (39),
+    # or if joints are offered a part of theirs; twenty masses took 208 s by networks, which did not fit
+    data = bodies(6)
+    found = {}
+    for count in (2, 3):  # of recordings of 31 samples
+        short = data.select(range(count))
+        found[count] = structured(short, estimate_baseline(short), FitConfig().resolved(short))
+    assert [len(names) for names in dictionaries(data)] == [57, 15]
+    assert len(dictionaries(double_pendulum())) == 1
+    assert [f"of {n} features" in found[k].reason for k, n in ((2, 15), (3, 57))] == [True, True]
+    config, base, *_ = found[2]
+    springs = dict(zip(config.features, base.start["potential.features.sum.coefficient"], strict=True))
+    between = [springs[f"(q{i} - q{i + 1})^2"] for i in range(1, 6)]
+    assert between == pytest.approx([0.5] * 5, rel=2e-3)  # 4e-4 to 8e-4 by the rule's step
 
 
 def test_bodies_that_share_nothing_are_left_alone():

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 from torch import Tensor
-from torch.func import functional_call, jacrev
+from torch.func import functional_call, jacrev, vmap
 
 from herglotz.models import ContactLagrangian
 from herglotz.models.jet import coordinates
@@ -17,6 +17,7 @@ NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.netwo
             "action.weight", "action.bias")  # fmt: skip
 WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
 SPLIT = 1e-3  # of a rate: friction of one coordinate is its rate, and a rate that friction cancels hides long steps
+AT_ONCE = 256  # points of the grid whose derivatives are held in memory together
 BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
@@ -56,11 +57,12 @@ class Prior:
         self.force = force if force > 0 else 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
         with torch.no_grad():
-            self.departs = departure is not None and bool(self._departures(self.start))
+            self.departs = departure is not None and bool(self._departures(self.start, self.grid, self.velocity))
 
     def residuals(self, theta: Tensor) -> Tensor:
         """Prior residuals, (m,)."""
-        return torch.cat([(theta - self.start)[self.index] / self.spread, self._departed(theta)])
+        own = (theta - self.start)[self.index] / self.spread
+        return torch.cat([own, self._departed(theta, self.grid, self.velocity).reshape(-1)]) if self.departs else own
 
     def cost(self, theta: Tensor) -> Tensor:
         """½|residuals|²."""
@@ -72,8 +74,11 @@ class Prior:
         cost, b = own.square().sum() / 2, torch.zeros_like(theta).index_add(0, self.index, own / self.spread)
         A = torch.zeros_like(theta).index_add(0, self.index, self.spread**-2).diag()
         if self.departs:
-            J, r = jacrev(lambda x: (r := self._departed(x), r), has_aux=True)(theta)
-            cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
+            # Point by point: the derivative of all outputs at all points at once took 44 GB for twenty coordinates.
+            slopes = vmap(jacrev(lambda *x: (r := self._departed(*x), r), has_aux=True), (None, 0, 0), out_dims=1)
+            for q, v in zip(self.grid.split(AT_ONCE), self.velocity.split(AT_ONCE), strict=True):
+                J, r = (x.flatten(0, 1) for x in slopes(theta, q, v))
+                cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
         return cost, A, b
 
     def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
@@ -105,17 +110,17 @@ class Prior:
                 return own
             return potential.features(self.grid, 1).gradient  # the potential is made of features alone
 
-    def _departed(self, theta: Tensor) -> Tensor:
-        """The residuals of the networks' outputs; none without a departure."""
-        parts = self._departures(theta) if self.departs else []
-        return torch.cat([x / (self.departure * x.numel() ** 0.5) for x in parts]) if parts else theta[:0]
+    def _departed(self, theta: Tensor, q: Tensor, v: Tensor) -> Tensor:
+        """The residuals of the networks' outputs at points of the grid, (k, ...)."""
+        parts = self._departures(theta, q, v)
+        return torch.cat([x / (self.departure * (len(self.grid) * len(x)) ** 0.5) for x in parts])
 
-    def _departures(self, theta: Tensor) -> list[Tensor]:
-        """Network outputs on the grid, each relative to its natural size."""
+    def _departures(self, theta: Tensor, q: Tensor, v: Tensor) -> list[Tensor]:
+        """Network outputs, each relative to its natural size: forces (n, ...) and rates (1, ...)."""
         named = {f"model.{name}": value for name, value in self.parameters.unflatten(theta).items()}
-        force, rate = functional_call(_Departures(self.parameters.model), named, (self.grid, self.velocity))
-        parts = [] if force is None else [force.reshape(-1) / self.force]
-        return parts if rate is None else [*parts, rate / self.typical_rate]
+        force, rate = functional_call(_Departures(self.parameters.model), named, (q, v))
+        parts = [] if force is None else [force / self.force]
+        return parts if rate is None else [*parts, rate[None] / self.typical_rate]
 
 
 def prior_of(model: ContactLagrangian, base: Baseline, departure: float | None) -> Prior:

@@ -1,0 +1,39 @@
+"""The prior's normal equations."""
+
+import pytest
+import torch
+from torch.func import grad, jacrev
+
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.training.problems.prior import Prior
+
+
+def prior_of(n, level):
+    """Of a model of n lengths, and parameters away from its start."""
+    one, zero = (1.0,) * n, (0.0,) * n
+    config = ModelConfig(
+        angles=(False,) * n, level=level, stiffness=one, tilt=zero, scale=one, speed=one, rate=0.1, potential_width=4
+    )
+    ends = torch.ones(n, dtype=torch.float64)
+    prior = Prior(ContactLagrangian(config).double(), -ends, ends, departure=0.5)
+    make = torch.Generator().manual_seed(0)
+    return prior, prior.start + 0.1 * torch.randn(len(prior.start), generator=make, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(("n", "level"), [(1, "affine"), (2, "affine"), (5, "linear")])
+def test_equations_are_those_of_the_residuals(n, level):
+    # fails if forces and rates are weighed as each other, or a part of the grid (64 n points, 256 a time) is left out
+    prior, theta = prior_of(n, level)
+    r, J = prior.residuals(theta), jacrev(prior.residuals)(theta)
+    cost, A, b = prior.normal_equations(theta)
+    assert len(r) == len(prior.index) + 64 * n * (n + (level == "affine"))
+    for found, told in ((cost, r.square().sum() / 2), (A, J.T @ J), (b, J.T @ r)):
+        torch.testing.assert_close(found, told, rtol=1e-12, atol=1e-12 * float(told.abs().max()))  # 5e-16 to 3e-15
+
+
+def test_twenty_coordinates_fit_into_memory():
+    # fails if every output at every point is differentiated by every point: 44 GB, of which a fit to noisy data died
+    prior, theta = prior_of(20, "linear")
+    cost, _, b = prior.normal_equations(theta)
+    torch.testing.assert_close(cost, prior.cost(theta))
+    torch.testing.assert_close(b, grad(prior.cost)(theta), rtol=1e-9, atol=1e-12 * float(b.abs().max()))
