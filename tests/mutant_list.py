@@ -273,7 +273,7 @@ MUTANTS = [
     ("models/feature_potential.py", ' and not config.translations', ''),
     ("training/named_terms.py", 'one_rate=True, springs=False', 'one_rate=True'),
     ("training/named_terms.py", '(*baseline_features(data.angles, zero, zero)[0], *pairs', '(*pairs'),
-    ("training/named_terms.py", 'NamedTerms(tuple(absolute), (), True, apart=True)', 'NamedTerms(tuple(absolute), (), True)'),
+    ("training/named_terms.py", 'NamedTerms(absolute, (), True, apart=True)', 'NamedTerms(absolute, (), True)'),
     ("training/problems/shooting.py", 'self.mass * self.speed * relative', 'self.speed * relative'),
     ("training/problems/smoothing.py", 'self.mass * v', 'v'),
     ("training/equation.py", '-float(run.model.kinetic.mass().detach()[i, i])', '-1.0'),

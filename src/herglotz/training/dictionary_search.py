@@ -22,7 +22,7 @@ from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, sparsest
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
-from herglotz.training.cross_validation import MARGIN
+from herglotz.training.exchange import exchanged
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.found_terms import Found, gain
 from herglotz.training.linear_terms import LinearStart, starts_of
@@ -37,6 +37,7 @@ from herglotz.training.named_terms import (
     settings_of,
     started,
     values_of,
+    without_terms,
 )
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.prior import prior_of
@@ -105,7 +106,8 @@ class DictionarySearch:
             if more is None or not found.joined_by(more, self.floor):
                 break
             found = self._finer(self._held(self._longer(more)))
-        found = self._last_terms(self._likeliest(self._pruned(found)))
+        found = exchanged(self._pruned(found), self.all, self.refit, self._missing, self.floor)
+        found = self._last_terms(self._likeliest(found))
         return FewerNumbers(self.data, self.floor, self.order, self.refit, self._problem).of(found)
 
     def _begun(self) -> Found | None:
@@ -125,14 +127,14 @@ class DictionarySearch:
 
     def _first(self, start: Trajectories, local: LocalPolynomials) -> tuple[Found | None, Sequence[LinearStart]]:
         """From the linear problem, or from the baseline's own terms where that misleads; then starts of fewer terms."""
-        bare = self._grown(*self._bare(), 1, start) if self.coarse and self.data.dof == 1 else None
+        bare = self._bare(start) if self.coarse and self.data.dof == 1 else None
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
         linear = starts_of(self.data, self.base, self.all, local)
         grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
-            bare = self._grown(*self._bare(), 1, start)
+            bare = self._bare(start)
         if bare is not None and bare.misses_less(found):
             found, linear = bare, []
         return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[at:])
@@ -183,13 +185,8 @@ class DictionarySearch:
         halvings = math.ceil(math.log(max(change, 1.0), 4)) if math.isfinite(change) else every
         return max(1, every // (found.config.substeps * 2**halvings))
 
-    def _bare(self) -> tuple[NamedTerms, dict]:
-        """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
-        base, own, zero = self.base, self.own, (0.0,) * self.data.dof
-        base = base if self.all.springs else replace(base, stiffness=zero, tilt=zero)
-        values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
-        features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
-        return self.all.only(tuple(own)), {**values, **features}
+    def _bare(self, start: Trajectories) -> Found | None:
+        return self._grown(*without_terms(self.all, self.base), 1, start)
 
     def _braking(self, found: Found) -> Found:
         """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
@@ -338,8 +335,6 @@ class DictionarySearch:
             if other is None:
                 self.in_vain = (m, found.config.sticking), found.rms
                 break  # the terms make up for the longer steps
-            if found.rms < MARGIN * other.rms and other.rms > AT_THE_NOISE * max(self.noise, FINE * self.floor):
-                break  # something else is missing, and shorter steps would only take their time
             found = self._longer(other) if longer else other
         return found
 

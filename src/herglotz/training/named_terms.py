@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -49,7 +49,7 @@ class NamedTerms:
         features = tuple(dict.fromkeys(self.features + other.features))
         return replace(self, features=features, drag=tuple(dict.fromkeys(self.drag + other.drag)))
 
-    def only(self, names: Sequence[str]) -> NamedTerms:
+    def only(self, names: Collection[str]) -> NamedTerms:
         """Those of them that are among `names`."""
         features, drag = (tuple(x for x in own if x in names) for own in (self.features, self.drag))
         return replace(self, features=features, drag=drag, dry=self.dry and DRY in names)
@@ -216,6 +216,15 @@ def own_terms(angles: Sequence[bool]) -> dict[str, tuple[str, float]]:
     if angles[0]:
         return {"cos(q1)": ("potential.stiffness", -1.0), "sin(q1)": ("potential.tilt", 1.0)}
     return {"q1^2": ("potential.stiffness", 0.5), CONSTANT: ("potential.tilt", 1.0)}
+
+
+def without_terms(every: NamedTerms, base: Baseline) -> tuple[NamedTerms, dict]:
+    """No terms beside the baseline's: where the linear problem gives no model, terms join one by one."""
+    own, zero = own_terms(base.angles), (0.0,) * len(base.angles)
+    base = base if every.springs else replace(base, stiffness=zero, tilt=zero)
+    values = {"potential.stiffness": base.stiffness, "potential.tilt": base.tilt, "damping.rate": (base.rate,)}
+    features = {term: by * values[parameter][0] for term, (parameter, by) in own.items()}
+    return every.only(tuple(own)), {**values, **features}
 
 
 def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order: int, substeps: int) -> FitConfig:

@@ -61,7 +61,7 @@ def test_friction_that_holds_is_kept_where_smooth_friction_is_not_worth_its_widt
     search: Any = object.__new__(DictionarySearch)
     search.data, search.floor, search.noise = SimpleNamespace(q=torch.zeros(100, 1), dof=1), 0.0, 0.0
     search.config, search._longer = SimpleNamespace(sticking=None), lambda found: found
-    search._finer = lambda found: found
+    search._finer = lambda found, **_: found
 
     def make(rms, values):
         found: Any = SimpleNamespace(rms=rms, values=values, terms=SimpleNamespace(dry=True), pushes=False)

@@ -15,6 +15,7 @@ from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.linear_start import LinearFit
 from herglotz.training.linear_terms import LinearTerms
+from herglotz.training.named_terms import without_terms
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +75,7 @@ def test_other_terms_are_fitted_over_the_same_segments():
     stay[5:15] = False
     data = Trajectories.of((torch.arange(101).double() * 0.1)[stay], q[stay], angles=(True,))
     search = DictionarySearch(data, estimate_baseline(data, outliers=False, drag=False), FitConfig().resolved(data))
-    terms, values = search._bare()
+    terms, values = without_terms(search.all, search.base)
     stages = search._stages(terms, values, 1)
     fitted = stages.fit(20, 0.003, None, None)
     assert fitted is not None

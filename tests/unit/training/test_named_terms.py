@@ -435,6 +435,9 @@ def test_shorter_steps_may_cost_what_one_number_is_worth(finer, most, substeps):
     search._longer = lambda found: found
     search._too_long = lambda found: found.config.substeps == 1 and not hasattr(search, "in_vain")
     assert search._finer(at(1, 1.0)).config.substeps == substeps
+    vars(search).pop("in_vain", None)
+    search._longer = None  # the same segments stay, to be compared over
+    assert search._finer(at(1, 1.0), longer=False).config.substeps == substeps
 
 
 @pytest.mark.parametrize(("back", "offered"), [(0.0, ()), (3.0, ("load 1",))])
@@ -487,5 +490,6 @@ def test_a_load_is_asked_for_once_friction_that_joins_a_one_way_joint_pushes(mon
         setattr(search, last, lambda found: found)
     search._problem, search.order = None, 2
     monkeypatch.setattr(FewerNumbers, "of", lambda _self, found: found)
+    monkeypatch.setattr(dictionary_search, "exchanged", lambda found, *_: found)
     assert search.run() is start
     assert names == [("friction.coulomb",), ("load 1",)]

@@ -75,8 +75,8 @@ def test_a_model_without_terms_has_to_miss_less(monkeypatch, whole, rms, bare_wh
     search: Any = object.__new__(DictionarySearch)
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=1), None, None
     search._grown = lambda terms, *_: fits[terms]
-    search._bare = lambda: ("bare", {})
-    search._simpler = search._held = search._finer = lambda found: found
+    search._bare = lambda _start: fits["bare"]
+    search._simpler = search._held = search._finer = lambda found, **_: found
     start = stub(terms="found", values={}, ways=["found"])
     monkeypatch.setattr(dictionary_search, "starts_of", lambda *_: [start])
     assert search._first(None, None)[0] is fits[kept]
@@ -96,7 +96,7 @@ def bare_search(monkeypatch, families) -> Any:
     """A search of two coordinates with these starts."""
     search: Any = object.__new__(DictionarySearch)
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=2), None, None
-    search._simpler = search._held = search._finer = lambda found: found
+    search._simpler = search._held = search._finer = lambda found, **_: found
     monkeypatch.setattr(dictionary_search, "starts_of", lambda *_: families)
     return search
 
@@ -136,7 +136,7 @@ def test_friction_that_holds_is_judged_in_steps_that_are_short_enough():
         return stub(rms=rms, values=values, terms=stub(dry=True), pushes=False, config=config)
 
     search._sticking = lambda found, start: make(1.5 if found.config.substeps == 1 else 1.0, 1, start)
-    search._finer = lambda found: make(1.0, 8, found.values["at"])
+    search._finer = lambda found, **_: make(1.0, 8, found.values["at"])
     held = search._held(make(1.0, 1))
     assert (held.values["at"], held.config.substeps) == (0.0, 8)
 
@@ -194,7 +194,7 @@ def test_a_simpler_family_stands_in_where_residuals_are_no_noise():
     other = stub(instead_of=lambda *_: True, as_likely=lambda *_: False)
     search._first = lambda *_: (stub(coloured=True), [stub(terms="simple", values={})])
     search._grown = lambda *_: other
-    search._held = search._finer = lambda found: found
+    search._held = search._finer = lambda found, **_: found
     assert search._begun() is other
 
 
@@ -212,12 +212,13 @@ def test_terms_join_one_by_one(monkeypatch, lacking):
     search._begun = lambda: made(0)
     search._missing = lambda found: str(len(found.terms.names)) if len(found.terms.names) < lacking else None
     search.refit = lambda found, terms: made(len(found.terms.names) + 1)  # noqa: ARG005
-    search._held = search._finer = search._longer = search._pruned = lambda found: found
+    search._held = search._finer = search._longer = search._pruned = lambda found, **_: found
     search._likeliest = search._last_terms = lambda found: found
     search._problem = None
     monkeypatch.setattr(dictionary_search, "sparsest", lambda _: 1)
     monkeypatch.setattr(dictionary_search, "offered", lambda data, every, *_, **__: every)  # noqa: ARG005
     monkeypatch.setattr(dictionary_search, "FewerNumbers", lambda *_: stub(of=lambda found: found))
+    monkeypatch.setattr(dictionary_search, "exchanged", lambda found, *_: found)
     assert len(search.run().terms.names) == min(lacking, dictionary_search.ADDED)
     assert dictionary_search.ADDED >= 10
 
