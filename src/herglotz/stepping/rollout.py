@@ -221,9 +221,9 @@ class _Progress:
         if self.bar is not None:
             self.bar.update()
         elif perf_counter() - self.begin > PROGRESS_AFTER:
-            from tqdm import tqdm
+            from herglotz.progress import ProgressBar
 
-            self.bar = tqdm(total=self.steps, initial=self.count, unit="step", leave=False)
+            self.bar = ProgressBar(total=self.steps, initial=self.count, unit="step", leave=False)
 
     def close(self) -> None:
         """Remove the bar."""

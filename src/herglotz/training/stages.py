@@ -11,11 +11,11 @@ from typing import Any, Literal, TypedDict
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
+from herglotz.progress import ProgressBar
 from herglotz.schema import check_entries
 from herglotz.telling import tell
 from herglotz.training.distributed import is_first
@@ -86,7 +86,7 @@ class Stages:
         self.lines = progress in ("lines", "iterations") and is_first()
         self.verbose = progress == "iterations" and is_first()
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
-        self.bar = tqdm(total=1, desc="looking at the data", disable=disable, leave=False, dynamic_ncols=True)
+        self.bar = ProgressBar(total=1, desc="looking at the data", disable=disable, leave=False, dynamic_ncols=True)
         self.checkpoint, self.key = checkpoint, key
         self.label = ""
         self.history: list[dict[str, Any]] = []

@@ -9,11 +9,11 @@ from typing import Any
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian
+from herglotz.progress import ProgressBar
 from herglotz.stepping import State, Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Run
@@ -74,7 +74,9 @@ def tune(
         record(run, draw_starts(run, config.starts, 3 * config.seed + k), horizon) for k in range(3)
     )
     total = len(config.multiples) * (1 + len(config.widths))
-    with tqdm(total=total, desc="settings", disable=None if progress is None else not progress, leave=False) as bar:
+    with ProgressBar(
+        total=total, desc="settings", disable=None if progress is None else not progress, leave=False
+    ) as bar:
         search = _Search(run, frozen_double(run), config, max_error, training, choosing, [], bar)
         tried = [*search.forms(), *search.kicks()]
     costs = _costs(tried, choosing, config.rounds)
@@ -119,7 +121,7 @@ class _Search:
     training: Motions
     choosing: Motions
     notes: list[str]
-    bar: tqdm
+    bar: ProgressBar
 
     def _models(self) -> Iterator[tuple[int, int | None, ContactLagrangian]]:
         """Yield (multiple, width, model): the run's own model at every step, then the distilled models."""

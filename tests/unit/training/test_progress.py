@@ -1,12 +1,16 @@
 """What a fit shows while it works, and the log that it leaves."""
 
 import sys
+from io import StringIO
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 import torch
 
+import herglotz
 from herglotz.errors import InputError
+from herglotz.progress import ProgressBar
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 from herglotz.training.stages import Progress, Stages
@@ -107,3 +111,15 @@ def test_a_fit_removes_what_a_killed_one_left(monkeypatch, tmp_path, first):
     with pytest.raises(InterruptedError):
         module.fit([0.0, 1.0, 0.0, -1.0], h=1.0, out=tmp_path)
     assert sorted(x.name for x in tmp_path.iterdir()) == (names[-1:] if first else sorted(names))
+
+
+def test_bars_have_no_thread_that_python_may_end_in():
+    # fails if a thread of tqdm draws bars: one of twenty commands that Ctrl-C ended aborted with signal 6, for it held
+    # stderr while Python ended
+    bar = ProgressBar(total=2, disable=False, file=StringIO())
+    bar.update()
+    bar.close()
+    assert ProgressBar.monitor is None
+    package = Path(herglotz.__file__).parent
+    users = [path.name for path in package.rglob("*.py") if "import tqdm" in path.read_text("utf-8")]
+    assert users == ["progress.py"]
