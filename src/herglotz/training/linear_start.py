@@ -7,9 +7,9 @@ and its derivative J = ∂R/∂q2. Positions do not determine the scale of L_d (
 
 is minimised, J_k being the J of the round before: a generalised eigenproblem, whose smallest eigenvalue is 0 where the
 features can make the motion exactly. (With one coefficient fixed instead, the others cancel it: trap 2. A search by
-least squares from a constant mass ends in other valleys.) Noise makes its rounds wander, by masses of coordinates that
-hardly act on one another above all. From the best of them the likelihood of the errors e = J(x)⁻¹R(x), each coordinate
-having a size of its own,
+least squares from a constant mass ends in other valleys.) Noise makes its rounds wander: the coordinate that errs least
+counts ever more, by a mass that grows where others hardly act on it. From the best of the rounds the likelihood of the
+errors e = J(x)⁻¹R(x), each coordinate having a size of its own,
 
     Σ_i log Σ_k e_i²
 
@@ -37,7 +37,6 @@ from herglotz.training.parameter_vector import ParameterVector
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
-LEAST = 0.01  # of the largest error of a coordinate: smaller ones weigh no more
 STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
 AT_ONCE = 1_000_000  # derivatives of J that are formed at the same time: 8 MB, and 25 times as much that leads to them
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
@@ -122,16 +121,12 @@ class LinearFit:
         return out
 
     def _eigenvectors(self) -> Iterator[Tensor]:
-        """Coefficients of unit size by the ratio at the head of this module, after each round; none that is not finite.
-
-        Each coordinate's errors are over their size in the round before: else the coordinate that errs least would
-        count ever more, by a mass that grows where others hardly act on it.
-        """
+        """Coefficients of unit size by the ratio at the head of this module after each round, while they are finite."""
         R, J, n = self.R, self.J, self.R.shape[1]
-        Jk, error = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n), R.new_ones(n)
+        Jk = torch.eye(n, dtype=R.dtype, device=R.device).expand(len(R), n, n)
         for _ in range(ROUNDS):
             inverse = torch.linalg.pinv(Jk)
-            top = (inverse @ R / error[:, None]).flatten(0, 1)
+            top = (inverse @ R).flatten(0, 1)
             bottom = torch.einsum("tij,tjkf->tikf", inverse, J).flatten(0, 2)
             # In units of the motion: in others the smaller of both parts would be lost in the rounding of the larger.
             unit = float(top[:, 0].norm() / bottom[:, 0].norm())
@@ -145,10 +140,7 @@ class LinearFit:
             y = torch.linalg.svd(Q[: len(top)], full_matrices=False).Vh[-1]
             x = least_squares(U, y[:, None])[:, 0] / size
             yield x
-            Jk, error = J @ x, self.errors(x).square().mean(0).sqrt()
-            if not bool(torch.isfinite(error).all()):
-                return
-            error = (error / error.max().clamp_min(1e-300)).clamp_min(LEAST)
+            Jk = J @ x
 
     def _misfit(self, x: Tensor) -> float:
         """What is minimised in the end: Σ_i log of the mean square error of coordinate i; inf without a mass matrix."""

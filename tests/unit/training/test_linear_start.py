@@ -26,8 +26,9 @@ def weakly_coupled(seed: int, noise: tuple[float, float], samples: int = 500) ->
 @pytest.mark.parametrize("seed", range(5))
 @pytest.mark.parametrize("noise", [(0.5, 0.1), (0.1, 0.5)])
 def test_a_mass_is_not_made_large_by_small_errors_of_its_coordinate(seed, noise):
-    # fails if the coordinate that errs least counts ever more: its mass came out 500 to 1900 times as large, or 0.04 to
-    # 0.17 times. Over 40 seeds its logarithm has a standard deviation of 0.05 and 0.10, which noise gives it
+    # fails if the eigenvector is the start: the coordinate that errs least counts ever more, and its mass came out 500
+    # to 1900 times as large, or 0.04 to 0.17 times. Over 40 seeds its logarithm has a standard deviation of 0.05 and
+    # 0.10, which noise gives it
     fit = weakly_coupled(seed, noise)
     x = fit.solve(torch.ones(5, dtype=torch.bool))
     assert math.log(float(x[1] / x[0]) / 2) == pytest.approx(0, abs=0.4)

@@ -10,7 +10,7 @@ import torch
 from herglotz.data import Trajectories, simulate
 from herglotz.data.smoothing import local_polynomials
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, dictionary_search, trajectory_fit
+from herglotz.training import FitConfig, dictionary_search, structure, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import BETTER, DictionarySearch
 from herglotz.training.found_terms import Found
@@ -45,6 +45,32 @@ def test_masses_of_a_start_are_regular_at_all_samples(coupling):
     assert float(torch.linalg.eigvalsh((M @ left) / d[:, None] / d).min()) > SINGULAR
     assert torch.equal(left[:3], x[:3])
     assert torch.equal(left, x) is (coupling == 0.5)
+
+
+@pytest.mark.parametrize(("errors", "first"), [((1.0, 0.99), 0), ((1.0, 0.5), 1), ((1e-12, 1e-300), 1)])
+def test_the_likeliest_family_is_first(errors, first):
+    # fails if the least error decides: nine candidates more lower that of noise always. ½ · 9 · log 100 is worth 19 %
+    terms: Any = object.__new__(LinearTerms)
+    terms.count = 100
+    starts = [LinearStart(NamedTerms(), {}, error, size) for error, size in zip(errors, (10, 19), strict=True)]
+    assert terms.likeliest(starts) == first
+    assert terms.likeliest([]) == 0
+
+
+@pytest.mark.parametrize(("misses", "hold"), [((0.7, 0.75), "first"), ((0.9, 0.85), ""), ((None, 0.6), "smooth")])
+def test_another_hold_has_to_miss_far_less(monkeypatch, misses, hold):
+    # fails if any gain is worth another search, or a hold that cannot be followed ends it
+    made = dict(zip(("first", "smooth"), misses, strict=True))
+
+    def searching(data, *_args, **_settings):
+        miss = made[data.hold]
+        return stub(refit=lambda _found, _terms: None if miss is None else stub(rms=miss))
+
+    monkeypatch.setattr(structure, "DictionarySearch", searching)
+    t = torch.arange(9.0)
+    data = Trajectories.of(t, t[:, None], u=t[:, None])
+    found = stub(rms=1.0, terms=None, base=None, config=None)
+    assert structure._better_hold(found, data, tuple(made), outliers=False) == hold
 
 
 def stub(**values) -> Any:
@@ -136,8 +162,15 @@ def test_friction_that_holds_is_judged_in_steps_that_are_short_enough():
         return stub(rms=rms, values=values, terms=stub(dry=True), pushes=False, config=config)
 
     search._sticking = lambda found, start: make(1.5 if found.config.substeps == 1 else 1.0, 1, start)
-    search._finer = lambda found, **_: make(1.0, 8, found.values["at"])
+    said = {}
+
+    def finer(found, **how):
+        said.update(how)
+        return make(1.0, 8, found.values["at"])
+
+    search._finer = finer
     held = search._held(make(1.0, 1))
+    assert said == {"longer": False}  # misfits of longer segments are larger, and cannot be compared
     assert (held.values["at"], held.config.substeps) == (0.0, 8)
 
 
@@ -218,9 +251,11 @@ def test_terms_join_one_by_one(monkeypatch, lacking):
     monkeypatch.setattr(dictionary_search, "sparsest", lambda _: 1)
     monkeypatch.setattr(dictionary_search, "offered", lambda data, every, *_, **__: every)  # noqa: ARG005
     monkeypatch.setattr(dictionary_search, "FewerNumbers", lambda *_: stub(of=lambda found: found))
-    monkeypatch.setattr(dictionary_search, "exchanged", lambda found, *_: found)
+    exchanges = []
+    monkeypatch.setattr(dictionary_search, "exchanged", lambda found, *_: exchanges.append(found) or found)
     assert len(search.run().terms.names) == min(lacking, dictionary_search.ADDED)
     assert dictionary_search.ADDED >= 10
+    assert len(exchanges) == 1
 
 
 def test_every_start_is_made_regular(monkeypatch):
