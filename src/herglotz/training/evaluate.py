@@ -70,16 +70,16 @@ def unseen_errors(run: Run) -> list[Tensor]:
     return [error[first + trained : first + length] for first, length, trained in rows]
 
 
-def free_run_rms(task: Task, seen: Look, fitted: Fitted) -> float:
-    """RMS error of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
+def free_run_errors(task: Task, seen: Look, fitted: Fitted) -> Tensor:
+    """Errors of the free run over the unseen part, over the coordinates' balance; inf where it breaks off.
 
     Single spikes are left out.
     """
     fitted = replace(fitted, states=_with_dropped(fitted, seen.train, seen.spikes))
     states, _ = states_everywhere(fitted, seen.data, seen.train.lengths, task.base.model_step)
     _, free = _errors(fitted, task, seen, seen.spikes, states)
-    found = None if free is None else _rms(free / seen.train.balance)
-    return math.inf if found is None else found
+    lost = seen.data.q.new_full((1, seen.data.dof), math.inf)
+    return lost if free is None or not bool(free.isfinite().all()) else free / seen.train.balance
 
 
 def _with_dropped(fitted: Fitted, train: Trajectories, dropped: Tensor) -> Tensor:

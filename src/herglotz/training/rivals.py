@@ -19,7 +19,7 @@ from herglotz.schema import from_plain
 from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.evaluate import free_run_rms
+from herglotz.training.evaluate import free_run_errors
 from herglotz.training.look import Look, look
 from herglotz.training.named_terms import DRAG, STILL
 from herglotz.training.objectives import OBJECTIVES
@@ -62,7 +62,9 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
     why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with {model}, "
     why += f"{second['rms']:.2g} with networks ({networks.objective})"
-    if first["rms"] <= MARGIN * second["rms"]:
+    if lost := min(first["rms"], second["rms"]) > _spread(seen):
+        why += f"; both are lost: with errors up to the spread they miss {first['until']:.2g} and {second['until']:.2g}"
+    if first[by := "until" if lost else "rms"] <= MARGIN * second[by]:
         return seen, _reasoned(named, why)
     if networks.objective == "trajectory" and "departure" in second:
         other = _going_on(other, second)
@@ -152,13 +154,16 @@ def _reasoned(plan: Plan, why: str) -> Plan:
 def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict[str, Any]:
     """Error of the free run over the rest of the training part, and the fit to its first part, in plain values.
 
-    Beside it that of windows of 20 steps, which chaotic motion does not leave.
+    Beside it the same of errors that count up to the spread, `until`: of free runs that are lost, as of chaos, it tells
+    how long they follow; and that of windows of 20 steps.
     """
     inner, silent = replace(config, train_fraction=INNER), Stages()
     inside = look(seen.train.thinned(every), inner, silent, replace(plan, zeros=()))  # which `seen` has taken off
     task = Task(inside.kept, inside.base, inside.settings, silent, hurried=True)
     fitted = OBJECTIVES[plan.objective](task, inside, plan)
-    found: dict[str, Any] = {"rms": free_run_rms(task, inside, fitted), "sigma": fitted.sigma}
+    errors, spread = free_run_errors(task, inside, fitted), _spread(seen)
+    rms, until = (float(e.square().mean().sqrt()) for e in (errors, errors.clamp(-spread, spread)))
+    found: dict[str, Any] = {"rms": rms, "until": until, "sigma": fitted.sigma}
     if config.find_zeros and plan.network == "none" and inside.unseen is not None:
         error = unseen_window_errors(task, fitted, inside.unseen) / inside.train.balance
         found["windows"] = float(error.square().mean().sqrt())

@@ -6,6 +6,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
@@ -55,7 +56,8 @@ def held(monkeypatch):
         return SimpleNamespace(**{**vars(seen), "base": SimpleNamespace(start=start)})
 
     def held_out(seen, config, plan, every=1):  # noqa: ARG001
-        return errors["bare" if seen.name == "bare" else plan.network]
+        found = errors["bare" if seen.name == "bare" else plan.network]
+        return {"until": min(found["rms"], 1.0)} | found
 
     monkeypatch.setattr(rivals, "look", look)
     monkeypatch.setattr(rivals, "choose", lambda seen, _: plan("potential" if seen.name == "networks" else "none"))
@@ -109,6 +111,35 @@ def test_networks_that_err_more_lose(held, networks):
     seen, chosen = held.winner({"rms": 5 * NOISE, "sigma": NOISE}, {"rms": networks, "sigma": NOISE})
     assert (seen.name, chosen.network) == ("named", "none")
     assert chosen.departures == (2e-4, 6e-3)
+
+
+@pytest.mark.parametrize(
+    ("named", "networks", "winner"),
+    [((11.0, 0.9), (23.0, 0.6), "networks"), ((4e9, 0.62), (23.0, 0.6), "named"), ((0.3, 0.2), (0.5, 0.1), "named")],
+)
+def test_of_free_runs_that_are_lost_the_longer_one_wins(held, named, networks, winner):
+    # fails if rounding chooses: chaos made the error of one model 11 or 4e9, by the last digits of its parameters
+    found = ({"rms": rms, "until": until, "sigma": NOISE} for rms, until in (named, networks))
+    seen, chosen = held.winner(*found)
+    assert seen.name == winner
+    assert ("both are lost" in chosen.reasons["objective"]) is (named[0] > 1)
+
+
+def test_errors_count_up_to_the_spread(monkeypatch):
+    # fails if a free run that leaves the data after half of the time is as bad as one that never followed them
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=80, h=0.2, noise=NOISE, seed=0)
+    seen = SimpleNamespace(kept=data, train=data)
+    spread = rivals._spread(seen)  # type: ignore[arg-type]
+    errors = torch.tensor([[0.0], [-1e9 * spread]], dtype=torch.float64)
+    monkeypatch.setattr(
+        rivals, "look", lambda *_: SimpleNamespace(kept=data, base=None, settings=FitConfig(), unseen=None)
+    )
+    fitted = SimpleNamespace(sigma=NOISE, notes={}, model=torch.nn.Linear(1, 1))
+    monkeypatch.setitem(rivals.OBJECTIVES, "trajectory", lambda *_: fitted)
+    monkeypatch.setattr(rivals, "free_run_errors", lambda *_: errors)
+    found = rivals._held_out(seen, FitConfig(), plan("none"))  # type: ignore[arg-type]
+    assert found["until"] == pytest.approx(spread / 2**0.5)
+    assert found["rms"] == pytest.approx(1e9 * spread / 2**0.5)
 
 
 @pytest.mark.parametrize(
