@@ -111,7 +111,8 @@ def look(
     hold = "" if seen.found is None else seen.found.hold
     if not hold:
         return seen
-    again = _seen(replace(data, hold=hold), user_settings, stages.labelled(f", hold {hold}"), plan, named, zeros)
+    stages = stages.labelled(f"{stages.label}, hold {hold}")
+    again = _seen(replace(data, hold=hold), user_settings, stages, plan, named, zeros)
     why = f"the terms that were found with hold {seen.arrival.hold} miss the data by far less with {hold}"
     return replace(again, why_arrival=seen.why_arrival | {"hold": why})
 
