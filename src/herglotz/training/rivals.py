@@ -55,8 +55,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         if bare["rms"] <= FOLLOWS * _spread(seen) and not bare["rms"] > MARGIN * first["rms"]:
             seen, first, model = _going_on(fewer, bare), bare, "friction and inputs alone"
             named = choose(seen, config)
-    other = look(data, config, _of(stages, seen.zeros), named=False, zeros=seen.zeros)
-    other = replace(other, apart=seen.apart) if seen.apart else other
+    other = _without_names(data, config, stages, seen)
     networks = choose(other, config)
     every = sparsest(seen.kept)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
@@ -74,6 +73,14 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
             reasons={**networks.reasons, "fitted_before": "to three quarters of the training part"},
         )  # fmt: skip
     return other, _reasoned(networks, why)
+
+
+def _without_names(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> Look:
+    """The look that networks start from; inputs arrive as the named terms have shown."""
+    data = data if data.u is None else replace(data, hold=seen.arrival.hold)
+    other = look(data, config, _of(stages, seen.zeros), named=False, zeros=seen.zeros)
+    other = other if data.u is None else replace(other, why_arrival=seen.why_arrival)
+    return replace(other, apart=seen.apart) if seen.apart else other
 
 
 def _aligned(

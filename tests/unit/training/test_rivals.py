@@ -31,6 +31,13 @@ class Seen:
     found: Structure | None = None
 
 
+@dataclass(frozen=True)
+class Arrived:
+    """The part of a look that says how inputs arrive."""
+
+    why_arrival: dict
+
+
 def plan(network):
     plain = {"coulomb": False, "sticking": False, "coupled": False, "diagonal": False, "alike": False}
     return Plan(
@@ -203,3 +210,19 @@ def test_the_last_fit_goes_on_from_the_first_part():
     told = rivals._going_on(seen, {"sigma": 0.5, "start": {}}).found
     assert told is not None  # fails if σ is still that of the terms that are gone
     assert told.sigma == 0.5
+
+
+def test_networks_take_the_inputs_as_named_terms_have_shown_them(monkeypatch):
+    # fails if named terms, which found another hold, are compared with networks that have the one that was mistaken
+    data = simulate(scene("driven_pendulum"), trajectories=1, steps=40, h=0.1, seed=0)
+    seen = SimpleNamespace(arrival=SimpleNamespace(hold="zero"), zeros=(), apart="", why_arrival={"hold": "found"})
+    looks = []
+
+    def look(data, *_, **__):
+        looks.append(data.hold)
+        return Arrived({})
+
+    monkeypatch.setattr(rivals, "look", look)
+    other = rivals._without_names(replace(data, hold=""), FitConfig(), Stages(), seen)  # type: ignore[arg-type]
+    assert looks == ["zero"]
+    assert other.why_arrival == {"hold": "found"}
