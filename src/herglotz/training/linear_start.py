@@ -147,21 +147,21 @@ class LinearFit:
         M = -(self.J @ x) * x[0].sign()
         if int(torch.linalg.cholesky_ex((M + M.mT) / 2)[1].sum()):
             return math.inf
-        return float(self.errors(x).square().mean(0).clamp_min(1e-300).log().sum())
+        return float(self.errors(x).square().mean(0).clamp_min(torch.finfo(x.dtype).tiny).log().sum())
 
     def _polished(self, x: Tensor) -> Tensor:
         """The minimum of `_misfit` from x, the first mass being held; x where it has no mass matrix."""
-        best, damping, its = self._misfit(x), 1e-3, math.inf
+        best, damping, tiny = self._misfit(x), 1e-3, torch.finfo(x.dtype).tiny
         for _ in range(STEPS if best < math.inf else 0):
             e = self.errors(x)
-            size = e.square().mean(0).sqrt().clamp_min(1e-300)
+            size = e.square().mean(0).sqrt().clamp_min(tiny)
             D = torch.linalg.solve(self.J @ x, self.R - torch.einsum("tijf,tj->tif", self.J, e))[..., 1:]
             D, e = (D / size[:, None]).flatten(0, 1), (e / size).flatten()
             A = D.T @ D
             scale = torch.where(A.diagonal() > 0, A.diagonal(), 1.0).sqrt()
             A = A / scale[:, None] / scale + damping * torch.eye(len(A)).to(A)
             other = x.clone()
-            other[1:] -= torch.linalg.solve(A, D.T @ e / scale) / scale
+            other[1:] -= torch.linalg.solve_ex(A, D.T @ e / scale)[0] / scale  # no number: no step
             gain = best - (its := self._misfit(other))
             if not gain > 0:
                 damping *= 5

@@ -47,3 +47,12 @@ def test_coefficients_that_no_mass_matrix_has_are_left_alone():
     x = torch.tensor([1.0, -2.0, 3.0, 8.0, 0.5], dtype=torch.float64)
     assert fit._misfit(x) == math.inf
     assert torch.equal(fit._polished(x), x)
+
+
+def test_single_precision_gives_numbers():
+    # fails if an error of 0 is divided by a size that float32 has not: 1e-300
+    fit = weakly_coupled(0, (0.0, 0.0))
+    x = torch.tensor([1.0, 2.0, 3.0, 8.0, 0.5])
+    single = LinearFit(torch.zeros_like(fit.R).float(), fit.J.float(), NAMES)
+    assert math.isfinite(single._misfit(x))
+    assert torch.equal(single._polished(x), x)
