@@ -74,6 +74,7 @@ class Forces:
     # (..., n) the impulse that dry friction can hold where a coordinate stands still (q1 = q0), 0 where it slides:
     # F⁻ then is any value between minus − held and minus + held. None: no friction is set-valued.
     held: Tensor | None = None
+    grip: Tensor | None = None  # (..., n) the same where it slides too: the size of dry friction's part of F⁻
 
 
 @dataclass(frozen=True)

@@ -96,19 +96,19 @@ class Friction(nn.Module):
         f = self.force(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
         minus, plus = before * f.value, after * f.value
-        held, grip_slope = None, torch.zeros_like(v)
+        held, grip, grip_slope = None, None, torch.zeros_like(v)
         if self.dry and self.sticking:
             grip, grip_slope = self.grip(v)
-            whole = (c * h)[..., None]
-            minus, held = minus - whole * grip * v.sign(), torch.where(v.abs() > 0, 0.0, whole * grip)
+            grip = (c * h)[..., None] * grip
+            minus, held = minus - grip * v.sign(), torch.where(v.abs() > 0, 0.0, grip)
             grip_slope = grip_slope * v.sign()
         if order == 1:
-            return Forces(minus, plus, held=held)
+            return Forces(minus, plus, held=held, grip=grip)
         slope = f.gradient[0]  # ∂f/∂q1 = slope / h
         minus_2 = torch.diag_embed((c / 2)[..., None] * slope - c[..., None] * grip_slope)
         plus_2 = torch.diag_embed(slope / 2)
         zero = torch.zeros_like(minus)
-        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero, held)
+        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero, held, grip)
 
     def applied(self, u: Tensor) -> Tensor:
         """Return G (u − u₀), (..., n)."""

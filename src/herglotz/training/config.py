@@ -87,8 +87,9 @@ class FitConfig:
         training data are left out beforehand, unless "off".
     find_zeros
         The sensors may read something else in each recording where a coordinate is 0: where such zeros could replace
-        named terms they are found, and kept if free runs over held-out time ask for them
-        (`herglotz.training.sensor_zeros`). It costs a second search for terms.
+        named terms they are found, and kept if held-out time asks for them (`herglotz.training.sensor_zeros`). It costs
+        a second search for terms. None: where named terms miss the data by more than the noise. True: also where they
+        do not. False: nowhere.
     supervision
         What the one-step objective is fitted to: "q" (positions), "qs" (s beside them) or "qps" (momenta as well),
         where they are recorded at every sample. Their unit is fitted. With s known the full level is reliable.
@@ -155,7 +156,7 @@ class FitConfig:
     coulomb: bool = False
     sticking: bool | None = None
     robust: str = "auto"
-    find_zeros: bool = False
+    find_zeros: bool | None = None
     supervision: str = "q"
     restarts: int | None = None
     use_inputs: bool = True

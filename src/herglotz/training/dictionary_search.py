@@ -65,11 +65,16 @@ SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of o
 class DictionarySearch:
     """See the head of this module: `data` to train on, the first look `base` at them, and the settings of the fit.
 
-    With `outliers` Student's t is the loss.
+    With `outliers` Student's t is the loss. Where the data are every m-th of `recorded` samples, the linear problem is
+    made of them all.
     """
 
-    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False):
+    def __init__(
+        self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False,
+        recorded: Trajectories | None = None, every: int = 1,
+    ):  # fmt: skip
         self.data, self.base, self.config = data, base, config
+        self.recorded, self.every = data if recorded is None else recorded, every
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data, config.translations)
         self.own = own_terms(data.angles)
@@ -112,9 +117,9 @@ class DictionarySearch:
 
     def _begun(self) -> Found | None:
         """The terms of one linear problem, fitted to segments that grow."""
-        if (local := local_polynomials(self.data)) is None:
+        if (local := local_polynomials(self.recorded)) is None:
             return None
-        start = smoothed(self.data, local)
+        start = smoothed(self.recorded, local).thinned(self.every)
         found, simpler = self._first(start, local)
         if found is None:
             return None
@@ -130,7 +135,7 @@ class DictionarySearch:
         bare = self._bare(start) if self.coarse and self.data.dof == 1 else None
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
-        linear = starts_of(self.data, self.base, self.all, local)
+        linear = starts_of(self.recorded, self.base, self.all, local)
         grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
@@ -161,7 +166,9 @@ class DictionarySearch:
     def _from_sparse(self, sparse: Trajectories, every: int) -> Found | None:
         """What every m-th sample asks for, fitted to all of them."""
         base = replace(self.base, max_step=every * self.base.max_step, model_step=every * self.base.model_step)
-        search = DictionarySearch(sparse, base, self.config, outliers=self.freedom is not None)
+        search = DictionarySearch(
+            sparse, base, self.config, outliers=self.freedom is not None, recorded=self.data, every=every
+        )
         found = search.run()
         if found is None:
             return None
@@ -242,7 +249,10 @@ class DictionarySearch:
         if found.whole:
             return found
         stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
-        stages.lengths = [0, *(length for length in stages.lengths if length > found.fit.problem.grid.length)]
+        stages.hurried, stages.lengths = (
+            True,
+            [0, *(length for length in stages.lengths if length > found.fit.problem.grid.length)],
+        )
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
     def _problem(

@@ -30,6 +30,7 @@ from herglotz.training.task import Task
 from herglotz.training.verdict import unseen_window_errors
 
 REFINED = 2  # searches for terms with better zeros
+WORTH = 0.8  # of the error over held-out time without zeros: what zeros have to lower it to
 FOLLOWS = 0.5  # of the spread: a free run that misses by more is lost, and tells nothing of terms
 INNER = 0.75  # of the training part that rivals are fitted to
 
@@ -87,7 +88,7 @@ def _aligned(
     data: Trajectories, config: FitConfig, stages: Stages, seen: Look, first: dict[str, Any]
 ) -> tuple[Look, dict[str, Any]]:
     """With zeros of the sensors in each recording, where free runs over held-out time miss it less with them."""
-    if not config.find_zeros or seen.found is None or not seen.found.apart:
+    if config.find_zeros is False or seen.found is None or not seen.found.apart:
         return seen, first
     apart = _kept(stages, "zeros", lambda: sensor_zeros(data, config, seen))
     if apart is None:
@@ -107,7 +108,7 @@ def _aligned(
     second = stages.keep("held out, other zeros", lambda: _held_out(other, config, plan))
     numbers = (f"{x['windows']:.2g} and {x['rms']:.2g}" for x in (second, first))
     words = "{}; over held-out time windows and one free run miss {} with them, {} without".format(apart, *numbers)
-    if not MARGIN * _both(second, seen) < _both(first, seen):  # also where both are lost
+    if not _both(second, seen) < WORTH * _both(first, seen):  # also where both are lost
         return told, first
     return replace(other, apart=words), second
 
@@ -171,7 +172,7 @@ def _held_out(seen: Look, config: FitConfig, plan: Plan, every: int = 1) -> dict
     errors, spread = free_run_errors(task, inside, fitted), _spread(seen)
     rms, until = (float(e.square().mean().sqrt()) for e in (errors, errors.clamp(-spread, spread)))
     found: dict[str, Any] = {"rms": rms, "until": until, "sigma": fitted.sigma}
-    if config.find_zeros and plan.network == "none" and inside.unseen is not None:
+    if len(seen.train) > 1 and config.find_zeros is not False and plan.network == "none" and inside.unseen is not None:
         error = unseen_window_errors(task, fitted, inside.unseen) / inside.train.balance
         found["windows"] = float(error.square().mean().sqrt())
     found["start"] = {name: x.detach().reshape(-1).tolist() for name, x in fitted.model.named_parameters()}

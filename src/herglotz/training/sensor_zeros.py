@@ -4,7 +4,8 @@ A model cannot follow such recordings together, though each of them alone: frict
 and nothing then asks for the zeros any more. Four steps avoid that:
 
 1. The reference is fitted alone: with terms of its own, for those of all recordings hide the difference, and where they
-   miss more than the noise, with those of all recordings.
+   miss more than the noise, with those of all recordings. Where nobody asked for zeros, and the reference is missed no
+   less alone than with the others, nothing follows.
 2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
 3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations; z = 0 in
    the reference.
@@ -106,6 +107,8 @@ def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | N
     own = seen.kept.trajectory[together.problem.grid.sample] == of.reference
     before = _rms(together.problem.misfit(together.path)[own])
     apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
+    if config.find_zeros is None and not apart.differs:
+        return None  # zeros that keep nothing apart are looked for where the user asks alone
     first = look(data[of.reference], config, Stages())
     found = of.best(first, alone)
     if found.z.any() and found.rms <= MARGIN * together.noise:

@@ -142,7 +142,9 @@ class SegmentStages:
         else:
             start, states = before.theta, before.problem.states_at(before.path, grid.start_sample)
             problem.guess_from(before.problem, before.path)
-        problem.patient = self.patient
+        if self.patient and self.hurried:  # the start alone is stepped through: trials without a path may be left
+            problem.solve(problem.pack(start, states))
+        problem.patient = self.patient and not self.hurried
         name = f"segments of {length}" + (", robust" if freedom else "" if used is None else ", outliers left out")
         return self.optimise(problem, start, states, name, near=near)
 

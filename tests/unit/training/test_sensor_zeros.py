@@ -208,11 +208,23 @@ def test_a_prediction_takes_off_the_zeros_that_suit_its_warm_up():
     assert rms(PLANTED, sensor_zeros=(0.0,)) > (5 * NOISE, ())
 
 
-def test_zeros_are_looked_for_where_the_user_asks_alone():
+def test_zeros_are_not_looked_for_where_the_user_says_so():
     first = {"windows": 1.0, "rms": 1.0}
-    # fails if the search for zeros begins without being asked for
-    assert rivals._aligned(pendulums(), FitConfig(), silent(), seen(), first) == (seen(), first)
+    # fails if the search for zeros begins against the user's word
+    assert rivals._aligned(pendulums(), FitConfig(find_zeros=False), silent(), seen(), first) == (seen(), first)
     assert "--find-zeros" in seen().apart  # fails if nobody is told of it
+
+
+def test_zeros_are_looked_for_by_default_where_terms_miss_the_data(monkeypatch):
+    tried = []
+    monkeypatch.setattr(rivals, "_held_out", lambda *_: {"rms": 10 * NOISE, "windows": 10 * NOISE, "until": 10 * NOISE})
+    monkeypatch.setattr(rivals, "sensor_zeros", lambda *_: tried.append(True))
+    looked = replace(seen(), found=seen().found._replace(doubt=False))  # type: ignore[union-attr]
+    rivals.held_out_winner(pendulums(), FitConfig(), silent(), looked)
+    assert tried == [True]  # fails if they wait for the flag
+    monkeypatch.setattr(rivals, "_held_out", lambda *_: {"rms": NOISE, "windows": NOISE, "until": NOISE})
+    rivals.held_out_winner(pendulums(), FitConfig(), silent(), looked)
+    assert tried == [True]  # fails if time is spent on data that are met
     assert seen(0.0).apart == ""
 
 
@@ -229,7 +241,7 @@ def held_out(monkeypatch, before, after):
 
 def test_zeros_stay_only_where_held_out_time_asks_for_them(monkeypatch):
     assert held_out(monkeypatch, (0.01, 0.02), (0.003, 0.004))
-    assert not held_out(monkeypatch, (0.0031, 0.0031), (0.003, 0.003))  # by less than a twentieth
+    assert not held_out(monkeypatch, (0.0036, 0.0036), (0.003, 0.003))  # by less than a fifth
     assert held_out(monkeypatch, (0.01, float("inf")), (0.003, 5.0))  # chaos: both are lost, windows are not
     assert not held_out(monkeypatch, (0.003, float("inf")), (0.003, 5.0))  # fails if a lost free run decides
     for lost in (float("inf"), float("nan")):  # fails if zeros stay that held-out time says nothing of

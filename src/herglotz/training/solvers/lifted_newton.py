@@ -13,22 +13,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
-from herglotz.mechanics.legendre import soft_threshold
+from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
 from herglotz.stepping import State, Status, solve, solve_step
-from herglotz.stepping.partials_equation import PartialsEquation
-from herglotz.stepping.stick_slip import at_rest
 from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.parameter_vector import FixedModel
 
 NEAR = 1e-7  # defects whose next ones need not be looked at where quadratic convergence makes them rounding
 CURVED = 1e4  # taken for the next defect over the square of the first, which no earlier one tells
+STILL = 64.0  # times rounding: sums of corrections move a coordinate by so little that friction holds
+PIECES = 4  # iterations of an equation that is linear in pieces
 CHUNK = 4096  # steps whose parameter Jacobian is held in memory at once
 
 
@@ -49,12 +49,8 @@ def solve_path(
     sweeps: int = 12,
 ) -> Path | None:
     """The trajectories from `start`, or None where the sweeps do not converge."""
-    n = (start.shape[-1] - 1) // 2
-    if not L_d.capabilities.sticking or n == 1:
-        path = _swept(linear_steps, L_d, start, h, guess, tol, sweeps)
-        if path is not None:
-            return path
-    return _swept(all_steps, L_d, start, h, guess, tol, sweeps)
+    path = _swept(linear_steps, L_d, start, h, guess, tol, sweeps)
+    return _swept(all_steps, L_d, start, h, guess, tol, sweeps) if path is None else path
 
 
 def _swept(
@@ -136,20 +132,40 @@ def _momentum_slope(P: Partials) -> Tensor:
 def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
     """The same with F linear about the next state's q; exact, and equal to `all_steps`, where F = 0 there.
 
-    Where friction is set-valued (one coordinate), F at rest tells whether it holds.
+    Where friction is set-valued, the inclusion with F linear is solved: it holds or lets go what it then should.
     """
     n = (x.shape[-1] - 1) // 2
     q0, p0, s0, q1 = x[:, :-1, :n], x[:, :-1, n : 2 * n], x[:, :-1, 2 * n], x[:, 1:, :n]
-    if L_d.capabilities.sticking:
-        rest = at_rest(PartialsEquation(L_d, State(q0, p0, s0), h, 2, increments=False))
-        delta = soft_threshold(rest.start, rest.bound)
-        q1 = q0 + torch.where(delta * (q1 - q0) > 0, q1 - q0, delta)
+    if sticking := L_d.capabilities.sticking:
+        q1 = torch.where((q1 - q0).abs() <= STILL * torch.finfo(x.dtype).eps * q0.abs(), q0, q1)
     P = partials(L_d, q0, q1, s0, h, order=2)
-    dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))[..., None]
-    if P.force is not None and P.force.held is not None:
-        dq = torch.where((P.force.held > 0)[..., None], 0.0, dq)
-    p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ dq)[..., 0], s0 + P.L + (P.D2[..., None, :] @ dq)[..., 0, 0]
-    return torch.cat([q1 + dq[..., 0], p1, s1[..., None]], -1), step_derivative(P, p0)
+    if sticking:
+        dq, P = _linear_inclusion(P, p0, q1 - q0)
+    else:
+        dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))
+    step = dq[..., None]
+    p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ step)[..., 0], s0 + P.L + (P.D2 * dq).sum(-1)
+    return torch.cat([q1 + dq, p1, s1[..., None]], -1), step_derivative(P, p0)
+
+
+def _linear_inclusion(P: Partials, p0: Tensor, delta: Tensor) -> tuple[Tensor, Partials]:
+    """How far the solution Δ lies from `delta` where F is linear, and P with what friction holds there.
+
+    F(Δ) without dry friction lies in w Sgn(Δ). With z = Δ + λ/K as in `herglotz.stepping.stick_slip`, λ being the
+    impulse of friction, G(z) = F(Δ) − K (z − Δ) = 0 is linear in pieces.
+    """
+    assert P.force is not None
+    assert P.force.grip is not None
+    J, w = unheld_jacobian(P, p0), P.force.grip
+    F, K = unheld_residual(P, p0) + w * delta.sign(), J.diagonal(0, -2, -1).abs()
+    bound, z = w / K, delta + torch.where(delta == 0, F, w * delta.sign()) / K
+    for _ in range(PIECES):
+        moved = soft_threshold(z, bound)
+        G = F + (J @ (moved - delta)[..., None])[..., 0] - K * (z - moved)
+        slope = torch.where((moved != 0)[..., None, :], J + torch.diag_embed(K), 0.0) - torch.diag_embed(K)
+        z = z - solve(slope, G)
+    moved = soft_threshold(z, bound)
+    return moved - delta, replace(P, force=replace(P.force, held=torch.where(moved == 0, w, 0.0)))
 
 
 def parameter_derivatives(
