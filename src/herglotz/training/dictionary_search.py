@@ -65,16 +65,13 @@ SMOOTH = 1e-3  # of the spread: data that are more precise are worth a rule of o
 class DictionarySearch:
     """See the head of this module: `data` to train on, the first look `base` at them, and the settings of the fit.
 
-    With `outliers` Student's t is the loss. Where the data are every m-th of `recorded` samples, the linear problem is
-    made of them all.
+    With `outliers` Student's t is the loss. Of `every`-th samples the linear problem alone is made of all that are
+    recorded.
     """
 
-    def __init__(
-        self, data: Trajectories, base: Baseline, config: FitConfig, *, outliers: bool = False,
-        recorded: Trajectories | None = None, every: int = 1,
-    ):  # fmt: skip
-        self.data, self.base, self.config = data, base, config
-        self.recorded, self.every = data if recorded is None else recorded, every
+    def __init__(self, data: Trajectories, base: Baseline, config: FitConfig, outliers: bool = False, every: int = 1):
+        self.recorded, self.every, self.base, self.config = data, every, base, config
+        self.data = data = data if every == 1 else data.thinned(every)
         self.freedom = FREEDOM if outliers else None
         self.all = candidates(data, config.translations)
         self.own = own_terms(data.angles)
@@ -91,7 +88,7 @@ class DictionarySearch:
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
         every = sparsest(self.data)
-        found = None if every == 1 else self._from_sparse(self.data.thinned(every), every)
+        found = None if every == 1 else self._from_sparse(every)
         if found is not None and found.coloured:
             return found  # more samples do not tell what a term is missing that this many do not show
         if found is None:
@@ -163,12 +160,10 @@ class DictionarySearch:
             fit = None if first is None else stages.grow(first, sigma)
         return None if fit is None else self._found(found.terms, stages, fit)
 
-    def _from_sparse(self, sparse: Trajectories, every: int) -> Found | None:
+    def _from_sparse(self, every: int) -> Found | None:
         """What every m-th sample asks for, fitted to all of them."""
         base = replace(self.base, max_step=every * self.base.max_step, model_step=every * self.base.model_step)
-        search = DictionarySearch(
-            sparse, base, self.config, outliers=self.freedom is not None, recorded=self.data, every=every
-        )
+        search = DictionarySearch(self.data, base, self.config, outliers=self.freedom is not None, every=every)
         found = search.run()
         if found is None:
             return None
@@ -249,10 +244,8 @@ class DictionarySearch:
         if found.whole:
             return found
         stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
-        stages.hurried, stages.lengths = (
-            True,
-            [0, *(length for length in stages.lengths if length > found.fit.problem.grid.length)],
-        )
+        stages.hurried = True
+        stages.lengths = [0, *(length for length in stages.lengths if length > found.fit.problem.grid.length)]
         return self._found(found.terms, stages, stages.grow(found.fit, max(found.rms, self.floor)))
 
     def _problem(

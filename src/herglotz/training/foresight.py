@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.trajectories import every_mth
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline
 from herglotz.training.free_run import continued
@@ -80,14 +81,17 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     """
     if not fitted.notes.get("follows_data", True) or not bool(torch.isfinite(states).all()):
         return None
+    every = fitted.notes.get("every", 1)
+    length = fitted.notes.get("segment_steps", FIRST_SEGMENT * task.config.substeps) // task.config.substeps // every
+    kept = every_mth(task.data.lengths, every).to(task.data.t.device)
+    known, used = fitted.states[~seen.spikes][kept], None if fitted.used is None else fitted.used[kept]
+    task = task.thinned(every)  # as it was fitted
     model, base, absent = _with_absent_terms(task, fitted.model)
-    length = fitted.notes.get("segment_steps", FIRST_SEGMENT * task.config.substeps) // task.config.substeps
     problem = ShootingProblem(
-        model, task.data, segment_grid(task.data, max(length, 1), base.model_step), sigma=fitted.sigma,
-        prior=prior_of(model, base, fitted.notes.get("departure")), used=fitted.used,
+        model, task.data, segment_grid(task.data, max(length, 1), base.model_step), sigma=fitted.sigma / every**0.5,
+        prior=prior_of(model, base, fitted.notes.get("departure")), used=used,
         freedom=FREEDOM if fitted.notes.get("robust") else None,
     )  # fmt: skip
-    known = fitted.states[~seen.spikes]
     theta, x = problem.parameters.get(), known[problem.grid.start_sample]
     problem.guess_from_states(known)
     cost, A, _ = problem.normal_equations(problem.pack(theta, x[:, : problem.d]))
@@ -95,9 +99,9 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
         return None
     runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
     ahead = ShootingProblem(
-        model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step), sigma=problem.sigma
+        model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step / every), sigma=problem.sigma
     )
-    guess = runs.stepped_on(fitted.model, states, base.model_step)
+    guess = runs.stepped_on(fitted.model, states, base.model_step / every)
     if guess is not None:
         ahead.guess_from_states(guess)
     path = None if guess is None else ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))

@@ -78,7 +78,7 @@ def fit_by_trajectory(task: Task, seen: Look, plan: Plan) -> Fitted:  # noqa: AR
     if found is None or fit is None:  # the model keeps the parameters of the one-step fit
         return _lost(task, model, "trajectory", sigma, "the model cannot follow the data over 20 steps")
     problem = fit.problem
-    notes = _chosen(found, fit) | {"segment_steps": problem.grid.longest, "follows_data": True}
+    notes = _chosen(found, fit) | {"segment_steps": problem.grid.longest, "follows_data": True, "every": every}
     return Fitted(model, fit.states(), "trajectory", problem.sigma, notes, problem.used)
 
 

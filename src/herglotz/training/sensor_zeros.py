@@ -104,7 +104,7 @@ def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | N
     together, alone = of.fit(seen.kept), of.fit(seen.kept[of.reference])
     if together is None or alone is None:
         return None
-    own = seen.kept.trajectory[together.problem.grid.sample] == of.reference
+    own = together.problem.data.trajectory[together.problem.grid.sample] == of.reference
     before = _rms(together.problem.misfit(together.path)[own])
     apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
     if config.find_zeros is None and not apart.differs:
@@ -150,15 +150,16 @@ class ZerosOf:
         assert seen.found is not None
         assert seen.found.sigma is not None
         self.data, self.freedom = seen.kept, FREEDOM if seen.outliers else None
+        self.every = seen.found.every
         self.task = seen.task(Stages())
         self.sigma = max(seen.found.sigma, FLOOR * self.task.size)
         self.reference = reference_of(self.data)
 
     def fit(self, data: Trajectories) -> TrajectoryFit | None:
         """The shortest segments of these recordings; None where the model cannot follow them."""
-        task = replace(self.task, data=data, stages=Stages())
+        task = replace(self.task, data=data, stages=Stages()).thinned(self.every)
         stages = SegmentStages(task, build_model(task.base, task.config, "none"))
-        return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=smoothed(data))
+        return stages.fit(stages.lengths[0], self.sigma, self.freedom, None, begin=smoothed(task.data))
 
     def best(self, first: Look, alone: TrajectoryFit) -> FoundZeros:
         """By the terms of the reference alone, at a look at it, or by those of all recordings, fitted to it alone."""

@@ -100,6 +100,7 @@ def test_a_model_without_terms_has_to_miss_less(monkeypatch, whole, rms, bare_wh
     fits["bare"].misses_less = lambda other: Found.misses_less(fits["bare"], other)
     search: Any = object.__new__(DictionarySearch)
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=1), None, None
+    search.recorded = None
     search._grown = lambda terms, *_: fits[terms]
     search._bare = lambda _start: fits["bare"]
     search._simpler = search._held = search._finer = lambda found, **_: found
@@ -122,6 +123,7 @@ def bare_search(monkeypatch, families) -> Any:
     """A search of two coordinates with these starts."""
     search: Any = object.__new__(DictionarySearch)
     search.coarse, search.precision, search.data, search.base, search.all = False, 1e-6, stub(dof=2), None, None
+    search.recorded = None
     search._simpler = search._held = search._finer = lambda found, **_: found
     monkeypatch.setattr(dictionary_search, "starts_of", lambda *_: families)
     return search
@@ -223,7 +225,8 @@ def test_a_simpler_family_stands_in_where_residuals_are_no_noise():
     # fails if likelihoods decide there, or the first family has no rival
     search: Any = object.__new__(DictionarySearch)
     t = torch.arange(30.0, dtype=torch.float64)
-    search.data, search.floor = Trajectories.of(t, t[:, None].sin()), 0.0
+    search.data, search.floor, search.every = Trajectories.of(t, t[:, None].sin()), 0.0, 1
+    search.recorded = search.data
     other = stub(instead_of=lambda *_: True, as_likely=lambda *_: False)
     search._first = lambda *_: (stub(coloured=True), [stub(terms="simple", values={})])
     search._grown = lambda *_: other
