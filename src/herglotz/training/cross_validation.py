@@ -15,6 +15,7 @@ from herglotz.training.solvers.lifted_newton import Path
 
 FOLDS = 5  # held-out blocks: fifths of every trajectory, in time
 STAY = 20  # first samples of a driven trajectory, and half of its first fold at most, that are never left out
+SURE = 10  # times better than by σ: starts known so well are never left out
 MARGIN = 1.05  # a weaker prior or a richer level must lower the error by more than this factor
 
 
@@ -49,15 +50,18 @@ def held_out_errors(
     Fold j is the j-th fifth, in time, of every trajectory. To first order a least-squares fit without the rows B has
     there the residual (I − J_B A⁻¹ J_Bᵀ)⁻¹ r_B (Allen's PRESS, for blocks). Blocks in time, because what a
     deterministic model misses comes in long runs: single left-out samples, and a likelihood that takes residuals for
-    white noise, would both be fooled by their neighbours. Starts that are known better than by σ are never left out: a
-    free run begins there.
+    white noise, would both be fooled by their neighbours. Starts that are known far better than by σ are never left
+    out: a free run begins there.
     """
     r, J = problem.data_rows(path, theta)
     values, vectors = torch.linalg.eigh(A.double())
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
-    stay = problem.better.flatten() > 1
-    return left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]), stay) * problem.sigma
+    better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
+    return (
+        left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
+        * problem.sigma
+    )
 
 
 def _left_out(G: Tensor, r: Tensor) -> Tensor:

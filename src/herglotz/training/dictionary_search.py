@@ -319,11 +319,12 @@ class DictionarySearch:
 
     def _last_terms(self, found: Found) -> Found:
         """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
-        while found.terms.names and found.coloured:
+        first = found
+        while found.terms.names and (found.coloured or (self.data.dof == 1 and found.rms > self.floor)):
             terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
             less = None if terms == found.terms else self.refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
-            if less is None or not less.as_good(found, self.floor):
+            if less is None or not less.as_good(found if found.coloured else first, self.floor):
                 break
             found = less
         return found
