@@ -71,7 +71,7 @@ def test_a_program_that_calls_a_command_keeps_its_signals():
     "import herglotz.cli.verify as v; v.run = struck; main()",  # while the command works
 ])  # fmt: skip
 def test_an_interrupt_is_one_line(program):
-    # fails if an interrupt of the command prints a traceback, is swallowed by an import, or ends otherwise than with 130
+    # fails if an interrupt prints a traceback, is swallowed by an import, or ends otherwise than with 130
     words = """
 import os, signal, sys, time
 sys.argv = ["herglotz", "verify", "free_particle"]
