@@ -14,8 +14,9 @@ import sys
 import threading
 import traceback
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from types import FrameType
 
 import herglotz
 from herglotz.cli.common import complain
@@ -35,7 +36,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     Parameters
     ----------
     argv
-        Arguments without the program's name; left out, those of the process.
+        Arguments without the program's name; left out, those of the process, which then ends where it is interrupted.
 
     Returns
     -------
@@ -49,7 +50,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except SystemExit as stop:  # argparse: help and version (0), usage errors (2)
         return stop.code if isinstance(stop.code, int) else OK
     except KeyboardInterrupt as interrupt:
-        return _say(f"interrupted{interrupt}", INTERRUPTED)
+        _say(f"interrupted{interrupt}", INTERRUPTED)
+        return INTERRUPTED if argv is not None else _leave()
     except BrokenPipeError:  # the reader of our output has left (`herglotz verify ... | head -1`)
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return OK
@@ -113,6 +115,21 @@ def _say(message: str, code: int) -> int:
     return code
 
 
+def _leave() -> int:
+    """End the process without Python's own end, in which threads of torch were seen to abort (exit code 134)."""
+    for stream in (sys.stdout, sys.stderr):
+        with suppress(OSError, ValueError):  # its reader may have left
+            stream.flush()
+    os._exit(INTERRUPTED)
+
+
+def _importing(frame: FrameType | None) -> bool:
+    """Whether a module is being imported: torch and numpy make other errors of an interrupt, or swallow it."""
+    while frame is not None and not frame.f_code.co_filename.startswith("<frozen importlib"):
+        frame = frame.f_back
+    return frame is not None
+
+
 @contextmanager
 def _orderly() -> Iterator[None]:
     """Raise `KeyboardInterrupt` at the first signal, leave at the second; the handlers before come back at the end."""
@@ -121,9 +138,11 @@ def _orderly() -> Iterator[None]:
         return
     stopped = False
 
-    def stop(_number: int, _frame: object) -> None:
+    def stop(number: int, frame: FrameType | None) -> None:
         nonlocal stopped
         stopped = True
+        if _importing(frame):
+            leave(number, frame)
         for one in SIGNALS:
             signal.signal(one, leave)
         raise KeyboardInterrupt

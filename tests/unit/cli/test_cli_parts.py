@@ -1,6 +1,8 @@
 """Small parts of every command: tables, signals, what is said of a fault of the package's own."""
 
 import signal
+import subprocess
+import sys
 from argparse import Namespace
 from pathlib import Path
 from types import SimpleNamespace
@@ -61,6 +63,33 @@ def test_a_program_that_calls_a_command_keeps_its_signals():
     finally:
         for one, handler in zip(SIGNALS, before, strict=True):
             signal.signal(one, handler)
+
+
+@pytest.mark.parametrize("program", [
+    "import herglotz.__main__; os.kill(os.getpid(), signal.SIGINT); time.sleep(9)",  # before the arguments are read
+    "sys.meta_path.insert(0, Struck()); main()",  # while torch is imported
+    "import herglotz.cli.verify as v; v.run = struck; main()",  # while the command works
+])  # fmt: skip
+def test_an_interrupt_is_one_line(program):
+    # fails if an interrupt prints a traceback, is swallowed by an import, or ends otherwise than with 130
+    words = """
+import os, signal, sys, time
+sys.argv = ["herglotz", "verify", "free_particle"]
+class Struck:
+    def find_spec(self, name, *rest):
+        if name == "torch":
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                time.sleep(9)
+            except KeyboardInterrupt:
+                raise ImportError("numpy says so")
+def struck(*_):
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(9)
+from herglotz.__main__ import main
+"""
+    done = subprocess.run([sys.executable, "-c", words + program], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr, done.stdout) == (130, "herglotz: interrupted\n", "")
 
 
 def test_whole_numbers():  # fails if `none` is a number, or a slip a traceback
