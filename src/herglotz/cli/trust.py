@@ -109,7 +109,7 @@ def _report(numbers: dict[str, Any], physical: list[Quantity], result: Run, figu
     rows.append(("parameters the data fix", determined(numbers["effective_parameters"], numbers["all_parameters"])))
     print_table(rows)
     if result.metrics.get("equation"):  # the coefficients of named terms stand there with their deviations
-        print("Learned equation, standard deviations in brackets, of the last digits:")
+        print("Learned equation:")
         print(*(f"  {line}" for line in str(result.equation()).splitlines()), sep="\n")
     print("Value ± standard deviation (the first mass is 1):")
     for x in physical:

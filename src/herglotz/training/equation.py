@@ -28,6 +28,7 @@ from herglotz.training.fitted_run import FittedRun
 from herglotz.training.parameter_vector import ParameterVector
 
 WIDTH = 78  # two blanks stand before each line on screen
+BRACKETS = "in brackets: standard deviation of the last digits by noise alone, without the error of the time step"
 TOGETHER = "\N{NO-BREAK SPACE}"  # inside a term: lines break between terms
 
 
@@ -64,10 +65,11 @@ class Equation:
     network: str | None  # what a network adds, in words
 
     def __str__(self) -> str:
-        lines = []
+        lines, bracketed = [], False
         for left in self.lefts:
             every = [term for term in self.terms if term.left == left]
             own = [term for term in every if term.shown] or every
+            bracketed = bracketed or any("(" in number(abs(x.value), x.deviation) for x in own)
             right = " ".join(str(term).replace(" ", TOGETHER) for term in own) or "0"
             minus = f"−{TOGETHER}"
             right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
@@ -75,7 +77,8 @@ class Equation:
             lines += [line.replace(TOGETHER, " ") for line in wrapped]
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
-        return "\n".join([*lines, *textwrap.wrap(f"with {self.units}", WIDTH)])
+        told = f"with {self.units}; {BRACKETS}" if bracketed else f"with {self.units}"
+        return "\n".join([*lines, *textwrap.wrap(told, WIDTH)])
 
     def __repr__(self) -> str:
         return f"Equation({' '.join(str(self).split())})"

@@ -92,6 +92,13 @@ from herglotz.__main__ import main
     assert (done.returncode, done.stderr, done.stdout) == (130, "herglotz: interrupted\n", "")
 
 
+def test_an_interrupt_of_what_has_ended_changes_nothing():  # fails if the last moment of a process makes another code
+    words = "import sys, os, atexit, signal; sys.argv = ['herglotz', '--version']; import herglotz.__main__ as m; "
+    words += "atexit.register(lambda: os.kill(os.getpid(), signal.SIGINT)); sys.exit(m.command())"
+    done = subprocess.run([sys.executable, "-c", words], capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
+
+
 def test_whole_numbers():  # fails if `none` is a number, or a slip a traceback
     assert (_whole("--widths", " none "), _whole("--widths", "1, 2")) == ((), (1, 2))
     with pytest.raises(InputError, match=r"--widths needs whole numbers .*, got .1\.5."):

@@ -368,7 +368,8 @@ def test_likelier_terms_do_not_push(monkeypatch, pushes):  # fails if friction t
     assert search._likeliest(found) is (found if pushes else other)
 
 
-def test_lines_of_an_equation_break_between_terms():  # fails if a number stands at the end of a line, x on the next
+def test_lines_of_an_equation_break_between_terms():
+    # fails if a number stands at the end of a line, x on the next, or it is not said what deviations do not hold
     terms = tuple(
         Term("x″", what, -0.123456, 1e-5, "1/s²") for what in ("x′", "|x′| x′", "(u_0 + 0.1)", "x", "x³", "x⁵", "x⁷")
     )
@@ -376,8 +377,10 @@ def test_lines_of_an_equation_break_between_terms():  # fails if a number stands
     assert [line.strip() for line in lines] == [
         "x″ = −0.123456(10) x′ − 0.123456(10) |x′| x′ − 0.123456(10) (u_0 + 0.1)",
         "− 0.123456(10) x − 0.123456(10) x³ − 0.123456(10) x⁵ − 0.123456(10) x⁷",
-        "with x in m",
+        "with x in m; in brackets: standard deviation of the last digits by noise",
+        "alone, without the error of the time step",
     ]
+    assert "brackets" not in str(Equation((Term("x″", "x", -1.0, None, "1/s²"),), ("x″",), "x in m", None))
 
 
 @pytest.mark.parametrize(
