@@ -112,8 +112,7 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
-        self.patient = True  # paths are stepped through where no other gives them
-        self.many = task.data.dof > MANY
+        self.patient, self.many = True, task.data.dof > MANY  # patient: where no path is known, it is stepped through
         self.hurried = task.hurried or self.many  # stages before the last, and of states, end where they gain < 1 %
         self.compared = self.many and model.potential.network is not None  # fits with other priors are last
 
