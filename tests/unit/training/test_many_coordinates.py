@@ -12,7 +12,7 @@ from herglotz.training.task import Task
 
 @pytest.mark.parametrize(("n", "grown", "compared"), [(4, 1e-4, 1e-4), (5, 1e-2, 1e-3)])
 def test_stages_of_many_coordinates_end_early(monkeypatch, n, grown, compared):
-    # fails if noisy motion of many coordinates waits for gains of 1e-4 in every stage (twenty: 180 s of processor time),
+    # fails if noisy motion of many coordinates waits for gains of 1e-4 in every stage (twenty: 180 s),
     # if strengths are compared by fits that have not ended, or if few coordinates are hurried
     search, ends = trajectory_fit.levenberg_marquardt, []
 
