@@ -27,7 +27,7 @@ from herglotz.export import compile_c
 
 BATCH, STEPS = 65_536, 20  # of issue 16
 ROWS, MANY = 1_000_000, 1000  # samples of the csv; recordings of 100 samples each
-MASSES, SAMPLES = 20, 200  # of the chain that is fitted
+MASSES, SAMPLES, NOISE = 20, 200, 0.01  # of the chain that is fitted; noise in standard deviations of the motion
 COLUMNS = ("t[s],theta[rad],x[m]", "trajectory,t[s],theta[rad],x[m]")
 
 
@@ -48,13 +48,14 @@ def write(path: Path, recordings: int, samples: int) -> None:
     np.savetxt(path, np.stack(values, 1), "%.9g", ",", header=COLUMNS[recordings > 1], comments="")
 
 
-def chain() -> Callable[[], Any]:
+def chain(noise: float = 0.0) -> Callable[[], Any]:
     """Fit the motion of a chain of masses between two walls, a sum of damped normal modes."""
     make, t = np.random.default_rng(0), 0.1 * np.arange(SAMPLES)[:, None]
     stiffness = 2 * np.eye(MASSES) - np.eye(MASSES, k=1) - np.eye(MASSES, k=-1)
     squares, modes = np.linalg.eigh(stiffness)
     a, b, turned = make.standard_normal(MASSES), make.standard_normal(MASSES), t * squares**0.5
     q = np.exp(-0.025 * t) * (a * np.cos(turned) + b * np.sin(turned)) @ modes.T
+    q = q + noise * q.std() * make.standard_normal(q.shape)
     return lambda: hz.fit([q], h=0.1, progress=False)
 
 
@@ -69,6 +70,7 @@ WORK: dict[str, tuple[Callable[[Path], Callable[[], Any]], str]] = {
     f"csv, {ROWS} rows": (lambda path: csv(path, 1, ROWS), "≤ 3 s, ≤ 200 MB"),
     f"csv, {MANY} trajectories of 100 rows": (lambda path: csv(path, MANY, 100), ""),
     f"fit, {MASSES} coordinates, {SAMPLES} samples": (lambda _: chain(), "≤ 60 s"),
+    f"fit, {MASSES} coordinates, {SAMPLES} samples, noise of {NOISE:.0%}": (lambda _: chain(NOISE), "≤ 60 s"),
     f"C, B = {BATCH}, {STEPS} steps": (lambda _: batch(lambda model: compile_c(model, h=0.1)), ""),
     f"eager, B = {BATCH}, {STEPS} steps": (lambda _: batch(hz.Stepper), ""),
 }

@@ -38,7 +38,7 @@ LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "p
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
 STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
-AT_ONCE = 1_000_000  # derivatives of J that are formed at the same time: 8 MB, and 25 times as much that leads to them
+AT_ONCE = 300_000  # derivatives of J formed together: 2 MB, and 25 times that before them; of 20 coordinates, fastest
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
 
 

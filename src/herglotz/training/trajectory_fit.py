@@ -34,6 +34,7 @@ SMALL = 1e-2  # of the largest |q|: shortest segments that miss less lack no for
 NOT_THE_NOISE = 1.5  # times the data's precision; as in the verdict
 FAR_OFF, NEAR = 1e-3, 1e-8  # damping of the first iteration: steps are Newton's near the minimum
 STAGE = 40  # iterations of a stage at most: a start near the optimum needs fewer, and a poor one is left by the next
+MANY = 4  # coordinates: of more, an iteration takes up to 0.2 s, and gains of 1e-4 would be waited for minutes
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,9 @@ class SegmentStages:
     ):
         self.task, self.model, self.frozen, self.s, self.label = task, model, frozen, s, label
         self.lengths = segment_lengths(task.data)
-        self.patient = True  # paths are stepped through where no other gives them
-        self.hurried = task.hurried  # stages before the last, and of states alone, end where they gain less than 1 %
+        self.patient, self.many = True, task.data.dof > MANY  # patient: where no path is known, it is stepped through
+        self.hurried = task.hurried or self.many  # stages before the last, and of states, end where they gain < 1 %
+        self.compared = self.many and model.potential.network is not None  # fits with other priors are last
 
     def fit(
         self,
@@ -154,8 +156,9 @@ class SegmentStages:
         """Minimise from these parameters and segment states, `near` the minimum or not; None where no path is found."""
         target = StatesOnly(problem, theta) if self.frozen else problem
         x = states.reshape(-1) if self.frozen else problem.pack(theta, states)
-        total, last = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
-        rtol, patience = (1e-2, 1) if self.hurried and (self.frozen or not last) else (1e-4, 3)
+        total, whole = min(self.task.config.iterations, STAGE), problem.grid.segments == len(self.task.data)
+        early = self.hurried and (self.frozen or self.compared or not whole)
+        rtol, patience = (1e-2, 1) if early else (1e-3 if self.many else 1e-4, 3)
         result = self.task.stages.run(
             name + self.label, x, total,
             lambda x, callback: levenberg_marquardt(
@@ -263,6 +266,7 @@ def fit_trajectories(
     first = stages.robust_or_not(first, known=known)
     last = (stages.whole(first, sigma) if known else None) or stages.grow(first, sigma)
     previous, noise = last, last.noise
+    stages.hurried = task.hurried and not stages.many  # strengths are compared by fits that have ended
 
     def fit(name: str, departure: float) -> TrajectoryFit | None:
         nonlocal previous

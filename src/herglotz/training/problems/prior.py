@@ -17,7 +17,7 @@ NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.netwo
             "action.weight", "action.bias")  # fmt: skip
 WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
 SPLIT = 1e-3  # of a rate: friction of one coordinate is its rate, and a rate that friction cancels hides long steps
-AT_ONCE = 256  # points of the grid whose derivatives are held in memory together
+MOST = 256  # points of the grid: more do not change an RMS, and each of them has a row for every coordinate
 BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
@@ -48,7 +48,8 @@ class Prior:
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
-        unit = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True).draw(grid * len(low)).to(low)
+        points = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True)
+        unit = points.draw(min(grid * len(low), MOST)).to(low)
         speed = low.new_tensor(model.config.speed)
         self.grid = unit[:, : len(low)] * (high - low) + low
         self.velocity = (2 * unit[:, len(low) :] - 1) * speed
@@ -76,9 +77,8 @@ class Prior:
         if self.departs:
             # Point by point: the derivative of all outputs at all points at once took 44 GB for twenty coordinates.
             slopes = vmap(jacrev(lambda *x: (r := self._departed(*x), r), has_aux=True), (None, 0, 0), out_dims=1)
-            for q, v in zip(self.grid.split(AT_ONCE), self.velocity.split(AT_ONCE), strict=True):
-                J, r = (x.flatten(0, 1) for x in slopes(theta, q, v))
-                cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
+            J, r = (x.flatten(0, 1) for x in slopes(theta, self.grid, self.velocity))
+            cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
         return cost, A, b
 
     def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
