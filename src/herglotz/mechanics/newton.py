@@ -151,12 +151,15 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
     going = (here.residual > tiny) & (here.residual < inf)
     fraction: Number = None  # every sample takes full steps
     slow: Number = False  # samples whose old Jacobian has served its time
+    stale: Number = False  # samples whose move is by an old Jacobian
+    back: Number = False  # samples that such a move misled: they take no step, to get the Jacobian where they are
     mixed, iterations = False, 0
     while iterations < rules.max_iterations and _any(going):
         if not rules.natural or _any(here.residual > floor):  # the last digits are not counted
             iterations += 1
         move = here.delta if fraction is None else (fraction if alone else fraction[..., None]) * here.delta
-        fresh = going & (here.residual > near) | slow  # at a trial that may be far off, the Jacobian is wanted as well
+        # At a trial that may be far off, the Jacobian is wanted as well.
+        fresh = going & (here.residual > near) | slow | back if rules.keep else True
         move = move if alone else torch.where(going[..., None], move, 0.0)
         trial = _evaluate(equation, here.x + move, rules, alone, here.J, fresh)
         settled = trial.residual <= tiny
@@ -165,7 +168,7 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
         if rules.keep:
             still = _not(fresh | settled) & going & (trial.residual < inf)
             slow = still & (trial.residual > CONTRACTION * here.residual)
-            better = better | (slow & _not(stalled))
+            better = better | (slow & _not(stalled) & (trial.merit <= here.merit))
         accept = better & going
         refused = going & _not(better)
         going = going & _not(settled | stalled)
@@ -175,6 +178,9 @@ def newton(equation: Equation, x: Tensor, rules: Rules, sizes: Sizes, alone: boo
         if fraction is not None or _any(refused):
             fraction = _next(fraction, accept, rules.natural, like=here.merit)
             going = going & (fraction >= rules.shortest)
+            back = stale & refused
+            fraction = fraction * _not(back)
+        stale = accept & _not(fresh) | stale & _not(accept)
     if alone:
         return _found_alone(here, not going, iterations)
     x, point, J, delta, merit, residual = here
