@@ -1,7 +1,7 @@
 """`python -m herglotz` and the command `herglotz`.
 
-An interrupt while the command line itself is imported (0.1 s) ends the process quietly, as later ones do; one that comes
-when all is done, while Python ends (0.4 s with torch), leaves the exit code as it is.
+An interrupt while the command line itself is imported (0.1 s) ends the process quietly, as later ones do. One that
+comes when all is done, while Python ends (0.4 s with torch), leaves the exit code as it is.
 """
 
 import os
@@ -19,6 +19,7 @@ if __name__ == "__main__" or os.path.basename(sys.argv[0]).startswith("herglotz"
     signal.signal(signal.SIGTERM, _leave)
 
 from herglotz.cli import main  # noqa: E402  (after the handlers)
+
 
 def command() -> int:
     """Run the subcommand that the process was started with; the process is to end with what is returned."""
