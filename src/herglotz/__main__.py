@@ -1,6 +1,6 @@
 """`python -m herglotz` and the command `herglotz`.
 
-An interrupt while the command line itself is imported (0.1 s) ends the process quietly, as later ones do; one that
+An interrupt while the command line itself is imported (0.1 s) ends the process quietly, as later ones do. One that
 comes when all is done, while Python ends (0.4 s with torch), leaves the exit code as it is.
 """
 
