@@ -9,10 +9,11 @@ import torch
 
 from herglotz.data import Trajectories, simulate
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, fit
+from herglotz.training import FitConfig, fit, verdict
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.choose import choose
 from herglotz.training.dictionary_search import FINER, DictionarySearch
+from herglotz.training.foresight import foresee
 from herglotz.training.look import look
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.plan import Plan
@@ -61,6 +62,20 @@ def test_every_fourth_sample_gives_a_motion_through_all(plan):
     assert run.metrics["train_rms"] == pytest.approx(whole.metrics["train_rms"], rel=0.05)
     assert float((run.states.q - whole.states.q).square().mean().sqrt()) < 1e-3  # a quarter of the samples: half of σ
     assert not torch.equal(run.states.q, whole.states.q)
+
+
+def test_every_fourth_sample_leaves_as_much_open(plan, monkeypatch):
+    # fails if fewer samples are told with the error of all of them: deviations were twice as large, and a fit that
+    # knows as much was told to need a longer recording
+    data, _, of = plan
+    told = []
+    monkeypatch.setattr(verdict, "foresee", lambda *given: told.append(foresee(*given)) or told[-1])
+    for every in (1, 4):
+        fit(data, FitConfig(train_fraction=0.7), plan=replace(of, every=every, order=4), progress=False)
+    all_of_them, fourth = told
+    assert fourth.horizon == pytest.approx(all_of_them.horizon, rel=0.02)
+    for name in ("start", "parameters"):
+        assert getattr(fourth, name) == pytest.approx(getattr(all_of_them, name), rel=0.1), name  # 1 %
 
 
 def test_recordings_keep_three_samples(plan):

@@ -1,11 +1,16 @@
 """Fits of many coordinates wait for smaller gains only where strengths of the prior are compared."""
 
+from types import SimpleNamespace
+from typing import Any
+
 import pytest
 import torch
 
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig, trajectory_fit
 from herglotz.training.baseline import estimate_baseline
+from herglotz.training.dictionary_search import DictionarySearch
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
 from herglotz.training.stages import Stages
 from herglotz.training.task import Task
 
@@ -18,7 +23,8 @@ def test_stages_of_many_coordinates_end_early(monkeypatch, n, grown, compared):
 
     def shortened(problem, x, **how):
         ends.append(how["rtol"])
-        return search(problem, x, **how | {"max_iterations": 1})
+        how["max_iterations"] = 1
+        return search(problem, x, **how)
 
     monkeypatch.setattr(trajectory_fit, "levenberg_marquardt", shortened)
     t = 0.1 * torch.arange(31, dtype=torch.float64)
@@ -29,3 +35,40 @@ def test_stages_of_many_coordinates_end_early(monkeypatch, n, grown, compared):
     assert trajectory_fit.fit_trajectories(task, task.build("potential"), 1.0) is not None
     assert ends == [grown] * (len(ends) - 3) + [compared] * 3  # the noise, and two strengths
     assert len(ends) > 4
+
+
+@pytest.mark.parametrize("hurried", [True, False])
+def test_a_hurried_stage_steps_through_its_start_alone(monkeypatch, hurried):
+    # fails if every trial without a path is stepped through, which costs more than all iterations, or if a start far
+    # from a path is lost though it could be stepped through
+    patient, t = [], 0.1 * torch.arange(31, dtype=torch.float64)
+    monkeypatch.setattr(
+        trajectory_fit, "levenberg_marquardt", lambda _problem, x, **_: OptimiserResult(x, 1.0, "done", 1, [1.0])
+    )
+    data = Trajectories.of(t, t.cos()[:, None], (31,))
+    task = Task(data, estimate_baseline(data), FitConfig(level="linear"), Stages(False, None, "", resume=False))
+    stages = trajectory_fit.SegmentStages(task, task.build("none"))
+    stages.hurried = hurried
+    problems = trajectory_fit.ShootingProblem
+    solve = problems.solve
+    monkeypatch.setattr(problems, "solve", lambda self, x: patient.append(self.patient) or solve(self, x))
+    assert stages.fit(stages.lengths[0], 0.01, None, None) is not None
+    assert patient[-2:] == ([True, False] if hurried else [True])
+
+
+def test_longer_segments_of_a_search_are_hurried():
+    # fails if a search, which compares many models, waits for gains of 1e-4 in each
+    search: Any = object.__new__(DictionarySearch)
+    search.floor = 0.0
+    stages = SimpleNamespace(lengths=[20, 40, 80], hurried=False, grow=lambda *_: None)
+    search._stages, search._found = lambda *_: stages, lambda *_: (stages.hurried, stages.lengths)
+    config, grid = SimpleNamespace(substeps=1, sticking=False), SimpleNamespace(length=40)
+    found = SimpleNamespace(
+        whole=False,
+        terms=None,
+        values={},
+        config=config,
+        rms=1.0,
+        fit=SimpleNamespace(problem=SimpleNamespace(grid=grid)),
+    )
+    assert search._longer(found) == (True, [0, 80])

@@ -241,6 +241,7 @@ def held_out(monkeypatch, before, after):
 
 def test_zeros_stay_only_where_held_out_time_asks_for_them(monkeypatch):
     assert held_out(monkeypatch, (0.01, 0.02), (0.003, 0.004))
+    assert held_out(monkeypatch, (0.0038, 0.0038), (0.003, 0.003))
     assert not held_out(monkeypatch, (0.0036, 0.0036), (0.003, 0.003))  # by less than a fifth
     assert held_out(monkeypatch, (0.01, float("inf")), (0.003, 5.0))  # chaos: both are lost, windows are not
     assert not held_out(monkeypatch, (0.003, float("inf")), (0.003, 5.0))  # fails if a lost free run decides
