@@ -25,10 +25,7 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
-        (
-            "extrapolation RMS",
-            _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
-        ),
+        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
         ("training RMS", _error(m.get("train_rms"), unit, degrees)),
         ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
         ("damping rate", show(m.get("rate"), f"per {per}")),
