@@ -51,10 +51,7 @@ def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
 def from_plain(cls: type[T], values: dict[str, Any]) -> T:
     """Build a settings dataclass from what `dataclasses.asdict` and JSON made of it (tuples come back as lists).
 
-    Raises
-    ------
-    InputError
-        If a key is not one of its fields, or a value is not of its type.
+    Raise InputError if a key is not one of its fields, or a value is not of its type.
     """
     unknown = set(values) - {f.name for f in fields(cls)}  # type: ignore[arg-type]
     if unknown:

@@ -68,10 +68,7 @@ class ExportedStepper(OneStepMethod):
     ) -> State:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions h apart; s0 defaults to 0.
 
-        Raises
-        ------
-        InputError
-            As `step`, and where the format holds no such program.
+        Raise InputError as `step`, and where the format holds no such program.
         """
         if "init" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
@@ -132,10 +129,7 @@ class ExportedStepper(OneStepMethod):
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
 
-        Raises
-        ------
-        InputError
-            If the file records no box, or the state is not of its shape or dtype.
+        Raise InputError if the file records no box, or the state is not of its shape or dtype.
         """
         if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
@@ -243,10 +237,7 @@ def check_range(h: Tensor, span: Sequence[float] | None) -> None:
 def spread_h(h: Tensor, shape: tuple[int, ...]) -> Tensor:
     """The step h, of every sample of a batch of that shape.
 
-    Raises
-    ------
-    InputError
-        If it is neither a scalar nor of that shape.
+    Raise InputError if it is neither a scalar nor of that shape.
     """
     if h.ndim > len(shape) or not all(a in (1, b) for a, b in zip(h.shape[::-1], shape[::-1], strict=False)):
         raise InputError(f"h must be a scalar or match the batch {tuple(shape)}, got shape {tuple(h.shape)}")

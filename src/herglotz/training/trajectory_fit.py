@@ -75,10 +75,7 @@ class TrajectoryFit:
 def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> None:
     """That there are no more than `most` numbers in q: what is solved for together grows with their square.
 
-    Raises
-    ------
-    InputError
-        Naming how many samples there are, how many can be, and which thinning leaves as many.
+    InputError names how many samples there are, how many can be, and which thinning leaves as many.
     """
     allowed = most // data.dof
     if data.samples <= allowed:

@@ -259,12 +259,8 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
 
     By the law of total variance the variance of the position is the mean of the fits' Laplace variances plus the
     variance of their predictions: what one posterior sees around its own minimum, and how far apart the minima are.
-    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`).
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two runs, or they were fitted to different data.
+    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`). Raise
+    InputError if there are fewer than two runs, or they were fitted to different data.
     """
     if len(runs) < 2:
         raise InputError(f"an ensemble needs two runs or more, got {len(runs)}; fit other seeds")
