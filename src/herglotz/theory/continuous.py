@@ -82,10 +82,7 @@ def contact_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H.
-
-    Source: contact Hamilton equations of the paper.
-    """
+    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H. Source: contact Hamilton equations of the paper."""
     q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
     return q_dot, p_dot, heat - H_value
 

@@ -87,10 +87,7 @@ class LeftLagrangian:
 
 
 def unforced(P: Partials) -> Partials:
-    """P, unless it comes with forces: those are not derivatives of an action.
-
-    Raise InputError if there are forces.
-    """
+    """P, unless it comes with forces: those are not derivatives of an action. Raise InputError if there are forces."""
     if P.force is not None:
         raise InputError("this L_d comes with forces F⁻, F⁺; actions and discrete Hamiltonians need one without")
     return P
