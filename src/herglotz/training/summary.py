@@ -64,16 +64,12 @@ def as_html(run: FittedRun) -> str:
     return f"<table>{body}</table>"
 
 
-def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
-    """What the model is made of beside its terms, told or found; "" without."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
-
-
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
     """The named terms, and which coordinate q1 is where it has a name of its own."""
     told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
-    return features_in_words(features) + (f"  ({', '.join(told)})" if told else "")
+    rest = len(features) - MOST_FEATURES
+    shown = ", ".join(features[:MOST_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
+    return shown + (f"  ({', '.join(told)})" if told else "")
 
 
 def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
