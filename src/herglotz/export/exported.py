@@ -80,15 +80,8 @@ class ExportedStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step, as `Stepper.step`, in the dtype of the file, which has its own guess; u None: no input acts.
 
-        Returns
-        -------
-        Step
-            NaN in the samples whose status is not `Status.CONVERGED`. `iterations` is the bound, not a count.
-
-        Raises
-        ------
-        InputError
-            If a shape, the dtype, h or u is not what the file takes. What is not finite has a status.
+        NaN in the samples whose status is not `Status.CONVERGED`; `iterations` is the bound, not a count. Raise
+        InputError if a shape, the dtype, h or u is not what the file takes; what is not finite has a status.
         """
         del guess
         self._check(*state)
@@ -103,18 +96,9 @@ class ExportedStepper(OneStepMethod):
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
         """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
 
-        Autograd does not go through the result.
-
-        Returns
-        -------
-        Linearised
-            The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du.
-            NaN where the step failed.
-
-        Raises
-        ------
-        InputError
-            As `step`, and where the format holds no derivative.
+        The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du; NaN where
+        the step failed. Autograd does not go through the result. Raise InputError as `step`, and where the format holds
+        no derivative.
         """
         if "linearise" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file holds no derivative; use a .pt2, ONNX or C file")

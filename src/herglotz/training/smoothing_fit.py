@@ -78,12 +78,8 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
     strength is then fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted with.
-    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`).
-
-    Returns
-    -------
-    Chosen or None
-        None where a step near the data has no solution.
+    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`). None where a step near
+    the data has no solution.
     """
     config = task.config
     departures = config.departures if model.potential.network is not None else config.departures[:1]
