@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -87,18 +88,9 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
     freedom = FREEDOM if config.robust == "on" else None
 
     def stage(name: str, x: Tensor | None, departure: float, process: float) -> SmoothingFit | None:
-        prior = prior_of(model, task.base, departure)
-        problem = SmoothingProblem(
-            model, task.data, grid, sigma=max(sigma, FLOOR * task.size), process=process, prior=prior, freedom=freedom
-        )
-        start, most = problem.start() if x is None else x, min(config.iterations, STAGE)
-        result = task.stages.run(
-            name, start, most,
-            lambda x, callback: levenberg_marquardt(
-                problem, x, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING, callback=callback
-            ),
-        )  # fmt: skip
-        return SmoothingFit(result.x, problem, result) if math.isfinite(result.cost) else None
+        noise, prior = max(sigma, FLOOR * task.size), prior_of(model, task.base, departure)
+        problem = SmoothingProblem(model, task.data, grid, sigma=noise, process=process, prior=prior, freedom=freedom)
+        return _minimised(task, name, problem, x)
 
     weakest = max(departures)
     first = stage("smoothing", None, weakest, 1.0)
@@ -125,6 +117,14 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
 
     found = strongest_not_beaten(departures, fit)
     return found or Chosen(last, weakest, {})
+
+
+def _minimised(task: Task, name: str, problem: SmoothingProblem, x: Tensor | None) -> SmoothingFit | None:
+    """The fit of a stage from x, or from the data; None where its cost is not finite."""
+    start, most = problem.start() if x is None else x, min(task.config.iterations, STAGE)
+    least = partial(levenberg_marquardt, problem, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING)
+    result = task.stages.run(name, start, most, lambda x, callback: least(x, callback=callback))
+    return SmoothingFit(result.x, problem, result) if math.isfinite(result.cost) else None
 
 
 def _noises(fit: SmoothingFit) -> tuple[float, float]:
