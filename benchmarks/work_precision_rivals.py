@@ -161,12 +161,8 @@ def dop853_source() -> str:
     lines.append(f"    const real u = ({total(dop.E5[:12])}) * scale, w = ({total(dop.E3[:12])}) * scale;")
     lines.append("    e5 += u * u; e3 += w * w;\n  }")
     lines.append("  if (e5 == 0 && e3 == 0) return 0;\n  return h * e5 / sqrt((e5 + (real)0.01 * e3) * D);\n}\n")
-    lines += [
-        "static void fixed8(real *y, real h, long steps) {",
-        "  real k[12][D], z[D]; int d;",
-        "  while (steps--) {",
-    ]
-    lines += ["  rhs(y, k[0]);", *stages]
+    lines.append("static void fixed8(real *y, real h, long steps) {\n  real k[12][D], z[D]; int d;")
+    lines += ["  while (steps--) {\n  rhs(y, k[0]);", *stages]
     lines.append(f"  for (d = 0; d < D; d++) y[d] += h * ({total(dop.B)});\n  }}\n}}\n")
     return "\n".join(lines)
 
@@ -332,29 +328,23 @@ def equation(case: Case) -> list[Timed]:
     y = torch.cat([case.entry.q, _velocity(constants, case.entry)], -1)
     for dtype in ("float64", "float32"):
         library = Native(setup.name, dtype, dof=2, constants=constants)
-        for method, sizes in (("RK4", (4, 5, 6, 7, 8, 10, 12, 16)), ("DOP853 fixed", (2, 3, 4))):
-            for x in sizes:
-                words = {"RK4": "RK4", "DOP853 fixed": "DOP853, equal steps"}[method]
-                label = f"{words}, h {setup.T / CHECKS / x:.3g}, C {dtype}"
-                point = {"kind": "learned equation", "setting": label, "dtype": dtype, "h": setup.T / CHECKS / x}
-                found.append(_classic(point, library, case, y, method, x))
+        sizes = {"RK4": (4, 5, 6, 7, 8, 10, 12, 16), "DOP853 fixed": (2, 3, 4)}
+        for method, x in ((method, x) for method, steps in sizes.items() for x in steps):
+            h, words = setup.T / CHECKS / x, method.replace(" fixed", ", equal steps")
+            point = {"kind": "learned equation", "setting": f"{words}, h {h:.3g}, C {dtype}", "dtype": dtype, "h": h}
+            found.append(_classic(point, library, case, y, method, x))
     return found
 
 
 def constants_of(model: Any) -> dict[str, float]:
     """The learned numbers of K = (M00 v0² + 2(M01 + MC cos(q0 − q1)) v0 v1 + M11 v1²)/2, V = −G0 cos q0 − G1 cos q1."""
     with torch.no_grad():
-        K, base = model.kinetic, model.kinetic.base.mass()
-        V = {tuple(x.form): w for x, w in _waves(model)}
+        K, base, P = model.kinetic, model.kinetic.base.mass(), model.potential.features.sum
+        # Sines are none by symmetry.
+        V = {tuple(x.form): w for x, w in zip(P.products, P.weights(), strict=True) if x.function == "cos"}
         found = {"M00": base[0, 0], "M01": base[0, 1], "MC": K.sum.weights()[0], "M11": base[1, 1]}
         found |= {"G0": -V[(1.0, 0.0)], "G1": -V[(0.0, 1.0)], "RATE": model.damping.rate}
         return {k: float(x) for k, x in found.items()}
-
-
-def _waves(model: Any) -> list[tuple[Any, Tensor]]:
-    """The cosines of V with their weights; sines, which are none by symmetry, are left out."""
-    c = model.potential.features.sum
-    return [(p, w) for p, w in zip(c.products, c.weights(), strict=True) if p.function == "cos"]
 
 
 def _velocity(constants: dict[str, float], state: State) -> Tensor:

@@ -56,6 +56,11 @@ class Equation:
         a = torch.stack([(d * f1 - C * f2) / det, (f2 - C * f1) / det], -1)
         return torch.cat([a[:, :1], a[:, 1:] - a[:, :1]], -1) if self.relative else a
 
+    def field(self, y: Tensor, theta: Tensor) -> Tensor:
+        """ẏ of y = (q, v), (B, 2n); θ is (B, P) or (P,)."""
+        q, v = y.chunk(2, -1)
+        return torch.cat([v, self.acceleration(q, v, theta.expand(len(y), -1))], -1)
+
 
 def train_known_equation(samples: Samples, seed: int, budget: float, *, relative: bool = False) -> Flow:  # noqa: ARG001
     """Least squares of the positions of windows, short ones first, from a linear fit of differences.
@@ -73,12 +78,7 @@ def train_known_equation(samples: Samples, seed: int, budget: float, *, relative
     elif n == 1:
         last = torch.stack([torch.cat([q, q.new_full((longest - len(q), n), torch.nan)]) for q in samples.q])
     theta = _fit_windows(equation, last, theta, h, parts)
-    P = len(theta)
-
-    def field(y: Tensor) -> Tensor:
-        return torch.cat([y[:, n:], equation.acceleration(y[:, :n], y[:, n:], theta.expand(len(y), P))], -1)
-
-    return Flow(field, h, parts, P)
+    return Flow(lambda y: equation.field(y, theta), h, parts, len(theta))
 
 
 def _fit_windows(equation: Equation, data: Tensor, theta: Tensor, h: float, parts: int) -> Tensor:
@@ -94,16 +94,8 @@ def _fit_windows(equation: Equation, data: Tensor, theta: Tensor, h: float, part
 
     def misfit(theta: Tensor, y: Tensor) -> Tensor:
         """Positions of the windows less the data, (B, length · n), for θ (B, P) and starts (B, 2n)."""
-
-        def field(y: Tensor) -> Tensor:
-            return torch.cat([y[:, n:], equation.acceleration(y[:, :n], y[:, n:], theta)], -1)
-
-        out = [y[:, :n]]
-        for _ in range(length - 1):
-            y = rk4(field, y, h, parts)
-            out.append(y[:, :n])
         seen = target.repeat(len(y) // W, 1)
-        found = torch.stack(out, 1).flatten(1).nan_to_num(1e3, 1e3, -1e3)
+        found = _positions(equation, theta, y, length, h, parts).flatten(1).nan_to_num(1e3, 1e3, -1e3)
         return torch.where(torch.isnan(seen), 0.0, found - seen)
 
     def cost(theta: Tensor, start: Tensor) -> tuple[Tensor, float]:
@@ -119,12 +111,8 @@ def _fit_windows(equation: Equation, data: Tensor, theta: Tensor, h: float, part
         J = ((ends[:, 0] - ends[:, 1]) / (2 * BUMP)).permute(1, 2, 0)  # (W, rows, P + k)
         A, b = J.mT @ J, (J.mT @ r[..., None])[..., 0]
         while damping < 1e8:
-            # Starts are eliminated window by window (Schur complement); θ is shared.
-            D = A + damping * torch.diag_embed(A.diagonal(dim1=-2, dim2=-1) + 1e-12)
-            inner = torch.linalg.solve(D[:, P:, P:], torch.cat([D[:, P:, :P], b[:, P:, None]], -1))
-            S = (D[:, :P, :P] - D[:, :P, P:] @ inner[..., :P]).sum(0)
-            step = torch.linalg.solve(S, (b[:, :P] - (D[:, :P, P:] @ inner[..., P:])[..., 0]).sum(0))
-            tried = theta - step, start - (inner[..., P] - inner[..., :P] @ step)
+            by_theta, by_start = _step(A + damping * torch.diag_embed(A.diagonal(dim1=-2, dim2=-1) + 1e-12), b, P)
+            tried = theta - by_theta, start - by_start
             new, new_value = cost(*tried)
             if new_value < value:
                 break
@@ -136,3 +124,21 @@ def _fit_windows(equation: Equation, data: Tensor, theta: Tensor, h: float, part
         if gain < 1e-9:
             break
     return theta
+
+
+def _positions(equation: Equation, theta: Tensor, y: Tensor, length: int, h: float, parts: int) -> Tensor:
+    """Positions (B, length, n) of motions with θ (B, P) from y (B, 2n)."""
+    n = y.shape[1] // 2
+    out = [y[:, :n]]
+    for _ in range(length - 1):
+        y = rk4(lambda y: equation.field(y, theta), y, h, parts)
+        out.append(y[:, :n])
+    return torch.stack(out, 1)
+
+
+def _step(D: Tensor, b: Tensor, P: int) -> tuple[Tensor, Tensor]:
+    """The step (P,) of θ, which the windows share, and of their starts, eliminated one by one (Schur complement)."""
+    inner = torch.linalg.solve(D[:, P:, P:], torch.cat([D[:, P:, :P], b[:, P:, None]], -1))
+    S = (D[:, :P, :P] - D[:, :P, P:] @ inner[..., :P]).sum(0)
+    step = torch.linalg.solve(S, (b[:, :P] - (D[:, :P, P:] @ inner[..., P:])[..., 0]).sum(0))
+    return step, inner[..., P] - inner[..., :P] @ step

@@ -17,21 +17,10 @@ LARGEST = 2**63 - 1  # of whole numbers: what torch takes; JSON has no bound, an
 def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
     """Check a dictionary against the hints of a `TypedDict` or a dataclass; further keys are let pass.
 
-    Parameters
-    ----------
-    kind
-        Keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, another
-        `TypedDict`, and list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. A list and a tuple are one, as in
-        JSON. Keys of a dataclass that have a default may be missing.
-    values
-        What was read.
-    where, remedy
-        The file, and what to do, for the message.
-
-    Raises
-    ------
-    InputError
-        That names the file, the key, its value and the remedy.
+    `kind` has keys and their types: bool, int, float (an int will do), str, classes, None, unions, Literal, another
+    `TypedDict`, and list[T], tuple[T, ...], tuple[T, T, T], dict[K, V] of these. A list and a tuple are one, as in
+    JSON. Keys of a dataclass that have a default may be missing. InputError names the file, the key, its value and the
+    remedy.
     """
     if not isinstance(values, Mapping):
         raise InputError(f"{where}: must hold named entries, got {_shown(values)}; {remedy}")
@@ -51,10 +40,7 @@ def check_entries(kind: Any, values: Any, where: str, remedy: str) -> None:
 def from_plain(cls: type[T], values: dict[str, Any]) -> T:
     """Build a settings dataclass from what `dataclasses.asdict` and JSON made of it (tuples come back as lists).
 
-    Raises
-    ------
-    InputError
-        If a key is not one of its fields, or a value is not of its type.
+    Raise InputError if a key is not one of its fields, or a value is not of its type.
     """
     unknown = set(values) - {f.name for f in fields(cls)}  # type: ignore[arg-type]
     if unknown:

@@ -63,10 +63,7 @@ MODELS = {
     ),
     "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3")),
     "dampers and air": config(
-        2,
-        (False, False),
-        level="forced",
-        drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v"),
+        2, (False, False), level="forced", drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v")
     ),
     "drag of position, order four": config(
         2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True

@@ -47,11 +47,7 @@ def test_long_rollout_keeps_sigma(settings):
 
 @pytest.mark.parametrize(
     "settings",
-    [
-        {"rate": 0.1},
-        {"rate": 0.1, "correction_width": 4},
-        {"rate": 0.1, "level": "forced", "coulomb": True},
-    ],
+    [{"rate": 0.1}, {"rate": 0.1, "correction_width": 4}, {"rate": 0.1, "level": "forced", "coulomb": True}],
     ids=lambda x: "-".join(f"{k}={v}" for k, v in x.items()),
 )
 def test_decay_to_rest_ends_at_rest(settings):

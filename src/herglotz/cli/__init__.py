@@ -31,17 +31,9 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one subcommand.
+    """Run one subcommand and return its exit code (see the head of this module).
 
-    Parameters
-    ----------
-    argv
-        Arguments without the program's name; left out, those of the process, which then ends where it is interrupted.
-
-    Returns
-    -------
-    int
-        The exit code: 0, 1 (a check failed), 2 (wrong input), 70 (a fault of the package) or 130 (interrupted).
+    Without `argv` the arguments are those of the process, which then ends where it is interrupted.
     """
     try:
         with _orderly(), _one_thread():

@@ -91,11 +91,8 @@ def existing(text: str) -> Path:
 def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) -> None:
     """Raise unless a file of this name could be written now; no file is left behind.
 
-    Raises
-    ------
-    InputError
-        If the extension is not one of `suffixes`, the folder does not exist or cannot be written to, the path is a
-        folder, or there is such a file already and it is not to be overwritten by `force`.
+    Raise InputError if the extension is not one of `suffixes`, the folder does not exist or cannot be written to, the
+    path is a folder, or there is such a file already and it is not to be overwritten by `force`.
     """
     if path.suffix.lower() not in suffixes:
         raise InputError(f"--out {path}: the name must end in {' or '.join(suffixes)}")
@@ -111,10 +108,7 @@ def check_output_file(path: Path, suffixes: Sequence[str], force: bool = False) 
 def check_output_folder(path: Path) -> None:
     """Raise unless this folder could be made and written to; no file is left behind.
 
-    Raises
-    ------
-    InputError
-        If a file is in the way, or the folder cannot be written to.
+    Raise InputError if a file is in the way, or the folder cannot be written to.
     """
     existing = path
     while not existing.exists() and existing != existing.parent:

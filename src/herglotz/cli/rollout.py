@@ -182,10 +182,7 @@ def _note(text: str) -> None:
 def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source:
     """Read a run or an exported model, to be stepped.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or the run has no such trajectory.
+    Raise InputError if the file cannot be read, or the run has no such trajectory.
     """
     import torch
 

@@ -29,10 +29,7 @@ DTYPES = ("float64", "float32")
 def settings_of(arguments: argparse.Namespace) -> FitConfig:
     """The settings: those of --config, or the defaults, with the flags that were given over them.
 
-    Raises
-    ------
-    InputError
-        If the file is no `config.json` of a run, or a setting is wrong.
+    Raise InputError if the file is no `config.json` of a run, or a setting is wrong.
     """
     from herglotz.training import FitConfig
 
@@ -45,10 +42,7 @@ def settings_of(arguments: argparse.Namespace) -> FitConfig:
 def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Trajectories, dict[str, Any]]:
     """The recording and how it was read: as --config says of its own data, with the flags that were given over it.
 
-    Raises
-    ------
-    InputError
-        If the file is no `config.json` of a run, or the recording cannot be read that way.
+    Raise InputError if the file is no `config.json` of a run, or the recording cannot be read that way.
     """
     from herglotz.data import load
 

@@ -89,13 +89,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 
 def parse_parameters(texts: list[str]) -> dict[str, float]:
-    """Parse `name=value` arguments.
-
-    Raises
-    ------
-    InputError
-        If one has no = or its value is not a number.
-    """
+    """Parse `name=value` arguments; raise InputError if one has no = or its value is not a number."""
     parameters = {}
     for text in texts:
         name, equals, value = text.partition("=")

@@ -9,4 +9,3 @@ from herglotz.data.readers import load as load, save as save
 from herglotz.data.schmidt_lipson import read_schmidt_lipson as read_schmidt_lipson
 from herglotz.data.simulate import simulate as simulate
 from herglotz.data.trajectories import Trajectories as Trajectories
-from herglotz.data.windows import Steps as Steps, Triples as Triples

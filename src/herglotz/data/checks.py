@@ -45,10 +45,7 @@ def check(
 ) -> None:
     """Check types, shapes, labels and values of a set of trajectories, in this order.
 
-    Raises
-    ------
-    InputError
-        Naming the field, the trajectory and the sample (both counted from 0), the value and the remedy.
+    InputError names the field, the trajectory and the sample (both counted from 0), the value and the remedy.
     """
     _check_tensors(where, arrays)
     _check_shapes(where, arrays)

@@ -124,10 +124,8 @@ def assign(
 ) -> Columns:
     """Give every column of a header its role.
 
-    Raises
-    ------
-    InputError
-        If a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named column is absent.
+    Raise InputError if a cell cannot be read, a name comes twice, time or all coordinates are missing, or a named
+    column is absent.
     """
     names, units = _parse(cells, where)
     place = {name: i for i, name in enumerate(names)}

@@ -40,12 +40,8 @@ def in_commas(
     """Rows of a table, header first, with commas between columns and decimal points; and notes on what was changed.
 
     Lines without a value and comments are left out, unless a comment is the header: the last one before rows of numbers
-    alone, in as many columns.
-
-    Raises
-    ------
-    InputError
-        If numbers have decimal commas in some rows and decimal points in others, or commas that may be of thousands.
+    alone, in as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points in
+    others, or commas that may be of thousands.
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
     rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)

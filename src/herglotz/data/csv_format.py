@@ -145,12 +145,8 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
     `comments` become lines that start with #. A coordinate in rad that is not an angle is written too, although
-    `read_csv` reads it as an angle unless it is given `angles=()`.
-
-    Raises
-    ------
-    InputError
-        If a coordinate's name or a unit cannot stand in the header (it has a comma, or means another column).
+    `read_csv` reads it as an angle unless it is given `angles=()`. Raise InputError if a coordinate's name or a unit
+    cannot stand in the header (it has a comma, or means another column).
     """
     q = trajectories.names
     header = ["trajectory", f"t[{trajectories.time_unit}]"]

@@ -40,12 +40,8 @@ def input_recording(
     """The recording whose inputs drive the model: the trajectory of that number, or the only one.
 
     A file needs times and inputs alone. Its inputs are those that act: before they do what it says itself or, where it
-    says nothing, `unsaid`.
-
-    Raises
-    ------
-    InputError
-        If the file holds no inputs, has no such trajectory, or counts time in another unit.
+    says nothing, `unsaid`. Raise InputError if the file holds no inputs, has no such trajectory, or counts time in
+    another unit.
     """
     found = path if isinstance(path, Trajectories) else load(path, known=tuple(map(tuple, known)), motion=False)
     path = found.source or "recording"
@@ -64,12 +60,8 @@ def input_recording(
 def driven(found: Trajectories, t0: float, steps: int, h: float | None) -> tuple[Tensor, Tensor]:
     """Inputs (K, m) and times (K + 1,) of K steps from t0: the recording's own steps, or steps of h.
 
-    The recording's own steps take the inputs that its hold makes; a step of h takes their mean over its time.
-
-    Raises
-    ------
-    InputError
-        If the recording does not cover these steps, or has no sample at t0 where its own steps are taken.
+    The recording's own steps take the inputs that its hold makes; a step of h takes their mean over its time. Raise
+    InputError if the recording does not cover these steps, or has no sample at t0 where its own steps are taken.
     """
     t, u = found.t.double(), found.inputs_of_steps()
     assert u is not None  # `recorded` has refused others

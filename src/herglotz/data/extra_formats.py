@@ -45,10 +45,8 @@ class Table:
 def read_packed(path: PathLike, **columns: Any) -> Trajectories:
     """Read a table of a suffix of `ARRAYS` like a csv file with the same header; `columns` are those of `read_csv`.
 
-    Raises
-    ------
-    InputError
-        If the package that reads it is missing, the file is damaged, columns differ in length, or as `read_csv`.
+    Raise InputError if the package that reads it is missing, the file is damaged, columns differ in length, or as
+    `read_csv`.
     """
     every = ARRAYS[Path(path).suffix.lower()](path)  # of each recording
     return Trajectories.cat(from_frame(Table(Path(path), one), Wanted(**columns), Path(path)) for one in every)

@@ -22,10 +22,8 @@ TEMPORARY = ".{}.????????.tmp"  # names that `tempfile.mkstemp` gives to what be
 def read_bytes(path: PathLike, most: int = -1) -> bytes:
     """Return the contents of a file, or its first `most` bytes.
 
-    Raises
-    ------
-    InputError
-        If there is no such file, it is a directory, a pipe or a device (which may never end), empty or not readable.
+    Raise InputError if there is no such file, it is a directory, a pipe or a device (which may never end), empty or not
+    readable.
     """
     path = Path(path)
     try:
@@ -50,12 +48,8 @@ def read_bytes(path: PathLike, most: int = -1) -> bytes:
 def read_lines(path: PathLike) -> list[str]:
     r"""Return the lines of a text file, without their ends (\n, \r\n or \r).
 
-    It is UTF-8, UTF-16 with its mark, or else has units in Windows' letters.
-
-    Raises
-    ------
-    InputError
-        As `read_bytes`, and if the file is none of them.
+    It is UTF-8, UTF-16 with its mark, or else has units in Windows' letters. Raise InputError as `read_bytes`, and if
+    the file is none of them.
     """
     content = read_bytes(path)
     windows = all(byte < 128 or byte in UNITS for byte in set(content))
@@ -74,12 +68,8 @@ def write_atomically(path: PathLike, content: bytes) -> None:
     """Write a file under a temporary name in the same folder, then rename it: a crash leaves the old file whole.
 
     The temporary name is random and the file must not exist (`tempfile.mkstemp`: O_EXCL, O_NOFOLLOW), so that no link
-    planted in the folder is written through. The folder is synced after the rename.
-
-    Raises
-    ------
-    InputError
-        If the folder does not exist or is not writable, the path is a folder, or the disk is full.
+    planted in the folder is written through. The folder is synced after the rename. Raise InputError if the folder does
+    not exist or is not writable, the path is a folder, or the disk is full.
     """
     path = Path(path)
     try:
@@ -103,13 +93,7 @@ def write_atomically(path: PathLike, content: bytes) -> None:
 
 
 def folder_at(path: PathLike) -> Path:
-    """Return this folder, made with its parents if it is missing.
-
-    Raises
-    ------
-    InputError
-        If it cannot be made.
-    """
+    """Return this folder, made with its parents if it is missing; raise InputError if it cannot be made."""
     folder = Path(path)
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -25,12 +25,8 @@ def locked(folder: PathLike) -> Iterator[None]:
 
     The system itself holds the lock (`flock`) and lets it go when the process ends: a lock of a dead process is none,
     and a number of a process that another one has by now cannot mislead. The file holds the owner's number to name it.
-    In a group of `torchrun` the first process locks for all.
-
-    Raises
-    ------
-    InputError
-        If another process holds the folder, or it cannot be written to.
+    In a group of `torchrun` the first process locks for all. Raise InputError if another process holds the folder, or
+    it cannot be written to.
     """
     key = str(Path(folder).resolve())
     if fcntl is None or key in _held or os.environ.get("RANK", "0") != "0":

@@ -50,14 +50,9 @@ LABELS = tuple(Metadata.__annotations__)
 def read_npz(path: PathLike) -> Trajectories:
     """Read trajectories from a .npz archive.
 
-    Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and
-    `metadata` (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns) may follow.
-    Integer arrays become float64.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the array, what is wrong with it and the remedy.
+    Arrays `t` (N,) and `q` (N, n) or (N,) are needed; `lengths` (B,), `s` (N,), `p` (N, n), `u` (N, m) and `metadata`
+    (a JSON object with names, units, angles, time_unit, source, hold, delay, lag, columns) may follow. Integer arrays
+    become float64. InputError names the file, the array, what is wrong with it and the remedy.
     """
     return trajectories_of(read_bytes(path), Path(path))
 
@@ -82,10 +77,7 @@ def trajectories_of(content: bytes, path: Path) -> Trajectories:
 def write_npz(path: PathLike, trajectories: Trajectories) -> None:
     """Write every array and label; `read_npz` returns a set with the same digest. The file appears whole or not at all.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be written.
+    Raise InputError if the file cannot be written.
     """
     write_atomically(path, npz_bytes(trajectories))
 

@@ -23,13 +23,7 @@ def number(
     text: str,  # a cell
     where: str,  # file, row and column: begins the message
 ) -> float:
-    """Parse a finite number.
-
-    Raises
-    ------
-    InputError
-        If the cell is blank, not a number, NaN or infinite.
-    """
+    """Parse a finite number; raise InputError if the cell is blank, not a number, NaN or infinite."""
     try:
         value = float(text)
     except ValueError:
@@ -58,10 +52,7 @@ def group_rows(
 ) -> list[list[int]]:
     """Return the sample numbers of each trajectory, in order of first appearance.
 
-    Raises
-    ------
-    InputError
-        If there is no sample, a trajectory has fewer than three, or its time does not increase.
+    Raise InputError if there is no sample, a trajectory has fewer than three, or its time does not increase.
     """
     if not rows:
         raise InputError(f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows")

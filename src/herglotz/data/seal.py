@@ -23,10 +23,7 @@ TEXT = (b"/* sha256 of all above: ", b" */\n")
 def sealed_zip(content: bytes) -> bytes:
     """A zip archive (`.pt2`, `.pt`, `.npz`) whose comment is the hash.
 
-    Raises
-    ------
-    ValueError
-        If the archive has a comment already: its writer is not one of ours.
+    Raise ValueError if the archive has a comment already: its writer is not one of ours.
     """
     if content[-22:-18] != b"PK\5\6" or content[-2:] != EMPTY_ZIP_COMMENT:
         raise ValueError("not a zip archive without a comment")
@@ -51,10 +48,7 @@ def sealed_bytes(content: bytes, tail: bytes = b"") -> bytes:
 def check_seal(content: bytes, path: PathLike, remedy: str = "export the model again", text: bool = False) -> None:
     """Refuse a file that is not what was written.
 
-    Raises
-    ------
-    InputError
-        If the hash is missing (the file is cut, or older than seals), or is not that of the file.
+    Raise InputError if the hash is missing (the file is cut, or older than seals), or is not that of the file.
     """
     if text:
         content = content.replace(b"\r\n", b"\n").removesuffix(TEXT[1])

@@ -21,10 +21,8 @@ def time_split(
 ) -> tuple[Part, Part]:
     """Cut each trajectory after its first `round(fraction * length)` samples.
 
-    Raises
-    ------
-    InputError
-        If the fraction is not inside (0, 1), or a part of any trajectory would have fewer than three samples.
+    Raise InputError if the fraction is not inside (0, 1), or a part of any trajectory would have fewer than three
+    samples.
     """
     check_fraction(fraction)
     train, test = [], []
@@ -69,10 +67,7 @@ def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:
 def every_mth(lengths: Sequence[int], every: int) -> Tensor:
     """Return which samples are 0, m, 2m, … of their trajectory, (N,) bool.
 
-    Raises
-    ------
-    InputError
-        If `every` is not a whole number >= 1.
+    Raise InputError if `every` is not a whole number >= 1.
     """
     if isinstance(every, bool) or not isinstance(every, int) or every < 1:
         raise InputError(f"every must be a whole number >= 1, got {every!r}")

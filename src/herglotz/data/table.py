@@ -35,12 +35,7 @@ def from_table(
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
     Rows in which a value is missing are left out, and a note says how many: the step over them is longer, with the mean
-    of their inputs.
-
-    Raises
-    ------
-    InputError
-        If the time of a trajectory does not increase, or a trajectory is too short.
+    of their inputs. Raise InputError if the time of a trajectory does not increase, or a trajectory is too short.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
@@ -128,12 +123,8 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
 def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:
     """Read a pandas DataFrame (or anything with `columns` and `frame[name]`) like a csv file with that header.
 
-    `where` begins messages. The index of a DataFrame joins the columns, unless it merely counts the rows.
-
-    Raises
-    ------
-    InputError
-        Naming column, row (counted from 0), value and remedy.
+    `where` begins messages. The index of a DataFrame joins the columns, unless it merely counts the rows. InputError
+    names column, row (counted from 0), value and remedy.
     """
     frame = _with_index(frame)
     raw = [plain(frame[name], f"{where}, column {quote(str(name))}: numbers") for name in frame.columns]
@@ -182,10 +173,7 @@ def in_dates(found: Trajectories, told: str = "date") -> Trajectories:
 def plain(x: Any, what: str = "numbers") -> np.ndarray:
     """Values as an array, those that are masked or pandas' NA as NaN; messages call them `what`.
 
-    Raises
-    ------
-    InputError
-        If they are complex.
+    Raise InputError if they are complex.
     """
     array = np.ma.filled(x.astype(np.float64), np.nan) if isinstance(x, np.ma.MaskedArray) else np.asarray(x)
     refuse({f"{what} are complex; give their real parts, x.real": np.iscomplexobj(array)})
@@ -198,10 +186,7 @@ def plain(x: Any, what: str = "numbers") -> np.ndarray:
 def seconds(column: np.ndarray) -> np.ndarray:
     """Times in seconds, since the first one where they are dates; the column itself where it holds neither.
 
-    Raises
-    ------
-    InputError
-        If some dates have a time zone and others have none.
+    Raise InputError if some dates have a time zone and others have none.
     """
     if column.dtype.kind in "OU" and len(column) and all(isinstance(x, str) for x in column):
         dates = [None if is_number(x) else moment(x) for x in column]

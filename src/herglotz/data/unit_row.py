@@ -18,12 +18,8 @@ def with_units(
 ) -> list[str] | None:
     """Header cells `name[unit]` with the units of the row below; None where that row holds none.
 
-    It holds units where no cell is a number, and the time is in a unit of time: no sample has that.
-
-    Raises
-    ------
-    InputError
-        If a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
+    It holds units where no cell is a number, and the time is in a unit of time: no sample has that. Raise InputError if
+    a name has one unit in the header and another below, or as `herglotz.data.csv_columns.assign`.
     """
     units = [_bare(cell) for cell in below]
     if len(units) != len(cells) or not {"s", *PER_SECOND}.intersection(units) or any(map(_is_sample, units)):

@@ -200,10 +200,7 @@ def runtime(file: str) -> str:
 def read_metadata(text: str, path: PathLike) -> dict[str, Any]:
     """The entries that `export_c` wrote into the comment at the top.
 
-    Raises
-    ------
-    InputError
-        If there are none, or they cannot be.
+    Raise InputError if there are none, or they cannot be.
     """
     found = re.search(rf"^ *{re.escape(MARK)}(.*)$", text, re.MULTILINE)
     entries = from_json(found and found[1], path)

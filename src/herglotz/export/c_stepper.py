@@ -21,12 +21,8 @@ from herglotz.stepping.rollout import Track
 class CLibrary:
     """The compiled functions of a generated header, sample by sample on one thread, as functions of tensors.
 
-    `path` is named in messages; `whole` gives the header with derivatives, where this one has none.
-
-    Raises
-    ------
-    InputError
-        If the text is not such a header, or no C compiler is there to compile it.
+    `path` is named in messages; `whole` gives the header with derivatives, where this one has none. Raise InputError if
+    the text is not such a header, or no C compiler is there to compile it.
     """
 
     def __init__(self, header: str, path: PathLike, whole: Callable[[], str] | None = None):

@@ -30,10 +30,7 @@ COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", 
 def compiler(variable: str = "CC") -> list[str]:
     """The compiler of C (or, of `COMPILERS`, another): what the variable names, or the first that is in the PATH.
 
-    Raises
-    ------
-    InputError
-        If there is none.
+    Raise InputError if there is none.
     """
     language, names, wanted = COMPILERS[variable]
     given = shlex.split(os.environ.get(variable, ""))
@@ -50,10 +47,7 @@ def compiler(variable: str = "CC") -> list[str]:
 def build(header: str, loops: str) -> ctypes.CDLL:
     """Compile C that includes the header as "stepper.h", or take the library from the cache, and load it.
 
-    Raises
-    ------
-    InputError
-        If there is no compiler, or it does not compile the header.
+    Raise InputError if there is no compiler, or it does not compile the header.
     """
     words = compiler()
     key = "\0".join([header, loops, *words, *FLAGS, sys.platform, _processor()])

@@ -68,10 +68,7 @@ class ExportedStepper(OneStepMethod):
     ) -> State:
         """The state (q1, p1, s1) = FL⁺(q0, q1, s0) from two positions h apart; s0 defaults to 0.
 
-        Raises
-        ------
-        InputError
-            As `step`, and where the format holds no such program.
+        Raise InputError as `step`, and where the format holds no such program.
         """
         if "init" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file starts from (q, p, s) only; use a .pt2 file for init")
@@ -83,15 +80,8 @@ class ExportedStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None, u: Tensor | None = None) -> Step:
         """One step, as `Stepper.step`, in the dtype of the file, which has its own guess; u None: no input acts.
 
-        Returns
-        -------
-        Step
-            NaN in the samples whose status is not `Status.CONVERGED`. `iterations` is the bound, not a count.
-
-        Raises
-        ------
-        InputError
-            If a shape, the dtype, h or u is not what the file takes. What is not finite has a status.
+        NaN in the samples whose status is not `Status.CONVERGED`; `iterations` is the bound, not a count. Raise
+        InputError if a shape, the dtype, h or u is not what the file takes; what is not finite has a status.
         """
         del guess
         self._check(*state)
@@ -106,18 +96,9 @@ class ExportedStepper(OneStepMethod):
     def linearise(self, state: State, h: Tensor | float, u: Tensor | None = None) -> Linearised:
         """One step and its derivative with respect to the state, h and u, by the implicit-function theorem.
 
-        Autograd does not go through the result.
-
-        Returns
-        -------
-        Linearised
-            The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du.
-            NaN where the step failed.
-
-        Raises
-        ------
-        InputError
-            As `step`, and where the format holds no derivative.
+        The step, d(q, p, s)′/d(q, p, s) (..., 2n+1, 2n+1), /dh (..., 2n+1) and, for a model with inputs, /du; NaN where
+        the step failed. Autograd does not go through the result. Raise InputError as `step`, and where the format holds
+        no derivative.
         """
         if "linearise" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file holds no derivative; use a .pt2, ONNX or C file")
@@ -132,10 +113,7 @@ class ExportedStepper(OneStepMethod):
     def outside_box(self, state: State) -> Tensor:
         """(...) True where a state lies outside the box the model was fitted in; angles count modulo 2π.
 
-        Raises
-        ------
-        InputError
-            If the file records no box, or the state is not of its shape or dtype.
+        Raise InputError if the file records no box, or the state is not of its shape or dtype.
         """
         if self._box is None:
             raise InputError(f"{self.path}: records no box; export it again with box=")
@@ -243,10 +221,7 @@ def check_range(h: Tensor, span: Sequence[float] | None) -> None:
 def spread_h(h: Tensor, shape: tuple[int, ...]) -> Tensor:
     """The step h, of every sample of a batch of that shape.
 
-    Raises
-    ------
-    InputError
-        If it is neither a scalar nor of that shape.
+    Raise InputError if it is neither a scalar nor of that shape.
     """
     if h.ndim > len(shape) or not all(a in (1, b) for a, b in zip(h.shape[::-1], shape[::-1], strict=False)):
         raise InputError(f"h must be a scalar or match the batch {tuple(shape)}, got shape {tuple(h.shape)}")

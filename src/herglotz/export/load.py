@@ -90,10 +90,8 @@ def load_pt2(path: PathLike, *, trust_code: bool = False) -> ExportedStepper:
 def load_onnx(path: PathLike) -> ExportedStepper:
     """Read a file that `export_onnx` wrote; it runs on as many threads as torch does.
 
-    Raises
-    ------
-    InputError
-        If onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another version.
+    Raise InputError if onnxruntime is not installed, or the file is missing, damaged, not one of ours, or of another
+    version.
     """
     content = _sealed(path)
     try:
@@ -146,10 +144,7 @@ def load_c(path: PathLike, *, trust_code: bool = False, model: ContactLagrangian
 def read_header(path: PathLike) -> tuple[str, dict[str, Any]]:
     """The text of a header and its metadata; nothing of it is compiled.
 
-    Raises
-    ------
-    InputError
-        If the file cannot be read, was changed or is no such header.
+    Raise InputError if the file cannot be read, was changed or is no such header.
     """
     text = _sealed(path, text=True).decode("utf-8", "replace")
     return text, read_metadata(text, path)

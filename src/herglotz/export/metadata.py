@@ -91,10 +91,7 @@ def describe(
 ) -> dict[str, Any]:
     """The metadata of a file: plain entries, checked, ready for JSON.
 
-    Raises
-    ------
-    InputError
-        If h, box, units or further entries are not usable.
+    Raise InputError if h, box, units or further entries are not usable.
     """
     dtype, n = next(model.parameters()).dtype, model.config.dof
     wrong_dtype = dtype not in (torch.float32, torch.float64)
@@ -146,13 +143,7 @@ def weights_digest(model: torch.nn.Module) -> str:
 
 
 def to_json(entries: Mapping[str, Any]) -> str:
-    """The entries as text.
-
-    Raises
-    ------
-    InputError
-        If one is not a plain finite number, text, list or dictionary.
-    """
+    """The entries as text; raise InputError if one is not a plain finite number, text, list or dictionary."""
     try:
         return json.dumps(entries, indent=1, allow_nan=False)
     except (TypeError, ValueError) as error:
@@ -162,10 +153,7 @@ def to_json(entries: Mapping[str, Any]) -> str:
 def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
     """The entries of a file that one of the exporters wrote.
 
-    Raises
-    ------
-    InputError
-        If it is not ours, or of another format version.
+    Raise InputError if it is not ours, or of another format version.
     """
     try:
         entries = json.loads(text or "")
@@ -178,13 +166,7 @@ def from_json(text: str | None, path: PathLike) -> dict[str, Any]:
 
 
 def check_metadata(entries: dict[str, Any], path: PathLike) -> None:
-    """Refuse the metadata of another format version, and entries that cannot be.
-
-    Raises
-    ------
-    InputError
-        That names the file, the entry and the remedy.
-    """
+    """Refuse the metadata of another format version, and entries that cannot be."""
     if entries["format"] != FORMAT:
         raise InputError(
             f"{path}: is of format {entries['format']}, this herglotz reads {FORMAT}; export the model again"

@@ -52,13 +52,9 @@ class RolloutModule(nn.Module):
         h: Tensor,  # (K, B)
         *u: Tensor,  # (K, B, m)
     ) -> Values:
-        """K steps from one state.
+        """K steps from one state: q, p (K, B, n), s, c, residual (K, B), status (K, B) uint8 and, with a box, outside.
 
-        Returns
-        -------
-        tuple of Tensor
-            q, p (K, B, n), s, c, residual (K, B), status (K, B) uint8 and, with a box, outside (K, B) uint8: what step
-            k = 1 … K gives. NaN from a failed step on.
+        Entry k is what step k = 1 … K gives, and NaN from a failed step on.
         """
         graphs = self.graphs
         carry = [dense(x) for x in graphs.start(q, p, s)]
@@ -106,12 +102,9 @@ class StepModule(nn.Module):
     ) -> Values:
         """One step: guess → solve → attach the derivative → momentum and action.
 
-        Returns
-        -------
-        tuple of Tensor
-            q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a
-            box, outside (B,) uint8; last the derivative, if asked for. NaN in the samples whose status is not
-            `Status.CONVERGED`.
+        q1 (B, n), p1 (B, n), s1 (B,), c (B,), residual |J⁻¹F| (B,) in units of q, status (B,) uint8 and, with a box,
+        outside (B,) uint8; last the derivative, if asked for. NaN in the samples whose status is not
+        `Status.CONVERGED`.
         """
         graphs = self.graphs
         carry, found = graphs.start(q, p, s), ()

@@ -32,13 +32,7 @@ def remember(content: bytes) -> None:
 
 
 def check_trusted(content: bytes, path: PathLike, trust_code: bool) -> None:
-    """Refuse a file that runs code when it is opened and comes from elsewhere.
-
-    Raises
-    ------
-    InputError
-        Unless it was written here, or `trust_code` is true.
-    """
+    """Refuse a file that runs code when it is opened, unless it was written here or `trust_code` is true."""
     digest = hashlib.sha256(content).hexdigest()
     if trust_code or digest in _here or (private_folder("written") / digest).exists():
         return

@@ -26,10 +26,7 @@ def legendre_minus(
     s0: Tensor,  # (...)
     h: Tensor | float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """FL⁻(q0, q1, s0) = (q0, −D1 L_d / c, s0).
-
-    Source: discrete Legendre transforms of the paper.
-    """
+    """FL⁻(q0, q1, s0) = (q0, −D1 L_d / c, s0). Source: discrete Legendre transforms of the paper."""
     return q0, momentum_minus(partials(L_d, q0, q1, s0, h)), s0
 
 

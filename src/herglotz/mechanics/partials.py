@@ -173,13 +173,7 @@ def value(L_d: DiscreteLagrangian, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor
 
 
 def check_arguments(q0: Tensor, q1: Tensor, s0: Tensor, names: tuple[str, ...] = ("q0", "q1", "s0")) -> None:
-    """Refuse what is no tensor, and positions without a last axis for the coordinates.
-
-    Raises
-    ------
-    InputError
-        With a remedy.
-    """
+    """Refuse what is no tensor, and positions without a last axis for the coordinates."""
     for name, x in zip(names, (q0, q1, s0), strict=True):
         if not isinstance(x, Tensor):
             raise InputError(f"{name} must be a tensor, got a {type(x).__name__}; {REMEDY}")
@@ -195,10 +189,7 @@ REMEDY = (
 def checked(L_d: Any, L: Any, like: Tensor) -> Tensor:
     """L, if L_d returned a number a sample: a shape that only broadcasts would step to a wrong number in silence.
 
-    Raises
-    ------
-    InputError
-        If L is no tensor or has not the shape (...) of `like`.
+    Raise InputError if L is no tensor or has not the shape (...) of `like`.
     """
     if isinstance(L, Tensor) and L.shape == like.shape:
         return L

@@ -2,9 +2,5 @@
 
 from herglotz.models.capabilities import Capabilities as Capabilities, capabilities as capabilities
 from herglotz.models.config import LEVELS as LEVELS, ModelConfig as ModelConfig
-from herglotz.models.model import (
-    ContactLagrangian as ContactLagrangian,
-    DrivenLagrangian as DrivenLagrangian,
-    numbers_of as numbers_of,
-)
+from herglotz.models.model import ContactLagrangian as ContactLagrangian, numbers_of as numbers_of
 from herglotz.models.term import TERMS as TERMS, Term as Term

@@ -47,10 +47,7 @@ class DragFeature:
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     """Read the text of a friction force.
 
-    Raises
-    ------
-    InputError
-        If it is none, or names a coordinate that the model has not.
+    Raise InputError if it is none, or names a coordinate that the model has not.
     """
     plain, n = " ".join(text.split()), len(angles)
     if plain == AIR:

@@ -44,10 +44,7 @@ Feature = tuple[Product, ...]
 def parse(text: str, angles: Sequence[bool]) -> Feature:
     """The products that a feature is the sum of.
 
-    Raises
-    ------
-    InputError
-        Naming the feature and the part of it that cannot be read.
+    InputError names the feature and the part of it that cannot be read.
     """
     feature = _Reader(text, angles).feature()
     if len({bool(p.velocities) for p in feature}) > 1:

@@ -156,9 +156,9 @@ class ContactLagrangian(nn.Module):
             inputs=self.inputs,
         )
 
-    def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int, delta: Tensor | None = None) -> Terms:
+    def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Terms:
         """Evaluate every term once."""
-        return self._terms(Phase(q0, q1, h, order, self.config, delta))
+        return self._terms(Phase(q0, q1, h, order, self.config))
 
     def _terms(self, phase: Phase) -> Terms:
         order, n = phase.order, phase.q0.shape[-1]

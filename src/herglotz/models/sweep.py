@@ -44,14 +44,9 @@ def trigonometry(q: Tensor, angles: tuple[bool, ...]) -> Trigonometry:
 class Sweep:
     """One scalar network at its present parameters, reading (s, c) or (s, c, v): `Trigonometry` and the velocity.
 
-    Parameters
-    ----------
-    network
-        Its features are those of `Phase`, or of `position_features` where `speed` is None.
-    angles, scale, speed
-        The coordinates; the sizes go into the weights of the first layer.
-    factor
-        Multiplies the network: a number, or a tensor (...) such as h.
+    The network's features are those of `Phase`, or of `position_features` where `speed` is None; `scale` and `speed` of
+    the coordinates go into the weights of its first layer. `factor`, a number or a tensor (...) such as h, multiplies
+    the network.
     """
 
     def __init__(

@@ -26,10 +26,7 @@ HOW = "name what moves together, as 'q1 + q2'"
 def directions(texts: Sequence[str], angles: Sequence[bool]) -> list[tuple[float, ...]]:
     """The d of every translation, n numbers each.
 
-    Raises
-    ------
-    InputError
-        If a text is no linear form of coordinates, or moves an angle together with another coordinate.
+    Raise InputError if a text is no linear form of coordinates, or moves an angle together with another coordinate.
     """
     found = []
     for text in texts:

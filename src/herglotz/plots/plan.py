@@ -23,10 +23,7 @@ DECISION, REASON = 26, 62  # characters in a line
 def plot_plan(run: Run) -> Figure:
     """Draw the decisions of one reason in a box, the reason beside it, and arrows from one box to the next.
 
-    Raises
-    ------
-    InputError
-        If the run holds no plan.
+    Raise InputError if the run holds no plan.
     """
     if "plan" not in run.metrics:
         raise InputError("the run holds no plan; fit it again to get one")

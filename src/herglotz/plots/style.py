@@ -80,10 +80,7 @@ def new_figure(width: float, height: float, title: str) -> Figure:
 def save_figure(figure: Figure, path: PathLike) -> None:
     """Write a figure as PNG, SVG or PDF, by the end of the name; the file appears whole or not at all.
 
-    Raises
-    ------
-    InputError
-        If the name has another end, or the file cannot be written.
+    Raise InputError if the name has another end, or the file cannot be written.
     """
     form = Path(path).suffix.lower().removeprefix(".")
     if form not in FORMATS:

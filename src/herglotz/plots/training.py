@@ -26,13 +26,7 @@ def plot_training(run: Run) -> Figure:
     """Draw the cost of every iteration, each stage in a panel of its own: each minimises another cost.
 
     With more than twelve stages, the last twelve are drawn. A stage is said to have settled where its last iteration
-    changed the cost by less than 1 % of the
-    stage's whole fall.
-
-    Raises
-    ------
-    InputError
-        If the run has no history.
+    changed the cost by less than 1 % of the stage's whole fall. Raise InputError if the run has no history.
     """
     if not run.history:
         raise InputError("the run has no history of its cost; fit it again to get one")

@@ -3,7 +3,6 @@
 from herglotz.scenes.cart_pole import cart_pole as cart_pole
 from herglotz.scenes.chain import chain as chain
 from herglotz.scenes.double_pendulum import double_pendulum as double_pendulum
-from herglotz.scenes.driven import DrivenRule as DrivenRule, driven_scene as driven_scene
 from herglotz.scenes.duffing import driven_duffing as driven_duffing, duffing as duffing
 from herglotz.scenes.exact import (
     NumericallyExact as NumericallyExact,
@@ -13,11 +12,7 @@ from herglotz.scenes.exact import (
 from herglotz.scenes.forced_oscillator import ExactForcedOscillator as ExactForcedOscillator
 from herglotz.scenes.kepler import kepler as kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag as ExactLinearDrag, linear_drag as linear_drag
-from herglotz.scenes.motion import (
-    Motion as Motion,
-    herglotz_motion as herglotz_motion,
-    lagrangian_motion as lagrangian_motion,
-)
+from herglotz.scenes.motion import herglotz_motion as herglotz_motion
 from herglotz.scenes.nonlinear_action import nonlinear_action as nonlinear_action
 from herglotz.scenes.oscillator import ExactOscillator as ExactOscillator, damped_oscillator as damped_oscillator
 from herglotz.scenes.parachute import (
@@ -28,7 +23,6 @@ from herglotz.scenes.parachute import (
 from herglotz.scenes.pendulum import damped_pendulum as damped_pendulum, driven_pendulum as driven_pendulum
 from herglotz.scenes.printed_parachute import PrintedParachute as PrintedParachute
 from herglotz.scenes.reference import (
-    ReferenceSolution as ReferenceSolution,
     path_action as path_action,
     reference_flow as reference_flow,
     reference_solve as reference_solve,
@@ -38,7 +32,6 @@ from herglotz.scenes.rigid_body import rigid_body as rigid_body
 from herglotz.scenes.rules import (
     ORDERS as ORDERS,
     adjoint as adjoint,
-    all_rules as all_rules,
     left as left,
     midpoint as midpoint,
     midpoint_heun as midpoint_heun,

@@ -93,10 +93,7 @@ def reference_flow(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The state of `reference_solve`, or an error where it has not converged.
 
-    Raises
-    ------
-    InputError
-        If the estimated error of a sample is not below `TOLERANCE` (or is NaN).
+    Raise InputError if the estimated error of a sample is not below `TOLERANCE` (or is NaN).
     """
     solution = reference_solve(vector_field, q, p, s, h, max_substeps)
     failed = ~(solution.error <= TOLERANCE)
@@ -152,13 +149,7 @@ def path_action(lagrangian: Lagrangian, path: Path, s0: Tensor, T: Tensor | floa
 
     s(T) − s0 is Herglotz's action of the path. Among the paths with the same ends and the same s0 it is stationary
     exactly at the solutions of Herglotz's equations; there it is L_d(q(0), q(T), s0), the exact discrete Lagrangian.
-
-    Raises
-    ------
-    InputError
-        If the integration does not converge.
-
-    Source: Cauchy problem and Herglotz action of the paper.
+    Raise InputError if the integration does not converge.  Source: Cauchy problem and Herglotz action of the paper.
     """
 
     def field(t: Tensor, _: Tensor, s: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -121,13 +121,7 @@ class SingleStep:
 
 
 def driven_by(L_d: DiscreteLagrangian, u: Tensor | None) -> DiscreteLagrangian:
-    """The discrete Lagrangian of a step with input u.
-
-    Raises
-    ------
-    InputError
-        If there is an input and L_d takes none.
-    """
+    """The discrete Lagrangian of a step with input u; raise InputError if there is an input and L_d takes none."""
     if u is None:
         return L_d
     if not isinstance(L_d, Driven):

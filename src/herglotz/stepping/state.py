@@ -137,13 +137,7 @@ class Rollout:
 
 
 def check_batch(states: tuple[Tensor, Tensor, Tensor]) -> State:
-    """The states, one batch (B, n), (B, n), (B).
-
-    Raises
-    ------
-    InputError
-        If they are no tensors, or of other shapes.
-    """
+    """The states, one batch (B, n), (B, n), (B); raise InputError if they are no tensors, or of other shapes."""
     q, p, s = states
     check_arguments(q, p, s, ("q", "p", "s"))
     if q.ndim != 2 or p.shape != q.shape or s.shape != q.shape[:1]:
@@ -156,11 +150,8 @@ def check_state(
 ) -> State:
     """The same state.
 
-    Raises
-    ------
-    InputError
-        If shapes or dtypes do not fit together, or not the parameters of L_d, where it has any (an exported file: its
-        `dof` and `dtype`); with `finite`, if a number is not.
+    Raise InputError if shapes or dtypes do not fit together, or not the parameters of L_d, where it has any (an
+    exported file: its `dof` and `dtype`); with `finite`, if a number is not.
     """
     q, p, s = state
     check_arguments(q, p, s, names)
@@ -186,13 +177,7 @@ def check_state(
 
 
 def check_started(state: State) -> State:
-    """The same state, made by `init`.
-
-    Raises
-    ------
-    StepError
-        If a number of it is not finite.
-    """
+    """The same state, made by `init`; raise StepError if a number of it is not finite."""
     good = torch.isfinite(state.p).all(-1) & torch.isfinite(state.s)
     if not bool(good.all()):
         sample = tuple(int(i) for i in (~good).nonzero()[0])
@@ -203,10 +188,7 @@ def check_started(state: State) -> State:
 def check_h(h: Tensor | float, like: Tensor) -> Tensor:
     """The time step as a tensor of the dtype and device of `like`.
 
-    Raises
-    ------
-    InputError
-        If it is not positive and finite.
+    Raise InputError if it is not positive and finite.
     """
     h = torch.as_tensor(h, dtype=like.dtype, device=like.device)
     if not h.numel():
@@ -226,10 +208,7 @@ def check_rows(inputs: Tensor) -> None:
 def step_sizes(h: Tensor, steps: int | None) -> Tensor:
     """All K steps, (K,) or (..., K), from a scalar and a count or from a list.
 
-    Raises
-    ------
-    InputError
-        If a scalar comes without a count, or a list with another one.
+    Raise InputError if a scalar comes without a count, or a list with another one.
     """
     if h.ndim == 0:
         if steps is None or steps < 1:

@@ -31,12 +31,8 @@ def curve_action(
 ) -> Tensor:
     """s_0 … s_N with s_{k+1} = s_k + L_d(q_k, q_{k+1}, s_k), shape (..., N+1).
 
-    Raises
-    ------
-    InputError
-        If the curve has fewer than two points or h does not fit.
-
-    Source: discrete Cauchy problem of the paper.
+    Raise InputError if the curve has fewer than two points or h does not fit.  Source: discrete Cauchy problem of the
+    paper.
     """
     sizes = curve_steps(q, h)
     s = [s0.expand(q.shape[:-2])]
@@ -52,15 +48,9 @@ def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | 
 
         ∂s_N/∂q_k = (∏_{j>k} c_j) R_k,    R_k = D1L_d(q_k, q_{k+1}, s_k) + c_k D2L_d(q_{k−1}, q_k, s_{k−1})
 
-    with R_0 = D1L_d and, at the far end, ∂s_N/∂q_N = D2L_d = p_N. Interior gradients vanish exactly on the solutions
-    of the discrete Herglotz equations.
-
-    Raises
-    ------
-    InputError
-        If the curve has fewer than two points, h does not fit, or L_d comes with forces.
-
-    Source: discrete Herglotz action and equations of the paper, indices by erratum E3.
+    with R_0 = D1L_d and, at the far end, ∂s_N/∂q_N = D2L_d = p_N. Interior gradients vanish exactly on the solutions of
+    the discrete Herglotz equations. Raise InputError if the curve has fewer than two points, h does not fit, or L_d
+    comes with forces.  Source: discrete Herglotz action and equations of the paper, indices by erratum E3.
     """
     s = curve_action(L_d, q, s0, h)
     P = curve_partials(L_d, q, s, h)
@@ -86,10 +76,7 @@ def curve_residual(P: Partials) -> Tensor:
 def curve_steps(q: Tensor, h: Tensor | float) -> Tensor:
     """All steps of a curve, (..., N).
 
-    Raises
-    ------
-    InputError
-        If the curve has fewer than two points or h is not positive or does not fit.
+    Raise InputError if the curve has fewer than two points or h is not positive or does not fit.
     """
     if q.ndim < 2 or q.shape[-2] < 2:
         raise InputError(f"a discrete curve needs shape (..., N+1, n) with N >= 1, got {tuple(q.shape)}")

@@ -60,19 +60,9 @@ class ConstrainedStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
         """One step: solve for (q1, λ) → momentum → projection → action.
 
-        Differentiable with respect to the state, h and the parameters of L_d (once).
-
-        Parameters
-        ----------
-        state
-            (q, p, s) with g(q) = 0; a p off the tangent space is as good as its projection.
-        guess
-            (..., n) near q1; default q + h v.
-
-        Raises
-        ------
-        InputError
-            If shapes or dtypes do not fit or h is not positive.
+        The state has g(q) = 0; a p off the tangent space is as good as its projection. The guess is near q1, by default
+        q + h v. Differentiable with respect to the state, h and the parameters of L_d (once). Raise InputError if
+        shapes or dtypes do not fit or h is not positive.
         """
         state = check_state(state)
         h = check_h(h, state.q)

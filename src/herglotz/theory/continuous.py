@@ -82,10 +82,7 @@ def contact_vector_field(
     p: Tensor,  # (..., n)
     s: Tensor,  # (...)
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H.
-
-    Source: contact Hamilton equations of the paper.
-    """
+    """X_H: q̇ = H_p, ṗ = −(H_q + p H_s), ṡ = p·H_p − H. Source: contact Hamilton equations of the paper."""
     q_dot, p_dot, heat, H_value = _evolution(H, q, p, s)
     return q_dot, p_dot, heat - H_value
 
@@ -111,12 +108,7 @@ def herglotz_acceleration(
 ) -> Tensor:
     """The acceleration a of Herglotz's equations, L_vv a = L_q + L_s L_v − L_vq v − L_vs L; with q̇ = v and ṡ = L.
 
-    Raises
-    ------
-    InputError
-        If L_vv is singular at a sample.
-
-    Source: d/dt L_v − L_q = L_s L_v, with d/dt expanded along ṡ = L.
+    Raise InputError if L_vv is singular at a sample.  Source: d/dt L_v − L_q = L_s L_v, with d/dt expanded along ṡ = L.
     """
     P = derivatives(L, q, v, s, order=2)
     L_vq_v = (P.D12.mT @ v[..., None])[..., 0]

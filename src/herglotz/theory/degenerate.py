@@ -73,25 +73,10 @@ class LegendrianStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:
         """One step; `residual` is the relation's |c p0 + D1 L_d|, of this step and those ahead, relative to its terms.
 
-        Directions of q1 that no equation fixes stay where the guess has them (the move has least norm). The result
-        carries no graph.
-
-        Parameters
-        ----------
-        state
-            (q, p, s), on the primary constraint; `consistent` puts it there.
-        guess
-            (..., n) near q1; default q.
-
-        Returns
-        -------
-        Step
-            `Status.SINGULAR` where least squares ended with a residual that is not zero: the state starts no step.
-
-        Raises
-        ------
-        InputError
-            If shapes or dtypes do not fit or h is not positive.
+        The state is on the primary constraint; `consistent` puts it there. Directions of q1 that no equation fixes stay
+        where the guess, by default q, has them (the move has least norm). `Status.SINGULAR` where least squares ended
+        with a residual that is not zero: the state starts no step. The result carries no graph. Raise InputError if
+        shapes or dtypes do not fit or h is not positive.
         """
         state = State(*(x.detach() for x in check_state(state)))
         h = check_h(h, state.q).detach()

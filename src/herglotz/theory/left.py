@@ -59,13 +59,9 @@ class LeftLagrangian:
     def partials(self, q0: Tensor, q1: Tensor, s1: Tensor, h: Tensor | float, order: int = 1) -> Partials:
         """Value and derivatives of L⁻ with respect to (q0, q1, s1), by the implicit-function theorem.
 
-        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c.
-        Their `c` is 1 + D3L⁻, not the conformal factor, which is 1/(1 − D3L⁻).
-
-        Raises
-        ------
-        InputError
-            If L_d comes with forces, for which there is no left Lagrangian.
+        With g = ∂s0 = (−D1, −D2, 1)/c, D_aD_b L⁻ = (D_ab + D_a3 g_b + g_a D_b3 + D33 g_a g_b)/c. Their `c` is 1 + D3L⁻,
+        not the conformal factor, which is 1/(1 − D3L⁻). Raise InputError if L_d comes with forces, for which there is
+        no left Lagrangian.
         """
         s0 = self.previous_action(q0, q1, s1, h)
         P = unforced(partials(self.L_d, q0, q1, s0, h, order))
@@ -91,13 +87,7 @@ class LeftLagrangian:
 
 
 def unforced(P: Partials) -> Partials:
-    """P, unless it comes with forces: those are not derivatives of an action.
-
-    Raises
-    ------
-    InputError
-        If there are forces.
-    """
+    """P, unless it comes with forces: those are not derivatives of an action. Raise InputError if there are forces."""
     if P.force is not None:
         raise InputError("this L_d comes with forces F⁻, F⁺; actions and discrete Hamiltonians need one without")
     return P

@@ -33,12 +33,8 @@ def fiber_inverse(
 ) -> Tensor:
     """The x with f_x(q, x, s) = y, by Newton: the velocity of a momentum (f = L), the momentum of a velocity (f = H).
 
-    Differentiable once with respect to q, y and s, by the implicit-function theorem.
-
-    Raises
-    ------
-    InputError
-        If a sample does not converge; the message names it.
+    Differentiable once with respect to q, y and s, by the implicit-function theorem. Raise InputError if a sample does
+    not converge; the message names it.
     """
     q, y = torch.broadcast_tensors(q, y)
 

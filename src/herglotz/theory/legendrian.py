@@ -35,10 +35,7 @@ class LegendrianDefect:
 def legendrian_defect(submanifold: Callable[[Tensor], Triple], u: Tensor) -> LegendrianDefect:
     """η pulled back along u ↦ (q, p, s), at parameters u of shape (..., n).
 
-    Raises
-    ------
-    InputError
-        If u has not as many parameters as q has components.
+    Raise InputError if u has not as many parameters as q has components.
     """
     x, T = jacobian(lambda u: join(*submanifold(u)), u)
     _, p, _ = split(x)

@@ -84,12 +84,8 @@ class RigidBodyStepper:
     def step(self, state: BodyState, h: Tensor | float) -> Step:
         """One step: solve FL⁻ for F → attitude → momentum → action. Differentiable with respect to the state and h.
 
-        NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F.
-
-        Raises
-        ------
-        InputError
-            If shapes or dtypes do not fit or h is not positive.
+        NaN in the samples whose status is not `Status.CONVERGED`: h|M| is then too large for any F. Raise InputError if
+        shapes or dtypes do not fit or h is not positive.
         """
         R, M, s = _checked(state)
         h = check_h(h, M)

@@ -81,14 +81,9 @@ def tulczyjew_triple(
 ) -> TulczyjewTriple:
     """The triple over (q0, q1, s0): E, its legs, and the defects of the diagram.
 
-    H⁺ and H⁻ are solved from L_d near (q0, q1); neither is used to make the leg that it is compared with.
-
-    Raises
-    ------
-    InputError
-        If L_d comes with forces.
-
-    Source: the conclusions of the paper promise the triple; E5 for H⁻, section 6 of `docs/mathematics.md` for E.
+    H⁺ and H⁻ are solved from L_d near (q0, q1); neither is used to make the leg that it is compared with. Raise
+    InputError if L_d comes with forces.  Source: the conclusions of the paper promise the triple; E5 for H⁻, section 6
+    of `docs/mathematics.md` for E.
     """
     P = unforced(partials(L_d, q0, q1, s0, h))
     start, end = (q0, momentum_minus(P), s0), (q1, momentum_plus(P), s0 + P.L)

@@ -16,10 +16,7 @@ from herglotz.training.run_folder import load_run as load_run, save_run as save_
 from herglotz.training.selection import Selection as Selection, select as select
 from herglotz.training.smoother import Smoothed as Smoothed, smooth as smooth
 from herglotz.training.solvers.adam import adam as adam
-from herglotz.training.solvers.levenberg_marquardt import (
-    OptimiserResult as OptimiserResult,
-    levenberg_marquardt as levenberg_marquardt,
-)
+from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt as levenberg_marquardt
 from herglotz.training.uncertainty import (
     Bands as Bands,
     Laplace as Laplace,

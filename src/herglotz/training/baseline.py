@@ -64,12 +64,7 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
 
     Noise biases second differences, so these numbers only start a fit. Where the data are known to hold `outliers`,
     Student's t takes the place of least squares (`problems.robust`), and rows that miss grossly set no size. A recorded
-    step is crossed in `substeps` model steps by trajectory fitting.
-
-    Raises
-    ------
-    InputError
-        If nothing moves.
+    step is crossed in `substeps` model steps by trajectory fitting. Raise InputError if nothing moves.
     """
     t, v, a, columns, max_step = differences(data, drag)
     n = data.dof

@@ -98,10 +98,7 @@ def everywhere(holds: bool) -> bool:
 def process_group() -> Iterator[None]:
     """Join the processes that `torchrun` started (NCCL with a GPU, gloo without), and part from them at the end.
 
-    Raises
-    ------
-    RuntimeError
-        If one of them ends, or does not answer for 60 seconds.
+    Raise RuntimeError if one of them ends, or does not answer for 60 seconds.
     """
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield

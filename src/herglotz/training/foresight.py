@@ -72,12 +72,7 @@ class Foresight:
 def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight | None:
     """See the head of this module; None where the model does not follow the data.
 
-    Parameters
-    ----------
-    task, fitted, seen
-        A finished fit.
-    states
-        (N, 2n+1) its states at all samples of `seen.data`, those of the unseen part by a free run.
+    `states` (N, 2n+1) are those of the finished fit at all samples of `seen.data`, of the unseen part by a free run.
     """
     if not fitted.notes.get("follows_data", True) or not bool(torch.isfinite(states).all()):
         return None

@@ -65,15 +65,10 @@ def in_words(name: str) -> str:
     return WORDS.get(stem, stem) + (f", entry {int(entry[:-1]) + 1}" if entry else "")
 
 
-def traded(posterior: Laplace, index: float = HARMFUL) -> list[Trade]:
+def traded(posterior: Laplace) -> list[Trade]:
     """The combinations of physical parameters that these data do not determine, the worst first; [] if there is none.
 
-    Parameters
-    ----------
-    posterior
-        Of a fit (`herglotz.training.laplace`).
-    index
-        Condition index from which a combination is told.
+    `posterior` is that of a fit (`herglotz.training.laplace`).
     """
     A, P = posterior.information, len(posterior.theta)
     names = posterior.names()
@@ -97,7 +92,7 @@ def traded(posterior: Laplace, index: float = HARMFUL) -> list[Trade]:
     for vector in _within_equal(values, vectors).T:  # values ascend
         value = vector @ M @ vector
         condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
-        if condition < index:
+        if condition < HARMFUL:
             break
         share = vector.square()
         order = [k for k in share.argsort(descending=True).tolist() if share[k] >= PART]

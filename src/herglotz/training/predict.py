@@ -32,10 +32,7 @@ BELIEVED = 0.1  # noise of a radian of motion over that of the data, as of steps
 
 @dataclass(frozen=True, repr=False)
 class Prediction:
-    """A recording beside the model's free run.
-
-    With windows, each window is one trajectory of `data`.
-    """
+    """A recording beside the model's free run. With windows, each window is one trajectory of `data`."""
 
     data: Trajectories  # what was scored, angles unwrapped; every `every`-th sample of the recording
     states: State  # (N, n), (N, n), (N,) smoothed in the warm-up, then free; NaN from a failed step on

@@ -264,10 +264,7 @@ class Reading(TypedDict, total=False):
 def reading_in(settings: dict[str, Any], where: str) -> dict[str, Any]:
     """Take what config.json says of reading the data out of its settings; {} where the user said nothing.
 
-    Raises
-    ------
-    InputError
-        If an entry is not known, or of another type than the flag of its name.
+    Raise InputError if an entry is not known, or of another type than the flag of its name.
     """
     reading = settings.pop("reading", {})
     check_entries(Reading, reading, f"{where}: reading", REMEDY)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -78,12 +79,8 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
 
     With `robust` "auto" the loss is Student's t where the residuals of the first stage have outliers. Every prior
     strength is then fitted in turn, the weakest first: its residuals give the noise that all strengths are fitted with.
-    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`).
-
-    Returns
-    -------
-    Chosen or None
-        None where a step near the data has no solution.
+    The strongest whose held-out error is not beaten beyond its spread wins (`cross_validation`). None where a step near
+    the data has no solution.
     """
     config = task.config
     departures = config.departures if model.potential.network is not None else config.departures[:1]
@@ -91,18 +88,9 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
     freedom = FREEDOM if config.robust == "on" else None
 
     def stage(name: str, x: Tensor | None, departure: float, process: float) -> SmoothingFit | None:
-        prior = prior_of(model, task.base, departure)
-        problem = SmoothingProblem(
-            model, task.data, grid, sigma=max(sigma, FLOOR * task.size), process=process, prior=prior, freedom=freedom
-        )
-        start, most = problem.start() if x is None else x, min(config.iterations, STAGE)
-        result = task.stages.run(
-            name, start, most,
-            lambda x, callback: levenberg_marquardt(
-                problem, x, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING, callback=callback
-            ),
-        )  # fmt: skip
-        return SmoothingFit(result.x, problem, result) if math.isfinite(result.cost) else None
+        noise, prior = max(sigma, FLOOR * task.size), prior_of(model, task.base, departure)
+        problem = SmoothingProblem(model, task.data, grid, sigma=noise, process=process, prior=prior, freedom=freedom)
+        return _minimised(task, name, problem, x)
 
     weakest = max(departures)
     first = stage("smoothing", None, weakest, 1.0)
@@ -129,6 +117,14 @@ def fit_smoothing(task: Task, model: ContactLagrangian, sigma: float) -> Chosen[
 
     found = strongest_not_beaten(departures, fit)
     return found or Chosen(last, weakest, {})
+
+
+def _minimised(task: Task, name: str, problem: SmoothingProblem, x: Tensor | None) -> SmoothingFit | None:
+    """The fit of a stage from x, or from the data; None where its cost is not finite."""
+    start, most = problem.start() if x is None else x, min(task.config.iterations, STAGE)
+    least = partial(levenberg_marquardt, problem, max_iterations=most, rtol=1e-4, patience=3, damping=DAMPING)
+    result = task.stages.run(name, start, most, lambda x, callback: least(x, callback=callback))
+    return SmoothingFit(result.x, problem, result) if math.isfinite(result.cost) else None
 
 
 def _noises(fit: SmoothingFit) -> tuple[float, float]:

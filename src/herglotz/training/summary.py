@@ -25,10 +25,7 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
-        (
-            "extrapolation RMS",
-            _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples"),
-        ),
+        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
         ("training RMS", _error(m.get("train_rms"), unit, degrees)),
         ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
         ("damping rate", show(m.get("rate"), f"per {per}")),
@@ -67,16 +64,12 @@ def as_html(run: FittedRun) -> str:
     return f"<table>{body}</table>"
 
 
-def features_in_words(names: tuple[str, ...], most: int = MOST_FEATURES) -> str:
-    """What the model is made of beside its terms, told or found; "" without."""
-    rest = len(names) - most
-    return ", ".join(names[:most]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
-
-
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
     """The named terms, and which coordinate q1 is where it has a name of its own."""
     told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
-    return features_in_words(features) + (f"  ({', '.join(told)})" if told else "")
+    rest = len(features) - MOST_FEATURES
+    shown = ", ".join(features[:MOST_FEATURES]) + (f" and {rest} more (metrics.json)" if rest > 0 else "")
+    return shown + (f"  ({', '.join(told)})" if told else "")
 
 
 def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:

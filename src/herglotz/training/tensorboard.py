@@ -36,10 +36,7 @@ class TensorboardLog:
 def tensorboard_log(folder: str | Path | None) -> Iterator[TensorboardLog | None]:
     """A log into this folder, which `tensorboard --logdir FOLDER` shows while the fit runs; None without a folder.
 
-    Raises
-    ------
-    InputError
-        If TensorBoard is not installed.
+    Raise InputError if TensorBoard is not installed.
     """
     if folder is None:
         yield None

@@ -75,10 +75,7 @@ class TrajectoryFit:
 def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> None:
     """That there are no more than `most` numbers in q: what is solved for together grows with their square.
 
-    Raises
-    ------
-    InputError
-        Naming how many samples there are, how many can be, and which thinning leaves as many.
+    InputError names how many samples there are, how many can be, and which thinning leaves as many.
     """
     allowed = most // data.dof
     if data.samples <= allowed:
@@ -91,20 +88,10 @@ def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> Non
 
 
 class SegmentStages:
-    """Fits of one model at growing segment lengths.
+    """Fits of one model at growing segment lengths, from its current parameters; `frozen` fits the states alone.
 
-    Parameters
-    ----------
-    task
-        Data, first look, settings and stages.
-    model
-        Its current parameters are the start.
-    frozen
-        Fit the states alone.
-    s
-        (N,) s at every sample in the model's unit, where it is known.
-    label
-        What sets the names of these stages apart from those of others in the same fit.
+    `s` (N,) is s at every sample in the model's unit, where it is known; `label` sets the names of these stages apart
+    from those of others in the same fit.
     """
 
     def __init__(
@@ -251,11 +238,7 @@ def fit_trajectories(
     the states of the one before. Then every prior strength is fitted in turn, the weakest first: its residuals give the
     noise that all strengths are fitted with. The strongest prior whose held-out error is not beaten beyond its spread
     wins. A model that is `known` from an earlier fit needs no growing: whole trajectories follow the shortest segments.
-
-    Returns
-    -------
-    Chosen or None
-        From the longest segments that could be fitted; None if the model cannot follow even the shortest.
+    The result is from the longest segments that could be fitted; None if the model cannot follow even the shortest.
     """
     if model.potential.network is None:
         return _without_prior(task, model, sigma, known=known)

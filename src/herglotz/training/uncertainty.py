@@ -132,17 +132,9 @@ class Laplace:
         The start x of each is fitted to those samples with θ held. With JᵀJ of that fit in blocks, and C the covariance
         of θ, x has the derivative G = −A_xx⁻¹ A_xθ by θ, and (θ, x) the covariance [[C, C Gᵀ], [G C, G C Gᵀ + A_xx⁻¹]].
 
-        Parameters
-        ----------
-        data
-            Trajectories of the same system (coordinates, units, inputs), each of more than `seen` samples.
-        seen
-            Samples at the beginning of each that are used, 3 or more; bands there are those of a fit.
-
-        Raises
-        ------
-        InputError
-            If a trajectory is shorter, or the model cannot follow its beginning.
+        The data are of the same system (coordinates, units, inputs), each trajectory of more than `seen` samples, 3 or
+        more; bands on those are the bands of a fit. Raise InputError if a trajectory is shorter, or the model cannot
+        follow its beginning.
         """
         data, where = data.unwrapped(), data.source or "data"
         if data.angles != self.run.data.angles:
@@ -259,12 +251,8 @@ def ensemble_bands(runs: Sequence[Run], data: Trajectories | None = None, seen: 
 
     By the law of total variance the variance of the position is the mean of the fits' Laplace variances plus the
     variance of their predictions: what one posterior sees around its own minimum, and how far apart the minima are.
-    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`).
-
-    Raises
-    ------
-    InputError
-        If there are fewer than two runs, or they were fitted to different data.
+    With `data`, bands on other trajectories, each started from its first `seen` samples (`Laplace.predict`). Raise
+    InputError if there are fewer than two runs, or they were fitted to different data.
     """
     if len(runs) < 2:
         raise InputError(f"an ensemble needs two runs or more, got {len(runs)}; fit other seeds")

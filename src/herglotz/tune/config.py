@@ -78,15 +78,9 @@ class TuneConfig:
 def allowed_failures(count: int, quantile: float, confidence: float) -> int:
     """Return how many of `count` starts may exceed a bound that `quantile` of all starts keep, with this confidence.
 
-    The result is the largest k with P(at most k of `count` exceed | each exceeds with probability 1 − quantile) ≤
-    1 − confidence. This tolerance limit holds for every distribution of the errors.
-
-    Raises
-    ------
-    InputError
-        If `count` starts are too few for the claim.
-
-    Source: S. S. Wilks, Ann. Math. Stat. 12 (1941) 91.
+    The result is the largest k with P(at most k of `count` exceed | each exceeds with probability 1 − quantile) ≤ 1 −
+    confidence. This tolerance limit holds for every distribution of the errors. Raise InputError if `count` starts are
+    too few for the claim.  Source: S. S. Wilks, Ann. Math. Stat. 12 (1941) 91.
     """
     p, total, k = 1 - quantile, 0.0, 0
     while k <= count:

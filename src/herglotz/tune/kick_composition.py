@@ -101,10 +101,7 @@ class KickStepper(OneStepMethod):
     def step(self, state: State, h: Tensor | float, guess: Tensor | None = None) -> Step:  # noqa: ARG002
         """Take one step; NaN and `Status.DIVERGED` where the result is not finite.
 
-        Raises
-        ------
-        InputError
-            If h is not the stepper's own, or there is more than one coordinate.
+        Raise InputError if h is not the stepper's own, or there is more than one coordinate.
         """
         h = torch.as_tensor(h, dtype=state.q.dtype)
         wrong = h[~((h - self.h).abs() <= 1e-6 * self.h)]

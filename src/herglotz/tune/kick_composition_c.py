@@ -106,13 +106,7 @@ void herglotz_kicks_rollouts(long batch, long steps, double wait, const hz_real 
 
 
 def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
-    """The header, for numbers of this dtype.
-
-    Raises
-    ------
-    InputError
-        If the dtype has no C form.
-    """
+    """The header, for numbers of this dtype; raise InputError if the dtype has no C form."""
     if dtype not in TYPES:
         raise InputError(f"dtype must be float64 or float32, got {dtype}")
     number = _number(dtype)

@@ -59,11 +59,7 @@ def record(run: Run, starts: State, horizon: float) -> Motions:
     """Return motions over `horizon` from these starts; motions that fail are left out.
 
     The reference is the run's model at the run's own step: the error of this flow against the data has been measured.
-
-    Raises
-    ------
-    InputError
-        If more than half of the motions fail.
+    Raise InputError if more than half of the motions fail.
     """
     with torch.no_grad():
         out = Stepper(frozen_double(run)).rollout(*starts, h=run.h, steps=round(horizon / run.h))

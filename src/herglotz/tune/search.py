@@ -229,10 +229,7 @@ def _costs(tried: list[Candidate], choosing: Motions, rounds: int) -> list[Cost]
 def choose(candidates: list[Candidate], asked: dict[str, float]) -> Candidate:
     """Return the cheapest candidate within max_error, or the most accurate one within budget_us.
 
-    Raises
-    ------
-    InputError
-        If there is none; the message names the nearest demand that can be met.
+    Raise InputError if there is none; the message names the nearest demand that can be met.
     """
     if "max_error" in asked:
         good = [c for c in candidates if c.bound <= asked["max_error"]]

@@ -17,12 +17,8 @@ def drawn_states(L_d: DiscreteLagrangian, h: float, samples: int, make: torch.Ge
     """Return (q0, p0, s0) with q0 and q̇ standard normal, s0 in [−1, 1], and p0 = −D1 L_d(q0, q0 + h q̇, s0)/c.
 
     A learned model has its own sizes of q and q̇, and its number of coordinates. Of a function the smallest number is
-    taken that it does not refuse, so a sum over coordinates is verified for one.
-
-    Raises
-    ------
-    InputError
-        If the function takes no number of coordinates up to 12, or gives no finite momentum.
+    taken that it does not refuse, so a sum over coordinates is verified for one. Raise InputError if the function takes
+    no number of coordinates up to 12, or gives no finite momentum.
     """
     if isinstance(L_d, ContactLagrangian):
         scale, speed = (torch.tensor(x, dtype=torch.float64) for x in (L_d.config.scale, L_d.config.speed))

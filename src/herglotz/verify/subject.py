@@ -76,11 +76,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
 
     States are drawn from the `q_range` and `v_range` of a scene with s in [−1, 1], from the fitted states of a run, or
     from the box of a file; for an L_d alone by `drawn_states`. A pair (L_d or stepper, states) brings its own states.
-
-    Raises
-    ------
-    InputError
-        If the target is none of these, or h is missing or not positive.
+    Raise InputError if the target is none of these, or h is missing or not positive.
     """
     if samples < 1:
         raise InputError(f"samples must be >= 1, got {samples}")

@@ -142,14 +142,8 @@ def test_bad_output_file(tmp_path, capsys, command, out):  # fails if an output 
             ["fit", "OUT.csv", "--out", "OUT", "--level", "afine"],
             "'forced'); did you mean affine? See 'herglotz fit --help'",
         ),
-        (
-            ["fit", "OUT.csv", "--out", "OUT", "--levle", "full"],
-            "--levle full; did you mean --level?",
-        ),
-        (
-            ["fit", "OUT.cvs", "--out", "OUT"],
-            "the folder; did you mean OUT.csv?",
-        ),
+        (["fit", "OUT.csv", "--out", "OUT", "--levle", "full"], "--levle full; did you mean --level?"),
+        (["fit", "OUT.cvs", "--out", "OUT"], "the folder; did you mean OUT.csv?"),
         (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "unknown level 'afine'; choose some of"),
         (["select", "OUT.csv", "--out", "OUT", "--levels", "linear,afine"], "auto; did you mean affine?"),
         (["simulate", "dufing", "--out", "OUT.csv"], "van_der_pol; did you mean duffing?"),

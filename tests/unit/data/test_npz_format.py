@@ -64,10 +64,7 @@ def test_arrays_alone_are_enough(tmp_path):  # fails if metadata or lengths are 
             {"t": T3, "q": Q3, "metadata": np.array('{"names": "q"}')},
             r"'metadata'.*: names must be list.str., got 'q' .*drop it",
         ),
-        (
-            {"t": T3, "q": Q3, "metadata": np.array('{"angles": [1]}')},
-            r"'metadata'.*: angles must be list.bool., got",
-        ),
+        ({"t": T3, "q": Q3, "metadata": np.array('{"angles": [1]}')}, r"'metadata'.*: angles must be list.bool., got"),
         (
             {"t": T3, "q": Q3, "metadata": np.array('{"columns": [["q", "coordinate"]]}')},
             "d.npz: 'metadata'.*: columns",

@@ -14,11 +14,7 @@ from herglotz.cli import main
 from herglotz.errors import InputError
 from herglotz.plots import IDENTITIES, save_theory_figures
 from herglotz.plots.fan import point_fan, spread_fan
-from herglotz.plots.hamilton_jacobi import (
-    STEPS,
-    plot_hamilton_jacobi_residual,
-    plot_momentum_vs_generating_function,
-)
+from herglotz.plots.hamilton_jacobi import STEPS, plot_hamilton_jacobi_residual, plot_momentum_vs_generating_function
 from herglotz.plots.parachute import physical_fall
 from herglotz.scenes import scene
 

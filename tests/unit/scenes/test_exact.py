@@ -6,14 +6,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import autograd_partials, contact_defect, partials, step_derivative
-from herglotz.scenes import (
-    NumericallyExact,
-    Reason,
-    exact_discrete_lagrangian,
-    herglotz_motion,
-    scene,
-    scene_names,
-)
+from herglotz.scenes import NumericallyExact, Reason, exact_discrete_lagrangian, herglotz_motion, scene, scene_names
 from herglotz.scenes.collocation import lobatto
 from herglotz.scenes.motion import constant_rate
 from herglotz.stepping import State, Status, Stepper

@@ -67,8 +67,7 @@ def pairs():
 
 
 @pytest.mark.parametrize(
-    ("name", "other"),
-    [("left", "right"), ("right", "left"), *((x, x) for x in ("midpoint", "trapezoid"))],
+    ("name", "other"), [("left", "right"), ("right", "left"), *((x, x) for x in ("midpoint", "trapezoid"))]
 )
 def test_adjoint_pairs(name, other):
     # fails if L_d*(q0, q1, s0) takes s at the wrong end or forgets that h changes sign

@@ -7,13 +7,7 @@ from herglotz.errors import InputError
 from herglotz.mechanics import autograd_partials
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import Event, State, Status, StepError, Stepper
-from herglotz.theory import (
-    BodyState,
-    ConstrainedStepper,
-    EvolutionStepper,
-    LegendrianStepper,
-    RigidBodyStepper,
-)
+from herglotz.theory import BodyState, ConstrainedStepper, EvolutionStepper, LegendrianStepper, RigidBodyStepper
 from herglotz.tune import KickStepper
 
 H = 0.1

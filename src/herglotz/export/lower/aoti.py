@@ -28,13 +28,9 @@ def export_aoti(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     nothing and takes contiguous tensors of the model's dtype only: call it through `load_aoti`, which does check. It
     runs on the kind of processor it was compiled on, without derivatives.
 
-    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`.
-
-    Raises
-    ------
-    InputError
-        If there is no C++ compiler, an argument is not usable, what was compiled does not step like the model, or the
-        file cannot be written.
+    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`. Raise
+    InputError if there is no C++ compiler, an argument is not usable, what was compiled does not step like the model,
+    or the file cannot be written.
     """
     from torch._inductor.package.package import package_aoti  # seconds, which only this format costs
 
@@ -62,10 +58,7 @@ def _compiled(program: ExportedProgram, settings: dict[str, Any]) -> Any:
 def _check(package: str, model: ContactLagrangian) -> None:
     """Step the new file beside the model: compilers have been seen to put values where others belong.
 
-    Raises
-    ------
-    InputError
-        If they disagree.
+    Raise InputError if they disagree.
     """
     found = compare(load_pt2(package, trust_code=True), Stepper(model), batches=(1, 7), steps=20)
     worst = max(found[key] for key in ("q", "p", "s"))  # NaN, which is not larger, where every start fails

@@ -31,12 +31,8 @@ def export_onnx(model: ContactLagrangian, entries: dict[str, Any]) -> bytes:
     A failed step has a status other than 0, and NaN from there on. The entry `herglotz_init` of the model's metadata is
     a second, small ONNX model in base 64: the state from two positions, q0, q1 (B, n), s0, h (B,)[, u] → p, s at q1.
 
-    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`.
-
-    Raises
-    ------
-    InputError
-        If onnx is not installed, an argument is not usable, or the file cannot be written.
+    The arguments and the path that is returned are those of `export_pt2`, and so is the output `outside`. Raise
+    InputError if onnx is not installed, an argument is not usable, or the file cannot be written.
     """
     try:
         import onnx  # noqa: F401

@@ -282,10 +282,7 @@ def fold_multiply(a: Atom, b: Atom) -> Atom | None:
 def literal(value: float) -> str:
     """A constant, which `herglotz.export.c_header` rounds and marks by the number type.
 
-    Raises
-    ------
-    InputError
-        If the number is not finite, as the inverse of a singular mass is (erratum E4: no step is defined).
+    Raise InputError if the number is not finite, as the inverse of a singular mass is (erratum E4: no step is defined).
     """
     if not math.isfinite(value):
         raise InputError(
