@@ -4,9 +4,8 @@ The linear problem (`linear_start`) is made of smoothed positions (`data.smoothi
 trajectories are fitted by multiple shooting. The candidate that lowers the cost most, by the quadratic model of the
 fit, joins while that is more than ½ log N (the Bayesian information criterion); at the end those that lower it by less
 leave, and of one coordinate all subsets are compared (`subsets`). That criterion takes residuals for white noise. Where
-they are none, because a force or the rule's accuracy is missing, any term may take over some of it: there terms stay
-only if held-out blocks of time ask for them. Model steps are halved while that changes the motion by a good part of
-what it misses the data by.
+they are none, and of one coordinate always, terms stay only if held-out blocks of time ask for them. Model steps are
+halved while that changes the motion by a good part of what it misses the data by.
 """
 
 from __future__ import annotations
@@ -319,9 +318,9 @@ class DictionarySearch:
 
     def _last_terms(self, found: Found) -> Found:
         """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
-        first = found
+        first, worth = found, 4**self.order * self.data.q.numel()
         while found.terms.names and (found.coloured or (self.data.dof == 1 and found.rms > self.floor)):
-            terms = found.needed(4**self.order * self.data.q.numel(), self.own, self.floor, one_less=True)
+            terms = found.needed(worth, self.own, self.floor, one_less=True)
             less = None if terms == found.terms else self.refit(found, terms)
             less = None if less is None else self._finer(less)  # the term may have made up for the steps' length
             if less is None or not less.as_good(found if found.coloured else first, self.floor):
