@@ -7,12 +7,17 @@
 >>> print(run.verify().table())
 """
 
+from __future__ import annotations
+
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+
+TYPE_CHECKING = False  # `typing` takes 20 ms, in which an interrupt of the command would print a traceback
 
 __version__ = "0.1.0"
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from herglotz.data import Trajectories, load, save, simulate
     from herglotz.errors import InputError
     from herglotz.export import compile, export_pt2, load_pt2
@@ -61,7 +66,7 @@ __all__ = [
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__} - {"Any", "TYPE_CHECKING", "import_module"})
+    return sorted({*globals(), *__all__} - {"TYPE_CHECKING", "annotations", "import_module"})
 
 
 def __getattr__(name: str) -> Any:
