@@ -136,6 +136,7 @@ class Stages:
             remind(problem, result.memory)
         else:
             self.bar.total = self.bar.n + total  # most stages end before their bound
+            self.bar.last_print_t = time.time()  # what was searched for before tells nothing of an iteration's time
             self.bar.set_description(name)
             resumed = None if stored is None else stored["search"]
 

@@ -125,3 +125,23 @@ def test_bars_have_no_thread_that_python_may_end_in(monkeypatch):
     package = Path(herglotz.__file__).parent
     users = [path.name for path in package.rglob("*.py") if "import tqdm" in path.read_text("utf-8")]
     assert users == ["progress.py"]
+
+
+def test_the_remaining_time_leaves_the_search_before_a_stage_out(monkeypatch):
+    # fails if a stage of 40 short iterations says 5 minutes because a search of 1000 s stood before it
+    now = [1000.0]
+    for clock in ("time.time", "tqdm.std.time"):
+        monkeypatch.setattr(clock, lambda: now[0])
+    stages, rates = Stages(progress=True), []
+    now[0] += 1000.0
+
+    def slow(x, callback):
+        for k in range(5):
+            now[0] += 0.5
+            callback(k + 1, 1.0, x, dict)
+            rates.append(stages.bar.format_dict["rate"])
+        return OptimiserResult(x, 1.0, "done", 5, [1.0], {})
+
+    with stages.bar:
+        stages.run("x", torch.zeros(1), 40, slow)
+    assert rates[-1] == pytest.approx(2.0, rel=0.01)  # iterations a second
