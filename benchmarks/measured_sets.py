@@ -123,9 +123,9 @@ def disturbed(seed: int, _folder: Path) -> dict[str, float]:
     return found
 
 
-def extrapolation(name: str) -> Callable[[int, Path], dict[str, float]]:
+def extrapolation(name: str, objective: str = "auto") -> Callable[[int, Path], dict[str, float]]:
     def measure(seed: int, folder: Path) -> dict[str, float]:
-        metrics = fit(load(folder / name), FitConfig(seed=seed), progress=False).metrics
+        metrics = fit(load(folder / name), FitConfig(seed=seed, objective=objective), progress=False).metrics
         return {k: metrics[k] for k in ("extrapolation_rms", "train_rms", "rate")}
 
     return measure
