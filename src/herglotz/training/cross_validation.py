@@ -58,10 +58,8 @@ def held_out_errors(
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
     better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q
-    return (
-        left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
-        * problem.sigma
-    )
+    errors = left_out_errors(r, problem.data, lambda rows: _left_out(G[rows], r[rows]) / better[rows], better > SURE)
+    return errors * problem.sigma
 
 
 def _left_out(G: Tensor, r: Tensor) -> Tensor:

@@ -317,7 +317,7 @@ class DictionarySearch:
         return found
 
     def _last_terms(self, found: Found) -> Found:
-        """Without terms that held-out blocks do not ask for, one after the other, where residuals are no noise."""
+        """Without terms that held-out blocks do not ask for: of several coordinates where residuals are no noise."""
         first, worth = found, 4**self.order * self.data.q.numel()
         while found.terms.names and (found.coloured or (self.data.dof == 1 and found.rms > self.floor)):
             terms = found.needed(worth, self.own, self.floor, one_less=True)

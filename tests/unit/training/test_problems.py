@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -159,6 +160,22 @@ def test_known_starts_are_in_no_held_out_block(samples):
     # fails if weighted residuals are taken for lengths, or a start that was recorded is foretold from later samples:
     # the first block of 0.6 m of motion missed 5e6 m, and decided all comparisons; measured now 0.21, 0.35 and 0.16 m
     assert float(two_modes(samples)[-1][0]) < 0.6
+
+
+@pytest.mark.parametrize(("better", "first", "error"), [(2.0, 4.0, (7 / 4) ** 0.5), (20.0, 1e6, 1.0)])
+def test_held_out_errors_are_in_units_of_q(better, first, error):
+    # fails if a start that is known twice as well counts twice in the error of its block, or is left out of none
+    # (the measured pendulum: that chose a prior whose free run missed by 0.0144 rad in place of 0.0098), or if one that
+    # is known far better is foretold
+    data = Trajectories.of(torch.arange(20.0, dtype=torch.float64), torch.arange(20.0, dtype=torch.float64)[:, None])
+    r, known = torch.ones(20, dtype=torch.float64), torch.ones(20, 1, dtype=torch.float64)
+    r[0], known[0] = first, better
+    problem: Any = SimpleNamespace(
+        data=data, sigma=3.0, better=known, data_rows=lambda *_: (r, torch.zeros(20, 1, dtype=torch.float64))
+    )
+    no: Any = None
+    found = held_out_errors(problem, no, no, torch.eye(1, dtype=torch.float64))
+    assert found.tolist() == pytest.approx([3 * error, 3, 3, 3, 3])
 
 
 def test_a_block_that_stays_decides_nothing():

@@ -283,3 +283,19 @@ def test_least_squares_stay_where_no_robust_fit_is_found(monkeypatch):
     chosen = trajectory_fit._without_prior(task, stub(), 1.0, known=True)
     assert chosen is not None
     assert chosen.fit is plain
+
+
+@pytest.mark.parametrize(("dof", "coloured", "left"), [(1, False, 2), (2, False, 5), (2, True, 0)])
+def test_terms_that_held_out_blocks_do_not_ask_for_leave(dof, coloured, left):
+    # fails if white residuals keep the powers of one coordinate that its free run pays for, if there each loss is
+    # weighed against the one before and not against all, or if several coordinates lose theirs to noise
+    def made(count):
+        good = lambda other, _floor: len(other.terms.names) - count <= 3  # noqa: E731  each one alone is
+        terms = lambda *_, **__: stub(names="x" * (count - 1))  # noqa: E731
+        return stub(terms=stub(names="x" * count), coloured=coloured, rms=1.0, needed=terms, as_good=good)
+
+    search: Any = object.__new__(DictionarySearch)
+    search.data, search.floor, search.order, search.own = stub(dof=dof, q=torch.zeros(9, dof)), 0.0, 2, ()
+    search.refit = lambda _found, terms: made(len(terms.names))
+    search._finer = lambda found: found
+    assert len(search._last_terms(made(5)).terms.names) == left
