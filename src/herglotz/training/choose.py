@@ -144,7 +144,8 @@ def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
     for rule in RULES:
         reason = rule.answer(seen, user_settings)
         if reason is not None:
-            return (rule.objective if not rule.objective.startswith("as ") else seen.settings.objective), reason
+            told = {"as named": user_settings.objective, "as found": seen.settings.objective}
+            return told.get(rule.objective, rule.objective), reason
     raise AssertionError("the last rule has no condition")
 
 

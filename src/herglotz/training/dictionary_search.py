@@ -154,7 +154,7 @@ class DictionarySearch:
         stages = self._stages(found.terms, found.values, found.config.substeps, found.config.sticking)
         stages.hurried, sigma, begin = True, max(found.rms, self.floor), smoothed(self.data, local)
         fit = stages.at_once(sigma, self.freedom, begin) if found.whole else None
-        if fit is None:
+        if fit is None or not fit.follows(sigma):
             first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=begin)
             fit = None if first is None else stages.grow(first, sigma)
         return None if fit is None else self._found(found.terms, stages, fit)

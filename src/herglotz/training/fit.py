@@ -130,6 +130,7 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         if plan is None and seen.found is not None and (seen.found.doubt or (config.find_zeros and seen.found.apart)):
             seen, plan = held_out_winner(data, config, stages, seen)
         plan = plan or choose(seen, config)
+        seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
     run.metrics["equation"] = _equation(run, plan, ROUNDING * task.exact).as_dict()

@@ -144,7 +144,8 @@ def _seen(
         seen = replace(seen, base=plan.started(base))
         if plan.network == "covered":
             seen = replace(seen, baseline_motion=_baseline_motion(seen.task(stages)))
-    if seen.leaves_objective if plan is None else plan.continues_probe:
+    asked = user_settings.objective == "auto" and seen.leaves_objective
+    if asked if plan is None else plan.continues_probe:
         seen = replace(seen, probe=_probe(seen.task(stages)))
     return seen
 

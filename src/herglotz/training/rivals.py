@@ -23,6 +23,7 @@ from herglotz.training.evaluate import free_run_errors
 from herglotz.training.look import Look, look
 from herglotz.training.named_terms import DRAG, STILL
 from herglotz.training.objectives import OBJECTIVES
+from herglotz.training.one_step_fit import NOISE_OF_R
 from herglotz.training.plan import Plan
 from herglotz.training.sensor_zeros import Apart, refined, sensor_zeros
 from herglotz.training.stages import Stages
@@ -33,6 +34,7 @@ REFINED = 2  # searches for terms with better zeros
 WORTH = 0.8  # of the error over held-out time without zeros: what zeros have to lower it to
 FOLLOWS = 0.5  # of the spread: a free run that misses by more is lost, and tells nothing of terms
 INNER = 0.75  # of the training part that rivals are fitted to
+DROWNED = 0.1  # of a recorded step's curvature: noise above it would be most of what one-step errors minimise
 
 
 def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen: Look) -> tuple[Look, Plan]:
@@ -56,9 +58,10 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         if bare["rms"] <= FOLLOWS * _spread(seen) and not bare["rms"] > MARGIN * first["rms"]:
             seen, first, model = _going_on(fewer, bare), bare, "friction and inputs alone"
             named = choose(seen, config)
-    other = _without_names(data, config, stages, seen)
-    networks = choose(other, config)
     every = sparsest(seen.kept)
+    asked = replace(config, objective="trajectory") if every > 1 and _drowned(seen) else config
+    other = _without_names(data, asked, stages, seen)
+    networks = choose(other, asked)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
     why = f"free runs over the last quarter of the training part miss {first['rms']:.2g} with {model}, "
     why += f"{second['rms']:.2g} with networks ({networks.objective})"
@@ -66,6 +69,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         why += f"; both are lost: with errors up to the spread they miss {first['until']:.2g} and {second['until']:.2g}"
     if first[by := "until" if lost else "rms"] <= MARGIN * second[by]:
         return seen, _reasoned(named, why)
+    networks = replace(networks, every=named.every)  # longer steps would change the motion
     if networks.objective == "trajectory" and "departure" in second:
         other = _going_on(other, second)
         networks = replace(
@@ -138,6 +142,16 @@ def _going_on(seen: Look, found: dict[str, Any]) -> Look:
 def _both(found: dict[str, Any], seen: Look) -> float:
     """Geometric mean of both errors over held-out time; a free run that is lost, as of chaos, misses by the spread."""
     return (found["windows"] * min(found["rms"], _spread(seen))) ** 0.5
+
+
+def _drowned(seen: Look) -> bool:
+    """Whether noise hides how the motion curves over one recorded step, which it does where steps are fine.
+
+    Networks are tried on fewer samples, whose steps tell more: the last fit would learn another model by these steps.
+    """
+    t = seen.kept.triples(seen.base.max_step)
+    curved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / seen.kept.balance
+    return NOISE_OF_R * precision(seen.kept) > DROWNED * float(curved.square().mean().sqrt())
 
 
 def _spread(seen: Look) -> float:

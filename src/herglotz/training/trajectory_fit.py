@@ -56,6 +56,10 @@ class TrajectoryFit:
         """Scale of the residuals, in units of q: their RMS, that of their bulk where the loss is robust."""
         return scale_of(self.misfit) if self.problem.freedom else float(self.misfit.square().mean().sqrt())
 
+    def follows(self, sigma: float) -> bool:
+        """Whether it misses the data by no more than twice σ."""
+        return self.noise <= LOST * sigma
+
     def loses(self, plain: TrajectoryFit) -> bool:
         """Whether it has lost data that least squares follow: what lies far from both alone is an outlier."""
         own, its = (float(fit.misfit.square().mean().sqrt()) for fit in (self, plain))
@@ -184,7 +188,7 @@ class SegmentStages:
     def at_once(
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
     ) -> TrajectoryFit | None:
-        """Whole trajectories from parameters that are known; None where that misses far more than σ.
+        """Whole trajectories from parameters that are known; None where no path is found.
 
         The states alone are fitted first: together with them, parameters would make up for poor starts.
         """
@@ -194,7 +198,7 @@ class SegmentStages:
         near = not self.model.capabilities.sticking  # its kinks leave Newton's steps no descent
         found = None if before is None else self.fit(self.lengths[-1], sigma, freedom, before, near=near)
         self.patient = True
-        return None if found is None or found.noise > LOST * sigma else found
+        return found
 
     def whole(self, first: TrajectoryFit, sigma: float) -> TrajectoryFit | None:
         """Whole trajectories at once, from parameters that are known well; None where that misses far more than σ."""
@@ -240,14 +244,15 @@ def fit_trajectories(
     wins. A model that is `known` from an earlier fit needs no growing: whole trajectories follow the shortest segments.
     The result is from the longest segments that could be fitted; None if the model cannot follow even the shortest.
     """
-    if model.potential.network is None:
-        return _without_prior(task, model, sigma, known=known)
-    stages, first = _wide_enough(task, model, sigma)
-    if first is None:
+    if model.potential.network is None:  # there is no strength of a prior to choose
+        departure = task.config.departures[0]
+        task = replace(task, config=replace(task.config, departures=(departure,)))
+        _, last = _longest(task, model, sigma, known=known)
+        return None if last is None else Chosen(last, departure, {departure: last.held_out_errors()})
+    stages, last = _longest(task, model, sigma, known=known)
+    if last is None:
         return None
     departures = stages.task.config.departures
-    first = stages.robust_or_not(first, known=known)
-    last = (stages.whole(first, sigma) if known else None) or stages.grow(first, sigma)
     previous, noise = last, last.noise
     stages.hurried = task.hurried and not stages.many  # strengths are compared by fits that have ended
 
@@ -270,25 +275,29 @@ def fit_trajectories(
     return found or Chosen(last, departures[0], {})
 
 
-def _without_prior(task: Task, model: ContactLagrangian, sigma: float, *, known: bool) -> Chosen[TrajectoryFit] | None:
-    """The fit of a model without a network: there is no strength of its prior to choose."""
-    departure = task.config.departures[0]
-    task = replace(task, config=replace(task.config, departures=(departure,)))
+def _longest(
+    task: Task, model: ContactLagrangian, sigma: float, *, known: bool
+) -> tuple[SegmentStages, TrajectoryFit | None]:
+    """The fit to segments that are as long as the model follows, by the loss that the data call for, with its stages.
 
-    def chosen(last: TrajectoryFit) -> Chosen[TrajectoryFit]:
-        return Chosen(last, departure, {departure: last.held_out_errors()})
-
-    plain = None
+    Of a model that is known whole trajectories by least squares are first. A heavy-tailed loss replaces them where it
+    lets no data go that they follow: the tails may be those of what the model misses.
+    """
+    plain, known_stages = None, SegmentStages(task, model)
     if known and task.config.robust != "on":
-        plain = SegmentStages(task, model).at_once(max(sigma, FLOOR * task.size))
-        if plain is not None and (task.config.robust == "off" or not heavy_tailed(plain.misfit)):
-            return chosen(plain)
+        known_to = max(sigma, FLOOR * task.size)
+        plain = known_stages.at_once(known_to)
+        tails = plain is not None and task.config.robust != "off" and heavy_tailed(plain.misfit)
+        if plain is not None and plain.follows(known_to) and not tails:
+            return known_stages, plain
     stages, first = _wide_enough(task, model, sigma)
     if first is None:
-        return None if plain is None else chosen(plain)
+        return known_stages, plain
     first = stages.robust_or_not(first, known=known)
-    last = stages.whole(first, sigma if known else 0.0) or stages.grow(first, sigma)
-    return chosen(last if plain is None or not last.loses(plain) else plain)
+    at_once = known or model.potential.network is None
+    last = stages.whole(first, sigma if known else 0.0) if at_once else None
+    last = last or stages.grow(first, sigma)
+    return (stages, last) if plain is None or not last.loses(plain) else (known_stages, plain)
 
 
 def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[SegmentStages, TrajectoryFit | None]:

@@ -1,5 +1,6 @@
 """The plan of a fit: chosen with reasons, stored, followed again, drawn in the docs."""
 
+import importlib
 import json
 from dataclasses import replace
 from functools import cache
@@ -20,6 +21,7 @@ from herglotz.training.plan import DECISIONS, WORDS
 from herglotz.training.stages import Stages
 
 DOCS = Path(__file__).resolve().parents[3] / "docs" / "trajectory.md"
+fit_module = importlib.import_module("herglotz.training.fit")
 QUICK = FitConfig(iterations=15, departures=(2e-3,))
 
 
@@ -106,6 +108,30 @@ def test_a_plan_overrules_the_choice():
     run = fit(pendulum(), QUICK, plan=plan, progress=False)
     assert run.metrics["objective"] == "trajectory"
     assert run.metrics["plan"]["objective"] == "trajectory"
+
+
+def test_what_a_trial_decided_holds_for_the_fit(monkeypatch):
+    # fails if strengths of the prior are compared again where the trial of networks has chosen one, or if an objective
+    # that was named is looked for
+    found, config = seen(0.01)
+    assert found.found is not None
+    found = replace(found, found=found.found._replace(doubt=True))
+    decided = replace(choose(found, config), departures=(6e-3,))
+    monkeypatch.setattr(fit_module, "look", lambda *_: found)
+    monkeypatch.setattr(fit_module, "held_out_winner", lambda *_: (found, decided))
+    fitted = {}
+
+    def objective(task, *_):
+        fitted["departures"] = task.config.departures
+        raise InterruptedError
+
+    monkeypatch.setitem(fit_module.OBJECTIVES, decided.objective, objective)
+    with pytest.raises(InterruptedError):
+        fit(pendulum(0.01), config)
+    assert fitted["departures"] == (6e-3,)
+    named = replace(config, objective="trajectory")
+    other = replace(found, found=None, settings=config)
+    assert choose_objective(other, named)[0] == "trajectory"
 
 
 def test_a_wrong_plan_is_refused_in_words():
