@@ -62,6 +62,13 @@ MODELS = {
         2, features=("cos(q1 - q2) v1 v2", "q2 v1", "q2^3"), level="forced", coupled=True
     ),
     "drag": config(1, (False,), level="forced", drag=("|v1| v1", "q1^2 v1", "v1^3")),
+    "dry friction of position": config(
+        2,
+        (False, True),
+        level="forced",
+        coulomb=True,
+        drag=("q1^2 sgn(v1)", "|v1| v1", "cos(q2) sgn(v1)", "sin(q2) sgn(v2)"),
+    ),
     "dampers and air": config(
         2, (False, False), level="forced", drag=("(v1 - v2)", "|v1 - v2| (v1 - v2)", "q2^2 (v2 - v1)^3", "|v| v")
     ),

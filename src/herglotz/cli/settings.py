@@ -125,7 +125,8 @@ MODEL = (
             field="terms", action="append", metavar="NAME"),
     setting("--coupled", "friction of differences of speeds: hinges (forced)", action="store_true"),
     setting("--drag", "a friction force beside the viscous one, its coefficient learned: '|v1| v1', 'q1^2 v1', '(v1 - "
-            "v2)' of a damper between two, '|v| v' of air, or a constant one, 'load 1' (forced); may be given again",
+            "v2)' of a damper between two, '|v| v' of air, a constant one, 'load 1', or dry friction by position, "
+            "'q1^2 sgn(v1)', 'cos(q1) sgn(v1)' (forced); may be given again",
             action="append", metavar="TEXT"),
     setting("--diagonal", "a mass for each coordinate, none between two: bodies", action="store_true"),
     setting("--absent", "a number of the model that is 0 and not learned, 'potential.tilt[0]'; may be given again",

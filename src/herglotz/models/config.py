@@ -135,9 +135,9 @@ class ModelConfig:
     def _check_forces(self) -> None:
         forced, wanted = self.level == "forced", self.dof * self.inputs
         instead = f"set level='forced', not '{self.level}'"
-        for text in self.drag if forced else ():
-            parse_drag(text, self.angles)
+        dry = [text for text in (self.drag if forced else ()) if parse_drag(text, self.angles).dry]
         refuse({
+            f"drag '{', '.join(dry)}' is of dry friction; set coulomb=True": dry and not self.coulomb,
             f"coulomb and inputs are forces; {instead}":
                 not forced and (self.coulomb or self.inputs or self.input_map),
             "sticking is of dry friction; set coulomb=True": self.sticking and not self.coulomb,

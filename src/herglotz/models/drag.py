@@ -6,7 +6,10 @@ a joint's own, or the one of two joints from one another, which a damper between
     |v1| v1        v2^3        q1^2 v1        q1^2 |v1| v1        (v1 - v2)        |v1 - v2| (v1 - v2)        load 2
 
 `load 2` is a constant force on coordinate 2: on an angle no potential has it. `|v| v` brakes a body that moves in a
-plane or in space as air does: |v| is the length of the whole velocity.
+plane or in space as air does: |v| is the length of the whole velocity. Dry friction changes with the position, or with
+the load that a position puts on a bearing, by
+
+    q1^2 sgn(v1)        cos(q1) sgn(v1)        sin(q2) sgn(v1)
 """
 
 from __future__ import annotations
@@ -28,12 +31,16 @@ _TEXT = re.compile(
     rf"(?:q(?P<q>\d+)(?:\^(?P<a>\d+))? )?(?:\|(?P<size>v\d+|{_APART})\| )?(?:(?P<v>v\d+)|\((?P<apart>{_APART})\))"
     r"(?:\^(?P<c>\d+))?|load (?P<load>\d+)"
 )
+_DRY = re.compile(r"(?:(?P<wave>cos|sin)\(q(?P<angle>\d+)\)|q(?P<q>\d+)(?:\^(?P<a>\d+))?) sgn\(v(?P<v>\d+)\)")
 AIR = "|v| v"
 
 
 @dataclass(frozen=True)
 class DragFeature:
-    """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`."""
+    """q_at^a |v|^b v^c of the speed v = v_on, or v_on − v_of, which brakes the coordinate `on`, and drives `of`.
+
+    If `dry` q_at^a sgn(v); a `wave`, cos or sin, of q_at stands in the place of its power.
+    """
 
     on: int
     at: int
@@ -42,6 +49,14 @@ class DragFeature:
     c: int  # 1 or more; 0: a constant force
     of: int | None = None
     air: bool = False  # |v| v of the whole velocity, on every coordinate
+    dry: bool = False
+    wave: str = ""
+
+    def position(self, q: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the factor that depends on q_at, and its slope."""
+        if self.wave:
+            return (q.cos(), -q.sin()) if self.wave == "cos" else (q.sin(), q.cos())
+        return _power(q, self.a), _power(q, self.a - 1) * self.a
 
 
 def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
@@ -53,9 +68,13 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, 0, 1, 1, air=True)
+    if (dry := _DRY.fullmatch(plain)) is not None:
+        return _parse_dry(text, dry.groupdict(), angles)
     match = _TEXT.fullmatch(plain)
     if match is None:
-        raise InputError(f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v' or 'load 1'")
+        raise InputError(
+            f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'load 1' or 'cos(q1) sgn(v1)'"
+        )
     found = match.groupdict()
     speed = found["v"] or found["apart"]
     on, *of = (int(digits) for digits in re.findall(r"\d+", speed or found["load"]))
@@ -71,12 +90,26 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
     return DragFeature(on - 1, at - 1, a, int(found["size"] is not None), c, of[0] - 1 if of else None)
 
 
+def _parse_dry(text: str, found: dict[str, str | None], angles: Sequence[bool]) -> DragFeature:
+    """Dry friction of a joint by the position of a coordinate."""
+    on, at, a = (int(found[name] or 1) for name in ("v", "angle" if found["wave"] else "q", "a"))
+    n = len(angles)
+    refuse({
+        f"drag '{text}': the coordinates are numbered 1 … {n}": not all(1 <= i <= n for i in (on, at)),
+        f"drag '{text}': a power of an angle is not periodic; write 'cos(q{at}) sgn(v{on})'":
+            not found["wave"] and any(angles[at - 1 : at]),
+        f"drag '{text}': powers are whole numbers from 1 to {HIGHEST}": not 1 <= a <= HIGHEST,
+    })  # fmt: skip
+    return DragFeature(on - 1, at - 1, 0 if found["wave"] else a, 0, 0, dry=True, wave=found["wave"] or "")
+
+
 class Drag(nn.Module):
     """f = −Σ_g θ_g e q̄_j^a |v|^b v^c of the speeds v = e·Δ/h, with F⁻ = c (h/2) f and F⁺ = (h/2) f.
 
     e has a 1 at a joint, and a −1 at another where v is the speed of the two from one another; drag through air is
     f = −θ |v| v of the whole velocity. The coefficients θ are plain parameters that start at 0; van der Pol's
-    oscillator has viscous friction of negative sign and one of q² v.
+    oscillator has viscous friction of negative sign and one of q² v. What dry friction has beside its constant force is
+    −θ q̄_j^a tanh(v/v_s) with the width v_s of `Friction`; of set-valued friction it is `held`, at q0.
     """
 
     def __init__(self, features: Sequence[DragFeature], dof: int):
@@ -85,29 +118,46 @@ class Drag(nn.Module):
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
         eye = torch.eye(dof + 1, dof, dtype=torch.float64)  # its last row is 0: no other joint
         on, of = [f.on for f in features], [f.on if f.air else dof if f.of is None else f.of for f in features]
-        self.air = [g for g, f in enumerate(features) if f.air]
+        self.air, self.dry = ([g for g, f in enumerate(features) if getattr(f, kind)] for kind in ("air", "dry"))
         self.register_buffer("on", eye[on] - eye[of], persistent=False)
         self.register_buffer("at", eye[[f.at for f in features]], persistent=False)
         self.on: Tensor
         self.at: Tensor
 
-    def terms(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return φ_g and its slopes by q̄_j and v, each (..., G)."""
+    def held(self, q0: Tensor) -> tuple[Tensor, Tensor] | None:
+        """Return what these terms add to the force of set-valued friction, (..., n), and ∂/∂q0, (..., n, n)."""
+        if not self.dry:
+            return None
+        at, x = self.at[self.dry], q0 @ self.at[self.dry].T
+        columns = [self.features[g].position(x[..., k]) for k, g in enumerate(self.dry)]
+        value, slope = (torch.stack(y, -1) * self.coefficient[self.dry] for y in zip(*columns, strict=True))
+        return value @ self.on[self.dry], self.on[self.dry].T @ (slope[..., None] * at)
+
+    def terms(self, q: Tensor, v: Tensor, widths: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return φ_g and its slopes by q̄_j and v, each (..., G); dry terms have these `widths` (n,), or are 0."""
         x, y = q @ self.at.T, v @ self.on.T
         columns = []
         for g, f in enumerate(self.features):
             at, speed = x[..., g], y[..., g]
-            own = speed.abs() if f.b else torch.ones_like(speed)
-            position, slope = _power(at, f.a), _power(at, f.a - 1) * f.a
-            bend = own * _power(speed, f.c - 1) * (f.b + f.c)
-            grip = own * _power(speed, f.c)
+            position, slope = f.position(at)
+            if f.dry:
+                rate = 0.0 if widths is None else 1 / widths[f.on]
+                grip = (speed * rate).tanh()
+                bend = (1.0 - grip * grip) * rate
+            else:
+                own = speed.abs() if f.b else torch.ones_like(speed)
+                bend = own * _power(speed, f.c - 1) * (f.b + f.c)
+                grip = own * _power(speed, f.c)
             columns.append((position * grip, slope * grip, position * bend))
         value, by_q, by_v = (torch.stack(x, -1) for x in zip(*columns, strict=True))
         return value, by_q, by_v
 
-    def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces) -> Forces:
-        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them."""
-        value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v))
+    def forward(self, q: Tensor, v: Tensor, c: Tensor, h: Tensor, own: Forces, widths: Tensor | None = None) -> Forces:
+        """Return `own` plus these forces at the mean position q and the velocity v, with derivatives if it has them.
+
+        `widths` are those of smooth dry friction, (n,).
+        """
+        value, by_q, by_v = (x * self.coefficient for x in self.terms(q, v, widths))
         slope, by_position = (-(self.on.T @ (x[..., None] * by)) for x, by in ((by_v, self.on), (by_q, self.at)))
         f = -value @ self.on
         if self.air:

@@ -50,14 +50,15 @@ class Friction(nn.Module):
             self.input_map = nn.Parameter(zeros(n, m))
         self.input_zero = nn.Parameter(zeros(m)) if config.input_zero else None
 
-    def grip(self, v: Tensor) -> tuple[Tensor, Tensor]:
+    def grip(self, v: Tensor, more: Tensor | float = 0.0) -> tuple[Tensor, Tensor]:
         """Set-valued friction's |f| = τ⁺ + ε⁺ e^{−(v/v_st)²} at the velocity v, and its slope, (..., n) each.
 
-        The positive parts τ⁺ and ε⁺ of τ and ε: friction that pushes would create energy.
+        The positive parts τ⁺ and ε⁺ of τ (and what it has `more` at a position) and ε: friction that pushes would
+        create energy.
         """
         x = v / (self.sharpest + self.log_stribeck.exp())
         bump = self.breakaway.relu() * (-(x * x)).exp()
-        return self.coulomb.relu() + bump, -2 * bump * x / (self.sharpest + self.log_stribeck.exp())
+        return (self.coulomb + more).relu() + bump, -2 * bump * x / (self.sharpest + self.log_stribeck.exp())
 
     @property
     def widths(self) -> tuple[Tensor, Tensor]:
@@ -91,14 +92,20 @@ class Friction(nn.Module):
             slope = slope - grip * (1.0 - t * t) * rate + 2 * bump * x / stribeck * t
         return f if u is None else f + self.applied(u), slope
 
-    def forward(self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None) -> Forces:
-        """Return F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2."""
+    def forward(
+        self, v: Tensor, c: Tensor, h: Tensor, order: int, u: Tensor | None = None,
+        more: tuple[Tensor, Tensor] | None = None,
+    ) -> Forces:  # fmt: skip
+        """Return F⁻ and F⁺ at the velocity v (..., n), with derivatives at order 2.
+
+        `more` is what set-valued friction has beside τ at q0, (..., n), and its slope there, (..., n, n).
+        """
         f = self.force(v, u)
         before, after = (c * h / 2)[..., None], (h / 2)[..., None]
         minus, plus = before * f.value, after * f.value
         held, grip, grip_slope = None, None, torch.zeros_like(v)
         if self.dry and self.sticking:
-            grip, grip_slope = self.grip(v)
+            grip, grip_slope = self.grip(v, 0.0 if more is None else more[0])
             grip = (c * h)[..., None] * grip
             minus, held = minus - grip * v.sign(), torch.where(v.abs() > 0, 0.0, grip)
             grip_slope = grip_slope * v.sign()
@@ -106,9 +113,13 @@ class Friction(nn.Module):
             return Forces(minus, plus, held=held, grip=grip)
         slope = f.gradient[0]  # ∂f/∂q1 = slope / h
         minus_2 = torch.diag_embed((c / 2)[..., None] * slope - c[..., None] * grip_slope)
+        minus_1 = -minus_2
+        if more is not None and grip is not None:
+            by_place = torch.where((self.coulomb + more[0] > 0)[..., None], more[1], 0.0)
+            minus_1 = minus_1 - (c * h)[..., None, None] * v.sign()[..., None] * by_place
         plus_2 = torch.diag_embed(slope / 2)
         zero = torch.zeros_like(minus)
-        return Forces(minus, plus, -minus_2, minus_2, zero, -plus_2, plus_2, zero, held, grip)
+        return Forces(minus, plus, minus_1, minus_2, zero, -plus_2, plus_2, zero, held, grip)
 
     def applied(self, u: Tensor) -> Tensor:
         """Return G (u − u₀), (..., n)."""

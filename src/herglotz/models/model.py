@@ -278,10 +278,15 @@ class ContactLagrangian(nn.Module):
             return None
         assert isinstance(self.damping, LinearDamping)
         h, v, c = phase.h, phase.move / phase.h[..., None], self.damping(phase).exp()
-        forces = self.friction(v, c, h, phase.order, u)
+        smooth = self.friction.dry and not self.friction.sticking
+        more = None if smooth or self.drag is None else self.drag.held(phase.q0)
+        forces = self.friction(v, c, h, phase.order, u, more)
         for term in self.forces_between:
             forces = with_force(forces, *term.force(v), c, h)
-        return forces if self.drag is None else self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces)
+        if self.drag is None:
+            return forces
+        widths = self.friction.widths[0] if smooth else None
+        return self.drag((phase.q0 + phase.q1) / 2, v, c, h, forces, widths)
 
 
 def _damping(config: ModelConfig, generator: torch.Generator) -> LinearDamping | AffineDamping | None:

@@ -125,7 +125,8 @@ class FitConfig:
         learned depends on where these coordinates are. `run.symmetries()` finds them (`herglotz.models.translations`).
     drag
         Friction forces beside the viscous one, each with a learned coefficient: "|v1| v1", "q1^2 v1", "|v| v" of a body
-        in air, "(v1 - v2)" of a damper between two coordinates, "load 1" (forced level). See `herglotz.models.drag`.
+        in air, "(v1 - v2)" of a damper between two coordinates, "load 1", and of dry friction that changes with the
+        position "cos(q1) sgn(v1)" (forced level). See `herglotz.models.drag`.
     order
         4: a rule of order 4 from the features themselves, without networks. The parameters found are then those of the
         motion, and hold at other steps.
@@ -243,7 +244,7 @@ class FitConfig:
         if self.level == "auto":
             level = "forced" if driven or self.has_forces() else "linear"
             config = replace(self, level=level, coulomb=self.coulomb or driven)
-        if self.sticking:
+        if self.sticking or any("sgn(" in text for text in self.drag):
             config = replace(config, coulomb=True)
         inputs, count = data.u.shape[1] if driven and data.u is not None else 0, len(self.input_map)
         refuse({

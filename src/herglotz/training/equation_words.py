@@ -20,6 +20,8 @@ def drag_in_words(f: DragFeature, i: int, names: Sequence[str]) -> str:
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
     position, size = [raised(names[f.at], f.a)] if f.a else [], [f"|{speed.strip('()')}|"] if f.b else []
+    if f.dry:
+        return f"{f'{f.wave}({names[f.at]})' if f.wave else position[0]} sgn({speed})"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 

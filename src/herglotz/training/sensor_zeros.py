@@ -238,7 +238,8 @@ def _turned(f: Product) -> bool:
 
 def _pushes_on(f: DragFeature) -> bool:
     """Whether a force q^a |v|^b v^c keeps its direction where q and v change their signs: it is no mirror image."""
-    return (f.a + f.c) % 2 == 0
+    odd = f.a + (f.wave == "sin")
+    return (odd + (1 if f.dry else f.c)) % 2 == 0
 
 
 def _rms(x: Tensor) -> float:

@@ -66,6 +66,10 @@ TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "coupled": (2, {"level": "forced", "coupled": True, "coulomb": True}),
     "drag": (3, {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
+    "sticking by position": (
+        2,
+        {"level": "forced", "coulomb": True, "sticking": True, "drag": ("q2^2 sgn(v2)", "cos(q1) sgn(v1)", "v2^3")},
+    ),
     "sticking, two joints": (2, {"level": "forced", "coulomb": True, "sticking": True, "coupled": True}),
 }
 
