@@ -75,6 +75,9 @@ MODELS = {
     "drag of position, order four": config(
         2, (False, True), level="forced", drag=("q1^2 |v2| v2", "v1^2"), order=4, potential_width=0, coulomb=True
     ),
+    "bent springs": config(
+        2, (False, False), level="affine", features=("|q1| q1", "|q2|^3 - 0.5 |q1| q1^2", "q2^3"), potential_width=0
+    ),
     "features of r, known": config(
         3, (False,) * 3, features=("r^-1", "central 2"), known=("0.5 q2^2",), level="affine"
     ),

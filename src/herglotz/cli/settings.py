@@ -168,8 +168,8 @@ AS_TOLD = (
 EXPERT = (
     "what is known (expert)",
     setting("--feature", "what L = K - V may hold beside its terms, its coefficient learned: 'cos(q1 - q2) v1 v2' (of "
-            "K), 'cos(2q1)' (of V), or a list by name (chain, sites, central, pendulums, harmonics, revolute, "
-            "lengths); may be given again", field="features", action="append", metavar="TEXT"),
+            "K), 'cos(2q1)' or '|q1| q1' (of V), or a list by name (chain, sites, central, pendulums, harmonics, "
+            "revolute, lengths); may be given again", field="features", action="append", metavar="TEXT"),
     setting("--known", "what is known of L = K - V, with its numbers (the first mass is 1): --known='-9.81 cos(q1)' is "
             "a pendulum's V: no velocity is in it. May be given again", action="append", metavar="TEXT"),
     setting("--frequency", "angular frequency, in rad per unit of time, of a periodic force whose amplitude and phase "

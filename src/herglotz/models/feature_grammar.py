@@ -3,11 +3,13 @@
     feature = [sign] product { sign product }
     product = factor { ["*"] factor }             one function of the position at most
     factor  = number | ("cos" | "sin") "(" form ")" | base [ "^" integer ]
-    base    = "r" | "q" index | "v" index | "(" form ")"
+    base    = "r" | "q" index | "v" index | "(" form ")" | size
+    size    = "|" "q" index "|"                   |q1|^3, and before a power of the same coordinate: |q1| q1^2
     form    = [sign] addend { sign addend }
     addend  = [ number ["*"] ] "q" index
 
-Only r takes negative powers. Blanks separate, and mean nothing else.
+Only r takes negative powers; odd powers of |q1| stand for sgn(q1) q1^k, of k from 2 on. Blanks separate, and mean
+nothing else.
 """
 
 from __future__ import annotations
@@ -22,17 +24,17 @@ from herglotz.errors import InputError
 HIGHEST_POWER = 16  # of data that vary by a factor of 10, such a power varies by 1e16: all the digits of float64
 _TOKEN = re.compile(
     r"\s*(?:(?P<number>(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)|(?P<coordinate>[qv]\d+)|(?P<word>cos|sin|r(?![a-z]))"
-    r"|(?P<mark>[-+*^()]))"
+    r"|(?P<mark>[-+*^()|]))"
 )
-HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), (q1 - q2)^2, q1^3, r^-1"
+HOW = "write sums of products of numbers, v1, and one of cos(q1 - q2), sin(q1), (q1 - q2)^2, q1^3, |q1| q1, r^-1"
 
 
 @dataclass(frozen=True)
 class Product:
-    """factor · f(w·q) · ∏ v, with f = cos, sin, a power of the linear form, or a power of r = |q| (no w)."""
+    """factor · f(w·q) · ∏ v: f = cos, sin, a power of the linear form x, sgn(x) times one, or one of r = |q| (no w)."""
 
     factor: float
-    function: str  # "cos", "sin", "power" or "radius"
+    function: str  # "cos", "sin", "power", "signed" or "radius"
     form: tuple[float, ...] = ()  # w, n numbers
     power: int = 0
     velocities: tuple[int, ...] = ()  # coordinates of the factors v, repeated for powers
@@ -83,7 +85,11 @@ class _Reader:
         functions: list[tuple[str, tuple[float, ...], int]] = []
         velocities: list[int] = []
         numbers = count = 0
-        while count == 0 or self._take("*") or self._next()[0] in ("number", "coordinate", "word") or self._is("("):
+        more = (("mark", "("), ("mark", "|"))
+        while (
+            count == 0 or self._take("*") or self._next()[0] in ("number", "coordinate", "word")
+            or self._next()[:2] in more
+        ):  # fmt: skip
             kind, token, _ = self._next()
             if kind == "number":
                 numbers += 1
@@ -125,10 +131,31 @@ class _Reader:
             return "radius", (), self._power(negative=True)
         if token == "(":
             return "power", self._form(), self._power()
+        if token == "|":
+            return self._size()
         if kind == "coordinate":
             i = self._coordinate()
             return "power", tuple(float(i == j) for j in range(self.n)), self._power()
         raise self._unread(where)
+
+    def _size(self) -> tuple[str, tuple[float, ...], int]:
+        """A power of |q_i|, times one of q_i where that follows: of an even power of |q_i| the size has no part."""
+        begin = self._next()[2]
+        self.at += 1
+        if self._next()[0] != "coordinate" or self._next()[1][0] != "q":
+            raise self._unread(begin)
+        i = self._coordinate()
+        if not self._take("|"):
+            raise self._unread(begin)
+        own = power = self._power()
+        if self._next()[:2] == ("coordinate", f"q{i + 1}"):
+            self.at += 1
+            power += self._power()
+        if power > HIGHEST_POWER:
+            raise self._error(f"a power must be at most {HIGHEST_POWER}, got {power}")
+        if power == 1:
+            raise self._error(f"the force of |q{i + 1}| jumps at 0; write |q{i + 1}| q{i + 1} or |q{i + 1}|^3")
+        return ("signed" if own % 2 else "power"), tuple(float(i == j) for j in range(self.n)), power
 
     def _form(self) -> tuple[float, ...]:
         """The n numbers w of a linear form in parentheses."""

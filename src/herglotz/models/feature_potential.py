@@ -12,7 +12,7 @@ from herglotz.models.config import ModelConfig
 from herglotz.models.features import Feature, Product, expand, parse
 from herglotz.models.jet import Jet, pairs
 
-RIDGES = ("cos", "sin", "power")  # functions of a linear form w·q; "radius" is a function of r²
+RIDGES = ("cos", "sin", "power", "signed")  # functions of a linear form w·q; "radius" is a function of r²
 
 
 class Combination(nn.Module):
@@ -25,7 +25,7 @@ class Combination(nn.Module):
         every.sort(key=lambda pair: names.index(pair[0].function))  # sorts products of the same function together
         self.products: list[Product] = [p for p, _ in every]
         self.counts = [sum(p.function == f for p in self.products) for f in names]
-        self.ridges = sum(self.counts[:3])
+        self.ridges = sum(self.counts[: len(RIDGES)])
         self.dof, self.learned = dof, len(features)
         self.highest = max((p.power for p in self.products[: self.ridges]), default=0)
         self.coefficient = nn.Parameter(torch.zeros(len(features), dtype=torch.float64))
@@ -55,14 +55,17 @@ class Combination(nn.Module):
 
     def ridge(self, x: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of the functions of w·q, at x = w·q, (..., ridges)."""
-        functions = (lambda y: _wave(y, k), lambda y: _wave(y, k + 3), lambda y: self._powers(y, k))
-        parts = zip(functions, x.split(self.counts[:3], -1), strict=True)
+        functions = (
+            lambda y: _wave(y, k), lambda y: _wave(y, k + 3), lambda y: self._powers(y, k),
+            lambda y: y.sign() * self._powers(y, k, "signed"),
+        )  # fmt: skip
+        parts = zip(functions, x.split(self.counts[: len(RIDGES)], -1), strict=True)
         found = [function(part) for function, part in parts if part.shape[-1]]
         return found[0] if len(found) == 1 else torch.cat(found or [x], -1)
 
-    def _powers(self, x: Tensor, k: int) -> Tensor:
-        """Return the k-th derivatives of the powers."""
-        exponent = self.power.split(self.counts)[2]
+    def _powers(self, x: Tensor, k: int, function: str = "power") -> Tensor:
+        """Return the k-th derivatives of the powers, or of those that have a sign."""
+        exponent = self.power.split(self.counts)[RIDGES.index(function)]
         rest, product = exponent - k, torch.ones_like(x)
         for j in range(self.highest - k):  # no pow: its forward-mode derivative takes the logarithm of negative numbers
             product = product * torch.where(rest > j, x, 1.0)
@@ -70,7 +73,7 @@ class Combination(nn.Module):
 
     def radial(self, square: Tensor, k: int) -> Tensor:
         """Return the k-th derivative of the functions of r², (..., number of radial functions)."""
-        exponent = self.power.split(self.counts)[3] / 2
+        exponent = self.power.split(self.counts)[-1] / 2
         return _front(exponent, k) * square[..., None].pow(exponent - k)
 
 

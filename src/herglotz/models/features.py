@@ -5,7 +5,8 @@ each of one function of the position and any number of velocities:
 
     cos(q1 - q2) v1 v2        (q2 - q1)^4 + (q3 - q2)^4        0.5 r^-1        q1 v2 - q2 v1
 
-with cos, sin and whole powers of a linear form of the q, and whole powers of r = |q|. One coefficient multiplies the
+with cos, sin and whole powers of a linear form of the q, whole powers of r = |q|, and |q1| q1 or |q1|^3 of a length:
+the force of the first is |q1|, that of a spring which is stiffer on one side. One coefficient multiplies the
 whole sum, which is how parameters are shared. Short names stand for lists of features (`LIBRARIES`).
 """
 

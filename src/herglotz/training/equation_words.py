@@ -33,6 +33,8 @@ def slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
     if p.function == "power":
         inner = form if sum(1 for x in p.form if x) == 1 else f"({form})"
         return (raised(inner, p.power - 1) if p.power > 1 else ""), p.factor * p.power * w, 2 - p.power
+    if p.function == "signed":
+        return f"|{form}| {raised(form, p.power - 2)}".strip(), p.factor * p.power * w, 2 - p.power
     return (f"sin({form})", -p.factor * w, 1) if p.function == "cos" else (f"cos({form})", p.factor * w, 1)
 
 

@@ -29,6 +29,7 @@ from herglotz.training.named_terms import (
     NamedTerms,
     candidates,
     loads,
+    offered,
     places,
     settings_of,
     shapes_of_dry,
@@ -179,7 +180,7 @@ def _with_absent_terms(
     """A model of named terms with all other candidates at 0, and where these stand; other models as they are."""
     c, data, parameters = task.config, task.data, ParameterVector(model)
     own = NamedTerms(c.features, c.drag, c.coulomb)
-    every = _offered(task, own, parameters)
+    every = _searched(task, own, parameters)
     if every is None or not set(own.names) <= set(every.names):
         return model, task.base, {}
     values = values_of(parameters, parameters.get(), c, data.angles)
@@ -192,14 +193,14 @@ def _with_absent_terms(
     return more, base, at | {name: [i] for i, name in enumerate(numbers.numbers) if name in c.absent}
 
 
-def _offered(task: Task, own: NamedTerms, parameters: ParameterVector) -> NamedTerms | None:
+def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> NamedTerms | None:
     """The candidates of a search for a model of these named terms alone; None where no search would give the model."""
     c, data = task.config, task.data
     told = any((c.known, c.terms, c.input_map, c.translations and not c.features))
     network = any(name.startswith(NETWORKS) for name in parameters.names)
     if network or told or c.objective != "trajectory" or c.level not in ("linear", "forced") or data.dof > MOST:
         return None
-    every = candidates(data, c.translations)
+    every = offered(data, candidates(data, c.translations), own, lacks=False)
     pushed = NamedTerms((), tuple(name for name in loads(data, one_way=True) if name in own.drag))
     return replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
 

@@ -18,6 +18,7 @@ from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.parameter_vector import ParameterVector
 
+SERIES = 3  # powers of a length beside its spring: more than the potential of an oscillator that is named has
 HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
 WAVES = 3  # highest harmonic of one angle
 BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
@@ -130,10 +131,19 @@ def distances(data: Trajectories) -> tuple[str, ...]:
     return tuple(name for name in lengths(data.angles) if name.startswith("r^")) if away else ()
 
 
+def kinks(data: Trajectories) -> tuple[str, ...]:
+    """Potentials of one length whose force bends at 0: |x| of a spring that is stiffer on one side, and x |x|."""
+    return () if data.dof > 1 or any(data.angles) else ("|q1| q1", "|q1|^3")
+
+
 def offered(data: Trajectories, every: NamedTerms, beside: NamedTerms, *, lacks: bool) -> NamedTerms:
-    """The candidates `every`, with distances where a model of the terms `beside` has one or `lacks` a force."""
-    of_r = distances(data) if every.springs else ()
-    return every.joined(NamedTerms(of_r)) if lacks or set(of_r) & set(beside.features) else every
+    """The candidates, with distances or kinks where a model of the terms `beside` has one or `lacks` a force.
+
+    Kinks also where it has so many powers of a length that they may be a series of something else.
+    """
+    more = (*distances(data), *kinks(data)) if every.springs else ()
+    series = bool(kinks(data)) and len(set(beside.features) - set(own_terms(data.angles))) >= SERIES
+    return every.joined(NamedTerms(more)) if lacks or series or set(more) & set(beside.features) else every
 
 
 def central(data: Trajectories, every: NamedTerms) -> list[NamedTerms]:

@@ -232,7 +232,8 @@ def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
 
 def _turned(f: Product) -> bool:
     """Whether a product of L changes its sign with q and v."""
-    changes = f.function == "sin" or (f.function == "power" and f.power % 2 == 1)
+    even = {"sin": False, "power": f.power % 2 == 0, "signed": f.power % 2 == 1}
+    changes = not even.get(f.function, True)
     return changes != (len(f.velocities) % 2 == 1)
 
 

@@ -1,6 +1,7 @@
 """Dry friction that depends on the position or the direction: the law, its derivative, and that a fit finds it."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ H = 0.05
 
 def body(drag, coefficients, *, coulomb=1.0, angle=False, sticking=True, inputs=0, rate=0.0):
     """A unit mass without a potential, and with this friction."""
-    model = ContactLagrangian(
+    model: Any = ContactLagrangian(
         ModelConfig(
             angles=(angle,), scale=(1.0,), speed=(1.0,), stiffness=(0.0,), tilt=(0.0,), rate=rate, level="forced",
             coulomb=True, sticking=sticking, drag=drag, inputs=inputs, input_map=(1.0,) * inputs, potential_width=0,
@@ -149,7 +150,7 @@ def test_a_fit_finds_friction_that_grows_to_the_ends():
     # fails if the coefficient has no slope in the fit, or the equation does not name it. At seeds 0 to 4 it was 1.02 to
     # 1.12 (the truth is 1; viscous friction and Stribeck's excess make up for it), the free run 0.9 to 1.2 of the noise
     t, q, u = recorded(0)
-    run = hz.fit(
+    run: Any = hz.fit(
         {"t[s]": t, "x[m]": q, "u": u}, level="forced", sticking=True, drag=("q1^2 sgn(v1)",),
         objective="trajectory", potential_width=0, progress=False,
     )  # fmt: skip
