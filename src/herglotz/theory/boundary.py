@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.errors import InputError
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
 from herglotz.mechanics.newton import find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
@@ -66,7 +65,6 @@ def boundary_value(
     *,
     h: Tensor | float,
     steps: int | None = None,
-    guess: Tensor | None = None,
     throw: bool = False,
 ) -> Curve:
     """The discrete curve from q_start to q_end on which s_N is stationary: R_1 = … = R_{N−1} = 0.
@@ -75,8 +73,6 @@ def boundary_value(
     ----------
     h, steps
         A scalar h with a count N, or (N,) or (..., N) steps.
-    guess
-        (..., N+1, n) a curve to start from, of which the interior is used; default the straight line.
     throw
         Raise `StepError` if a sample fails.
 
@@ -99,10 +95,8 @@ def boundary_value(
     batch = torch.broadcast_shapes(q_start.shape[:-1], q_end.shape[:-1], s0.shape, h_all.shape[:-1])
     first, last = (q.detach().expand(*batch, q.shape[-1]) for q in (q_start, q_end))
     s = s0.detach().expand(batch)
-    line = straight_line(first, last, h_all) if guess is None else guess
-    if line.shape != (*batch, h_all.shape[-1] + 1, q_end.shape[-1]):
-        raise InputError(f"guess needs shape (..., N+1, n) with N = {h_all.shape[-1]}, got {tuple(line.shape)}")
-    return checked(_critical(L_d, line[..., 1:-1, :], [first, last], s, h_all, beyond=True), throw)
+    interior = straight_line(first, last, h_all)[..., 1:-1, :]
+    return checked(_critical(L_d, interior, [first, last], s, h_all, beyond=True), throw)
 
 
 def family_value(
@@ -110,11 +104,13 @@ def family_value(
     S: Function,
     y: Tensor,  # (..., n) q_N
     h: Tensor,  # (N,) or (..., N)
-    guess: Tensor,  # (..., N, n) q_0 … q_{N−1}
     beyond: bool,
 ) -> Curve:
-    """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0)."""
-    return _critical(L_d, guess, [y], S, h, beyond)
+    """The curve ending in y on which S(q_0) + Σ L_d is stationary in q_0, too: p_0 = dS(q_0), s_0 = S(q_0).
+
+    Newton's iteration starts with all points q_0 … q_{N−1} at y.
+    """
+    return _critical(L_d, y[..., None, :].expand(*y.shape[:-1], h.shape[-1], y.shape[-1]), [y], S, h, beyond)
 
 
 def checked(curve: Curve, throw: bool) -> Curve:

@@ -32,7 +32,6 @@ def hopf_lax(
     *,
     h: Tensor | float,
     steps: int | None = 1,
-    guess: Tensor | None = None,
     beyond: bool = False,
     throw: bool = False,
 ) -> HopfLax:
@@ -51,8 +50,6 @@ def hopf_lax(
         S^k: a callable on (..., n), e.g. `Quadratic` or `PointSource`. Values are values of s.
     h, steps
         A scalar h with a count N, or (N,) or (..., N) steps.
-    guess
-        (..., N, n) the points x = q_k … q_{k+N−1} to start from, which picks the branch; default y.
     beyond
         Accept a solution that has crossed a caustic, where S is not a function on all of Q any more.
     throw
@@ -69,8 +66,7 @@ def hopf_lax(
     sizes = torch.as_tensor(h, dtype=y.dtype, device=y.device)
     sizes = step_sizes(sizes, steps if sizes.ndim == 0 else None)
     y = y.detach().expand(*torch.broadcast_shapes(y.shape[:-1], sizes.shape[:-1]), y.shape[-1])
-    points = y[..., None, :].expand(*y.shape[:-1], sizes.shape[-1], y.shape[-1]) if guess is None else guess
-    curve = checked(family_value(L_d, S, y, sizes, points, beyond), throw)
+    curve = checked(family_value(L_d, S, y, sizes, beyond), throw)
     slope = torch.where((curve.status == Status.CONVERGED)[..., None, None], curve.opening.slope, torch.nan)
     return HopfLax(curve.s[..., -1], curve.p[..., -1, :], slope, curve.q[..., 0, :], curve.status, curve)
 

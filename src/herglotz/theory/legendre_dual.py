@@ -29,9 +29,8 @@ def fiber_inverse(
     q: Tensor,  # (..., n)
     y: Tensor,  # (..., n)
     s: Tensor,  # (...)
-    guess: Tensor | None = None,  # (..., n); default y
 ) -> Tensor:
-    """The x with f_x(q, x, s) = y, by Newton: the velocity of a momentum (f = L), the momentum of a velocity (f = H).
+    """The x with f_x(q, x, s) = y, by Newton from y: v of a momentum (f = L), p of a velocity (f = H).
 
     Differentiable once with respect to q, y and s, by the implicit-function theorem. Raise InputError if a sample does
     not converge; the message names it.
@@ -42,12 +41,12 @@ def fiber_inverse(
         P = derivatives(f, q, x, s, order=2)
         return P.D2 - y, P.D22
 
-    root = find_root(equation, y if guess is None else guess)
+    root = find_root(equation, y)
     if not bool(root.converged.all()):
         sample = tuple(int(i) for i in (~root.converged).nonzero()[0])
         raise InputError(
             f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
-            f"{root.iterations} Newton steps); give a nearer guess, and check that f_xx is not singular"
+            f"{root.iterations} Newton steps); check that there is one, and that f_xx is not singular"
         )
     if not torch.is_grad_enabled():
         return root.x

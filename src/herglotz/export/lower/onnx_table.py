@@ -62,7 +62,9 @@ def _translate(w: Writer, node: Any) -> Any:
         if target == aten.add.Tensor and _is_zero(node.args[1]):
             return w.values[node.args[0]]
         dtype = ops.common_dtype(node)
-        names = [w.name(x, dtype) for x in node.args]
+        if target == aten.mul.Tensor and (scaled := ops.write_scaled(w, node)):
+            return scaled
+        names = ops.write_beside(w, node, dtype)
         if (scale := node.kwargs.get("alpha", 1)) != 1:
             names[1] = w.emit("Mul", names[1], w.name(scale, dtype))
         return w.emit(SIMPLE[target], *names)

@@ -46,6 +46,7 @@ class Writer:
         self.constants, self.real = constants, real
         self.numbers = count() if numbers is None else numbers
         self.nodes: list[Any] = []
+        self._wide: dict[tuple[str, int], str] = {}
         self.values: dict[fx.Node, Any] = {}  # names, known tensors, or the names of an operation's several outputs
 
     def inner(self) -> Writer:
@@ -110,6 +111,17 @@ class Writer:
     def finite(self, x: Any) -> str:
         """Whether |x| < ∞, which is false of NaN too."""
         return self.emit("Less", self.emit("Abs", self.name(x)), self.name(math.inf, described(x).dtype))
+
+    def widened(self, column: str, dtype: torch.dtype, n: int) -> str:
+        """A column (B, 1) as n equal ones, made once in a graph."""
+        if (column, n) not in self._wide:
+            real = self.real if dtype == torch.bool else dtype
+            ones = self.constant(np.ones((1, n)), NUMPY[real])
+            column_of = self.emit("Cast", column, to_=kind_of(real)) if dtype == torch.bool else column
+            wide = self.emit("Gemm", column_of, ones)
+            wide = self.emit("Cast", wide, to_=kind_of(dtype)) if dtype == torch.bool else wide
+            self._wide[column, n] = wide
+        return self._wide[column, n]
 
     def own(self, names: Sequence[str], inputs: Sequence[str]) -> list[str]:
         """Names that this graph makes, each once: what it only passes on gets a node."""
