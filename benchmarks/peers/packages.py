@@ -56,7 +56,7 @@ class Learned:
             return stepper.rollout(*start, h=self.h / parts, steps=parts * (steps + 1)).q[:, ::parts]
 
     def _start(self, stepper: Stepper, q0: Tensor, q1: Tensor, parts: int) -> State:
-        """The state at q0 from which the model is at q1 after a recorded step, by Newton's iteration with differences."""
+        """The state at q0 from which the model is at q1 after a recorded step: Newton's iteration by differences."""
         s = torch.zeros_like(q0[:, 0])
         p = legendre_minus(self.run.model, q0, q1, s, torch.full_like(s, self.h))[1]
         for _ in range(SHOTS if parts > 1 else 0):  # one step ends at q1 by its momentum
