@@ -23,20 +23,27 @@ class ProgressBar(tqdm):
 
     def search(self, name: str) -> None:
         """Show how long a search, whose end nobody knows, has taken; `beat` draws the time."""
-        ProgressBar.searching, self.bar_format, self.drawn = self, SEARCH, time.monotonic()
+        self.bar_format, self.drawn = SEARCH, time.monotonic()
+        if not self.disable:  # a search makes fits of its own, whose bars are not drawn
+            ProgressBar.searching = self
         self.set_description(name)
 
     def stage(self, name: str, total: int) -> None:
         """Show how far a stage of so many iterations is, most of which end before their bound."""
-        ProgressBar.searching, self.bar_format = None, STAGE
+        self.bar_format = STAGE
+        self._searched()
         self.total = self.n + total
         self.last_print_t = time.time()  # what was searched for before tells nothing of an iteration's time
         self.set_description(name)
 
     def close(self) -> None:
         """See tqdm."""
-        ProgressBar.searching = None
+        self._searched()
         super().close()
+
+    def _searched(self) -> None:
+        if ProgressBar.searching is self:
+            ProgressBar.searching = None
 
 
 def beat() -> None:

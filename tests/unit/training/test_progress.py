@@ -61,7 +61,7 @@ class Parabola:
 
 def test_the_time_of_a_search_goes_on(monkeypatch, capsys):
     # fails if a bar stands still at 00:00 for the minutes that a search for terms takes, draws a share that nobody
-    # knows, goes on being drawn after it, or a search is a silent one where there is no terminal
+    # knows, ends with the first fit in it, goes on being drawn after it, or a search has no line without a terminal
     now = [1000.0]
     for clock in ("time.time", "tqdm.std.time", "time.monotonic"):
         monkeypatch.setattr(clock, lambda: now[0])
@@ -69,6 +69,7 @@ def test_the_time_of_a_search_goes_on(monkeypatch, capsys):
     stages.bar.fp, stages.bar.sp = shown, stages.bar.status_printer(shown)
 
     def search():
+        Stages().run("of a fit in it", torch.zeros(1), 9, optimise)
         now[0] += 75.0
         levenberg_marquardt(Parabola(), torch.zeros(1))
         return {}
