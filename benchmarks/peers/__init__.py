@@ -36,9 +36,8 @@ class Peer:
 
 PEERS = {
     "ours": Peer("herglotz", train_ours, "positions",
-                 "`herglotz.training.fit` with its defaults of then: the rows here were measured before named terms "
-                 "were tried first, so that a fit of today gives the networks of the measured pendulum with "
-                 "`--objective trajectory` alone; stops by itself"),
+                 "`herglotz.training.fit` with its defaults, in the steps of its model, of which a recorded one may "
+                 "hold several; both double pendulums were measured before named terms were tried; stops by itself"),
     "neural_ode": Peer("neural ODE", train_neural_ode, "either",
                        "Chen et al. 2018: v̇ = net(q, v) by torchdiffeq (rk4), error over windows of 9 samples; without "
                        "velocities the one at the start of each window is trained"),

@@ -23,7 +23,8 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.stepping import Stepper
+from herglotz.mechanics import legendre_minus
+from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, fit
 from herglotz.training.run import Run
 
@@ -32,6 +33,7 @@ from .rollouts import Flow
 from .samples import Samples, differences
 
 THRESHOLDS = (0.003, 0.01, 0.03, 0.1, 0.3)  # of SINDy's sparse regression; a validation part chooses
+SHOTS, NEAR = 6, 1e-5  # iterations for the first momentum, and the differences that they use
 
 
 @dataclass(frozen=True)
@@ -47,11 +49,22 @@ class Learned:
         return self.run.metrics["parameters"]
 
     def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
-        """See `rollouts.Predictor`."""
-        stepper = Stepper(self.run.model)
+        """See `rollouts.Predictor`. The model takes its own steps, of which a recorded one may hold several."""
+        stepper, parts = Stepper(self.run.model), max(1, round(self.h / self.run.h))
         with torch.no_grad():
-            out = stepper.rollout(*stepper.init(q0, q1, None, self.h), h=self.h, steps=steps)
-        return torch.cat([q0[:, None], out.q], 1)
+            start = self._start(stepper, q0, q1, parts)
+            return stepper.rollout(*start, h=self.h / parts, steps=parts * (steps + 1)).q[:, ::parts]
+
+    def _start(self, stepper: Stepper, q0: Tensor, q1: Tensor, parts: int) -> State:
+        """The state at q0 from which the model is at q1 after a recorded step: Newton's iteration by differences."""
+        s = torch.zeros_like(q0[:, 0])
+        p = legendre_minus(self.run.model, q0, q1, s, torch.full_like(s, self.h))[1]
+        for _ in range(SHOTS if parts > 1 else 0):  # one step ends at q1 by its momentum
+            moved = [p, *(p + NEAR * e for e in torch.eye(p.shape[-1], dtype=p.dtype))]
+            each = [stepper.rollout(q0, x, s, h=self.h / parts, steps=parts).q[:, -1] for x in moved]
+            J = torch.stack([(x - each[0]) / NEAR for x in each[1:]], -1)
+            p = p - torch.linalg.solve(J, each[0] - q1)
+        return State(q0, p, s)
 
 
 def train_ours(samples: Samples, seed: int, budget: float) -> Learned:  # noqa: ARG001

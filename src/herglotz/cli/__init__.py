@@ -146,6 +146,10 @@ def _orderly() -> Iterator[None]:
     before = {one: signal.signal(one, stop) for one in SIGNALS}
     try:
         yield
+    except Exception as error:
+        if stopped:  # compiled parts of matplotlib make another error of an interrupt
+            raise KeyboardInterrupt from error
+        raise
     finally:
         if not stopped:  # else the process is about to end, and a signal on the way would print a traceback
             for one, handler in before.items():

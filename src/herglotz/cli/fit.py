@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_folder, exit_code, flag, print_json, print_next_of, say
-from herglotz.cli.flags import CSV, PROGRESS, RUN, check_run_folder, columns_of, progress
+from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import EXPERT, MACHINE, MODEL, OPTIMISER, data_of, settings_of
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ FLAGS = (
     flag("--no-plots", "do not draw figures", action="store_true"),
     flag("--tensorboard", "log for TensorBoard, as the fit runs (RUN holds history.csv too)",
          type=Path, metavar="FOLDER"),
-    *MACHINE, *CSV, *MODEL, *OPTIMISER, *EXPERT,
+    *MACHINE, *READING, *MODEL, *OPTIMISER, *EXPERT,
 )  # fmt: skip
 
 

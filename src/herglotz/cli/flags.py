@@ -19,23 +19,21 @@ def names(text: str) -> list[str]:
     return [] if text.strip().lower() == "none" else [name.strip() for name in text.split(",") if name.strip()]
 
 
-# How a file is read: angles and what its sensors read, and the roles of a csv file's columns.
+# How a file is read: the roles of its columns, angles, and what its sensors read.
 EACH = "a number for each coordinate, or for each of every recording: positions are scale * (reading - zero)"
-SENSORS = (
+READING = (
+    "how DATA is read (default: by the names of its columns, printed as a table)",
+    flag("--time", "column of the time", metavar="NAME"),
+    flag("--coordinates", "exactly these, with commas", type=names, metavar="NAMES"),
+    flag("--inputs", "forces, torques, ...: exactly these, or none", type=names, metavar="NAMES"),
+    flag("--drop", "columns to leave aside", type=names, metavar="NAMES"),
+    flag("--group", "column that numbers the trajectories", metavar="NAME"),
     flag("--angles", "coordinates that are angles in radians, with commas, or none (default: those with the unit rad "
          "or deg)", type=names, metavar="NAMES"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),
     flag("--sensor-scales", f"what one unit of each reading is worth, {EACH}", type=finite, nargs="+", metavar="X"),
 )  # fmt: skip
-CSV = (
-    "columns of a csv file (default: by their names, printed as a table)",
-    flag("--time", "column of the time", metavar="NAME"),
-    flag("--coordinates", "exactly these, with commas", type=names, metavar="NAMES"),
-    flag("--inputs", "forces, torques, ...: exactly these, or none", type=names, metavar="NAMES"),
-    flag("--drop", "columns to leave aside", type=names, metavar="NAMES"),
-    flag("--group", "column that numbers the trajectories", metavar="NAME"),
-)
 PROGRESS = (
     flag("--quiet", "no progress: neither a bar nor lines", action="store_true"),
     flag("--verbose", "a line for every iteration, with its cost", action="store_true"),
@@ -49,7 +47,6 @@ RUN = (
     flag("--out", "folder for the result; made if missing", required=True, type=Path, metavar="RUN"),
     flag("--resume", "go on after an interruption, with the same flags", action="store_true"),
     *DATA,
-    *SENSORS,
 )
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import check_output_folder, flag
-from herglotz.cli.flags import CSV, SENSORS, columns_of
+from herglotz.cli.flags import READING, columns_of
 from herglotz.errors import InputError
 
 FORMATS = ("png", "svg", "pdf")  # a copy, so that help does not import matplotlib; a test compares
@@ -32,7 +32,7 @@ FLAGS = (
          type=Path, metavar="FOLDER"),
     flag("--format", "kind of file (default %(default)s)", choices=FORMATS, default="png"),
     flag("--animate", "of a run: animation.gif, of its first trajectory", action="store_true"),
-    *SENSORS, *CSV,
+    *READING,
 )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from herglotz.cli.common import check_output_file, count, existing, flag, positive, print_json, print_table, say
-from herglotz.cli.flags import CSV, FORCE, SENSORS, columns_of
+from herglotz.cli.flags import FORCE, READING, columns_of
 from herglotz.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,10 +47,9 @@ FLAGS = (
     flag("--windows", "score W windows (with --horizon)", type=count, metavar="W"),
     flag("--horizon", "time of the free run in a window, in the data's unit of time", type=positive, metavar="T"),
     flag("--out", "write the predicted motion: .csv or .npz, and a .png", type=Path, metavar="FILE"),
-    *SENSORS,
     FORCE,
     flag("--json", "print the numbers as JSON, and nothing else", action="store_true"),
-    *CSV,
+    *READING,
 )  # fmt: skip
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from herglotz.cli.common import check_output_folder, existing, flag
-from herglotz.cli.flags import CSV, SENSORS, columns_of
+from herglotz.cli.flags import READING, columns_of
 
 DESCRIPTION = """\
 Write report.html, one self-contained page, and report.md, its words and tables: the verdict first, then the learned
@@ -24,7 +24,7 @@ FLAGS = (
     flag("source", "folder that `herglotz fit` or `select` wrote", metavar="RUN", type=Path),
     flag("--against", "another recording to score the model on", type=existing, metavar="DATA"),
     flag("--out", "folder for both files (default: RUN)", type=Path, metavar="FOLDER"),
-    *SENSORS, *CSV,
+    *READING,
 )  # fmt: skip
 
 

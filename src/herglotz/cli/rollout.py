@@ -116,7 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
         print_json(_numbers(found, times, seconds, left) | left_by | {"file": str(out)})
     else:
         _report(source, found, times, f"{out}: {arguments.steps} steps")
-    _warn(source, times, left, far)
+    _warn(source, times, left, far, "" if arguments.h else f"; --h {source.h:g} takes the model's own")
     if source.inputs and u is None:
         _note("the model is driven: without --inputs FILE or --u all of its inputs are 0")
     return 0
@@ -161,8 +161,8 @@ def _report(source: Source, found: Rollout, times: torch.Tensor, what: str) -> N
     say(f"{what} of {h:g} {source.time_unit}; at t = {float(times[-1]):g}: {end}")
 
 
-def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[Beyond]) -> None:
-    """Say on stderr where the motion or its steps are beyond the data of the fit."""
+def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[Beyond], remedy: str = "") -> None:
+    """Say on stderr where the motion or its steps are beyond the data of the fit; a remedy for its steps."""
     from herglotz.training.recorded_range import other_steps
 
     if left is not None and (far or not source.limits or "s" in source.states):  # a hair beyond q or p is no news
@@ -172,7 +172,7 @@ def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[B
             f"to{each}"
         )
     if words := other_steps(times, source.h_range or (0.0, math.inf), source.time_unit):
-        _note(words)
+        _note(words + remedy)
 
 
 def _note(text: str) -> None:

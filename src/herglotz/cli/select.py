@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from herglotz.cli.common import count, exit_code, flag, print_json, print_next_of
-from herglotz.cli.flags import CSV, PROGRESS, RUN, check_run_folder, columns_of, progress
+from herglotz.cli.flags import PROGRESS, READING, RUN, check_run_folder, columns_of, progress
 from herglotz.cli.settings import LEVELS, MACHINE, data_of, settings_of
 
 DESCRIPTION = """\
@@ -32,7 +32,7 @@ FLAGS = (
     flag("--seeds", "fits a level (default %(default)s)", type=count, default=3),
     *PROGRESS,
     *MACHINE,
-    *CSV,
+    *READING,
 )  # fmt: skip
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -20,9 +20,15 @@ ROLES = {
     "trajectory": re.compile(r"trajectory|trial|run"),
     "action": re.compile(r"s"),
     "momentum": re.compile(r"p|p_.*"),
-    "input": re.compile(r"u\d*|u_.*|F|(f|forces?|torques?|tau|motor)(\d+|_.*)|forces?|torques?|tau|motor"),
+    "input": re.compile(
+        r"u\d*|u_.*|F|f(\d+|_.*)|(forces?|torques?|tau|motor|efforts?|inputs?|controls?|commands?|cmd|pwm|voltage|current)"
+        r"(\d+|_.*)?"
+    ),
     # Left aside: logged velocities and accelerations are usually filtered, and counters of rows are no motion.
-    "rate": re.compile(r"v|v[xyz]|a[xyz]|(vel|velocity|speed|acc|acceleration)(_.*)?|.*_(d?dot|velocity|acceleration)"),
+    "rate": re.compile(
+        r"v|v[xyz]|a[xyz]|(vel|velocity|speed|acc|acceleration|omega)(_.*)?|.*_(d?dot|velocity|acceleration)"
+        r"|([qxyz]|theta|phi)\d*d?dot"
+    ),
     "counter": re.compile(r"index|row|sample|frame|unnamed: \d+"),
 }
 LETTERS = re.compile(r"v|[va][xyz]")  # of a velocity or an acceleration, unless the unit is that of a position
@@ -142,7 +148,7 @@ def assign(
     both = " and a column ".join(names[i] for i in roles["trajectory"])
     refuse({
         f"{where}: holds no inputs, only {every}; name their columns u, u_*, force or torque": not (u or wanted.motion),
-        f"{where}: no coordinate column, only {every}; {_remedy(names, roles['rate'])}": not q,
+        f"{where}: no coordinate column, only {every}; {_remedy(names, roles)}": not q,
         f"{where}: both a column {both}; keep one": len(roles["trajectory"]) > 1,
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
@@ -150,12 +156,13 @@ def assign(
     return Columns(names, units, clock, q, trajectory, action, p, u)
 
 
-def _remedy(names: Sequence[str], rates: list[int]) -> str:
+def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
     """What to do about a table without a coordinate; what its columns are taken for is not printed."""
-    if not rates:
-        return "add a column such as q[rad]"
-    which = ", ".join(names[i] for i in rates)
-    return f"{which} look like rates: choose with --coordinates NAMES (coordinates= in Python)"
+    alike = [
+        f"{', '.join(names[i] for i in roles[role])} look like {role}s" for role in ("rate", "input") if roles[role]
+    ]
+    choose = f"{', '.join(alike)}: choose with --coordinates NAMES (coordinates= in Python)"
+    return choose if alike else "add a column such as q[rad]"
 
 
 def as_names(names: Names) -> Sequence[str]:

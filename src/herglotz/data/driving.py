@@ -69,14 +69,15 @@ def driven(found: Trajectories, t0: float, steps: int, h: float | None) -> tuple
     if h is None:
         row = int((t - t0).abs().argmin())
         if abs(float(t[row]) - t0) > CLOSE * found.typical_step:
-            raise InputError(f"{where}: no sample at the start t = {t0:g}; {spans}: give t0, or h for equal steps")
+            remedy = "give t0 (--t0), or h (--h) for equal steps"
+            raise InputError(f"{where}: no sample at the start t = {t0:g}; {spans}: {remedy}")
         if row + steps >= len(t):
             raise InputError(f"{where}: {steps} steps from t = {t0:g} need {row + steps + 1} samples, it has {len(t)}")
         return u[row : row + steps], t[row : row + steps + 1]
     times = even_times(t0, h, steps)
     slack = CLOSE * h
     if float(times[0]) < float(t[0]) - slack or float(times[-1]) > float(t[-1]) + slack:
-        raise InputError(f"{where}: the rollout lasts from {t0:g} to {float(times[-1]):g}, but {spans}; give t0")
+        raise InputError(f"{where}: the rollout lasts from {t0:g} to {float(times[-1]):g}, but {spans}; give t0 (--t0)")
     total = torch.cat([torch.zeros_like(u[:1]), (u[:-1] * t.diff()[:, None]).cumsum(0)])
     at = torch.searchsorted(t, times).clamp(1, len(t) - 1)
     passed = (times - t[at - 1])[:, None]  # time since the last sample; ∫u grows linearly there

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, EXACT
 from herglotz.data.files import PathLike, read_bytes, write_atomically
+from herglotz.data.rows import quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
 from herglotz.schema import check_entries
@@ -62,7 +63,7 @@ def trajectories_of(content: bytes, path: Path) -> Trajectories:
     arrays = _arrays(path, content)
     for name in ("t", "q"):
         if name not in arrays:
-            found = ", ".join(sorted(arrays)) or "none"
+            found = ", ".join(name if name.isprintable() else quote(name) for name in sorted(arrays)) or "none"
             raise InputError(f"{path}: there is no array {name!r}, only {found}; add it: numpy.savez(..., {name}=...)")
     labels = _labels(path, arrays.get("metadata"))
     numbers = {name: _floating(path, name, arrays[name]) for name in ARRAYS if name in arrays}

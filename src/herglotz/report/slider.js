@@ -1,4 +1,5 @@
 // A walk through the free run: the slider moves a cursor over data and model, and its output says both values there.
+const short = (x, digits) => String(Number(x.toPrecision(digits)));  // 9.95, not 9.950
 for (const figure of document.querySelectorAll(".slider")) {
   const v = JSON.parse(figure.querySelector("script").textContent);
   const canvas = figure.querySelector("canvas"), g = canvas.getContext("2d");
@@ -11,7 +12,7 @@ for (const figure of document.querySelectorAll(".slider")) {
   const known = v.data.concat(v.model.filter((x) => x !== null));
   const low = known.reduce((a, b) => Math.min(a, b)), high = known.reduce((a, b) => Math.max(a, b)), span = high - low || 1;
   g.font = font;
-  const left = 14 + Math.max(...[low, high].map((q) => g.measureText(q.toPrecision(3)).width));  // 1.00e+30 is wide
+  const left = 14 + Math.max(...[low, high].map((q) => g.measureText(short(q, 3)).width));  // -1.23e+30 is wide
   const x = (t) => left + ((t - v.t[0]) / (v.t[n - 1] - v.t[0] || 1)) * (width - left - right);
   const y = (q) => top + ((high + 0.05 * span - q) / (1.1 * span)) * (height - top - bottom);
   const line = (from, to, colour) => {
@@ -33,12 +34,12 @@ for (const figure of document.querySelectorAll(".slider")) {
     if (k > v.trained) line(v.trained, k, "#d55e00");
     g.strokeStyle = "#222"; g.lineWidth = 1; g.beginPath(); g.moveTo(x(v.t[k]), top); g.lineTo(x(v.t[k]), height - bottom); g.stroke();
     g.fillStyle = "#222"; g.font = font;
-    g.fillText(high.toPrecision(3), 4, y(high) + 4); g.fillText(low.toPrecision(3), 4, y(low) + 4);
-    g.fillText(`${v.t[0].toPrecision(4)}`, left, height - 10);
-    g.textAlign = "right"; g.fillText(`${v.t[n - 1].toPrecision(4)} ${v.time_unit}`, width - right, height - 10); g.textAlign = "left";
+    g.fillText(short(high, 3), 4, y(high) + 4); g.fillText(short(low, 3), 4, y(low) + 4);
+    g.fillText(short(v.t[0], 4), left, height - 10);
+    g.textAlign = "right"; g.fillText(`${short(v.t[n - 1], 4)} ${v.time_unit}`, width - right, height - 10); g.textAlign = "left";
     const m = v.model[k];
-    output.textContent = `t = ${v.t[k].toPrecision(5)} ${v.time_unit}: ${v.name} recorded ${v.data[k].toPrecision(4)}, model ` +
-      (m === null ? "failed" : `${m.toPrecision(4)}, difference ${(v.data[k] - m).toExponential(1)}`) + ` ${v.unit}`;
+    output.textContent = `t = ${short(v.t[k], 5)} ${v.time_unit}: ${v.name} recorded ${v.data[k].toPrecision(4)}, model ` +
+      (m === null ? "failed" : `${m.toPrecision(4)}, difference ${short(v.data[k] - m, 2)}`) + ` ${v.unit}`;
   };
   input.addEventListener("input", draw);
   input.value = n - 1;

@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
-from herglotz.progress import ProgressBar
+from herglotz.progress import SEARCH, ProgressBar
 from herglotz.schema import check_entries
 from herglotz.telling import tell
 from herglotz.training.distributed import is_first
@@ -70,8 +70,8 @@ class Stages:
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
     and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
-    bits as one that was not interrupted. One bar over all stages shows their progress, whose remaining time is at most
-    that of the stages begun.
+    bits as one that was not interrupted. One bar over all stages and searches shows their progress: the time of the fit
+    so far, and what is at most left of the stages begun. How long a search takes is not known before its end.
     """
 
     def __init__(
@@ -86,7 +86,8 @@ class Stages:
         self.lines = progress in ("lines", "iterations") and is_first()
         self.verbose = progress == "iterations" and is_first()
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
-        self.bar = ProgressBar(total=1, desc="looking at the data", disable=disable, leave=False, dynamic_ncols=True)
+        self.bar = ProgressBar(bar_format=SEARCH, disable=disable, leave=False, dynamic_ncols=True)
+        self.bar.search("looking at the data")
         self.checkpoint, self.key = checkpoint, key
         self.label = ""
         self.history: list[dict[str, Any]] = []
@@ -111,8 +112,11 @@ class Stages:
         """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
         name += self.label
         if name not in self.kept:
-            self.bar.set_description(name)
+            began = time.monotonic()
+            self.bar.search(f"search for {name}")
             self.kept[name] = make()
+            if self.lines:
+                tell(f"search for {name}: {time.monotonic() - began:.1f} s")
             self._write()
         return self.kept[name]
 
@@ -135,9 +139,7 @@ class Stages:
             result.x = result.x.to(x)
             remind(problem, result.memory)
         else:
-            self.bar.total = self.bar.n + total  # most stages end before their bound
-            self.bar.last_print_t = time.time()  # what was searched for before tells nothing of an iteration's time
-            self.bar.set_description(name)
+            self.bar.stage(name, total)
             resumed = None if stored is None else stored["search"]
 
             def store(search: dict[str, Any]) -> None:

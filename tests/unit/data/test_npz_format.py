@@ -50,6 +50,7 @@ def test_arrays_alone_are_enough(tmp_path):  # fails if metadata or lengths are 
         ({"q": Q3}, r"d.npz: there is no array 't', only q; add it: numpy.savez"),
         ({"t": T3}, r"d.npz: there is no array 'q', only t;"),
         ({}, r"d.npz: there is no array 't', only none"),
+        ({"\n": T3}, r"d.npz: there is no array 't', only '.n';"),  # else the message has two lines
         ({"t": T3, "q": np.array([{}, 1, 2])}, r"d.npz: array 'q' holds Python objects, which are never loaded"),
         ({"t": T3, "q": Q3 + 1j}, r"d.npz: array 'q' has dtype complex128; save it as float64"),
         ({"t": T3, "q": np.array([-(2**60), 0, 1])}, r"d.npz: array 'q' has integers above 2\^53"),

@@ -181,6 +181,13 @@ def test_rollout_of_recorded_inputs(exact_run, tmp_path, capsys):
     capsys.readouterr()
     assert main([*command, "--u", "0.1", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["steps"] == steps
+    # fails if inputs of longer steps than the fit's leave open what to do about it
+    save(tmp_path / "u.csv", data.thinned(2))
+    command[3:] = ["9", *begin, "--force", "--out", str(tmp_path / "m.csv"), "--inputs", str(tmp_path / "u.csv")]
+    assert main(command) == 0
+    assert f"; --h {exact_run.h:g} takes the model's own" in " ".join(capsys.readouterr().err.split())
+    assert main([*command, "--h", f"{exact_run.h!r}"]) == 0
+    assert "takes the model's own" not in capsys.readouterr().err
 
 
 def test_figures_of_a_driven_run(exact_run, tmp_path, capsys):

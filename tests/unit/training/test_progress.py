@@ -13,7 +13,7 @@ import herglotz
 from herglotz.errors import InputError
 from herglotz.progress import ProgressBar
 from herglotz.training.run_folder import _log
-from herglotz.training.solvers.levenberg_marquardt import OptimiserResult
+from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.stages import Progress, Stages
 from herglotz.training.tensorboard import tensorboard_log
 
@@ -46,7 +46,44 @@ def test_one_bar_goes_through_all_stages():  # fails if a stage's unused bound s
             stages.run(name, torch.zeros(1), total, optimise)
         assert (bar.n, bar.total) == (4, 2 + 9)
         stages.keep("terms", lambda: {"desc": bar.desc})  # fails if a search has no name while it lasts
-        assert stages.kept["terms"] == {"desc": "terms: "}
+        assert stages.kept["terms"] == {"desc": "search for terms: "}
+
+
+class Parabola:
+    """½ (x − 1)²."""
+
+    def cost(self, x):
+        return 0.5 * (x - 1).square().sum()
+
+    def normal_equations(self, x):
+        return self.cost(x), torch.eye(1), x - 1
+
+
+def test_the_time_of_a_search_goes_on(monkeypatch, capsys):
+    # fails if a bar stands still at 00:00 for the minutes that a search for terms takes, draws a share that nobody
+    # knows, ends with the first fit in it, goes on being drawn after it, or a search has no line without a terminal
+    now = [1000.0]
+    for clock in ("time.time", "tqdm.std.time", "time.monotonic"):
+        monkeypatch.setattr(clock, lambda: now[0])
+    stages, shown = Stages(progress=True), StringIO()
+    stages.bar.fp, stages.bar.sp = shown, stages.bar.status_printer(shown)
+
+    def search():
+        Stages().run("of a fit in it", torch.zeros(1), 9, optimise)
+        now[0] += 75.0
+        levenberg_marquardt(Parabola(), torch.zeros(1))
+        return {}
+
+    with stages.bar:
+        stages.keep("terms", search)
+        assert shown.getvalue().split("\r")[-1].strip() == "search for terms: 01:15"
+    written = shown.getvalue()
+    now[0] += 75.0
+    levenberg_marquardt(Parabola(), torch.zeros(1))
+    assert shown.getvalue() == written
+    capsys.readouterr()
+    Stages("lines").keep("terms", lambda: now.append(now.pop() + 2) or {})
+    assert capsys.readouterr().err == "search for terms: 2.0 s\n"
 
 
 def test_the_log_has_every_iteration():  # fails if a stage's name is lost or cut

@@ -10,6 +10,7 @@ from typing import Any, Protocol, cast
 import torch
 from torch import Tensor
 
+from herglotz.progress import beat
 from herglotz.training.distributed import everywhere, of_first
 
 ROUNDING = 1e-11  # a change of the cost below this, relative, is the rounding of a long sum
@@ -158,6 +159,7 @@ def levenberg_marquardt(
     rounding = max(ROUNDING, 8 * torch.finfo(cost.dtype).eps)
     while at.iteration < max_iterations and at.over(patience) is None:
         at.iteration += 1
+        beat()
         step = _damped_step(A, b, at.damping * _floored(at.scale))
         new, predicted = math.inf, 0.0
         if step is not None:

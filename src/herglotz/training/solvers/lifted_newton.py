@@ -21,6 +21,7 @@ from torch.func import jacrev, vmap
 
 from herglotz.mechanics import Partials, momentum_jacobian, momentum_plus, momentum_residual, partials, step_derivative
 from herglotz.mechanics.legendre import soft_threshold, unheld_jacobian, unheld_residual
+from herglotz.progress import beat
 from herglotz.stepping import State, Status, solve, solve_step
 from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.parameter_vector import FixedModel
@@ -60,6 +61,7 @@ def _swept(
     x = torch.cat([start[:, None], guess[:, 1:]], 1)
     previous = float("inf")
     for _ in range(sweeps):
+        beat()
         stepped = step(L_d, x, h)
         if stepped is None:
             return None
