@@ -27,9 +27,9 @@ with atheris.instrument_imports(include=["herglotz"]):
     from herglotz.data.csv_format import read_csv
     from herglotz.data.npz_format import trajectories_of
     from herglotz.errors import InputError
-    from herglotz.export.metadata import Metadata
+    from herglotz.export.metadata import describe, from_json
+    from herglotz.models import ContactLagrangian, ModelConfig
     from herglotz.models.features import parse
-    from herglotz.schema import check_entries
 
 MEMBERS = ("t.npy", "q.npy", "metadata.npy", "lengths.npy", "u.npy")
 BETWEEN = b"\n--\n"  # members of an archive in one input
@@ -56,10 +56,39 @@ def features(content: bytes) -> None:
     parse(content.decode("utf-8", "replace"), angles=(False, True))
 
 
+def whole() -> dict[str, Any]:
+    """What an exported file says of itself, with every entry that it can have."""
+    model = ContactLagrangian(ModelConfig((True,), potential_width=2, damping_width=2, level="forced", inputs=1))
+    box = {f"{x}_{end}": [sign] for x in "qps" for end, sign in (("low", -1.0), ("high", 1.0))}
+    extra = dict.fromkeys(("time_unit", "card", "name"), "s") | {"names": ["x"], "degrees": ["x"], "metrics": {"x": 1}}
+    extra |= {"start": {"q": [0.0], "p": [0.0], "s": 0.0, "t": 0.0}, "h_range": [0.05, 0.2]}
+    extra |= {"arrival": {"hold": "zero", "delay": 0.1, "lag": 0.1}, "columns": [["x", "q", "m"]]}
+    return describe(model, 0.1, box, ["m"], 30, extra)
+
+
+def places(entries: Any) -> list[tuple[Any, ...]]:
+    """The keys that lead to every entry of entries, nested ones too."""
+    keys = entries if isinstance(entries, dict) else range(len(entries) if isinstance(entries, list) else 0)
+    return [path for key in keys for path in ((key,), *((key, *rest) for rest in places(entries[key])))]
+
+
+WHOLE = json.dumps(whole())
+PLACES = places(json.loads(WHOLE))
+
+
 def metadata(content: bytes) -> None:
-    """What an exported file says of itself."""
-    with suppress(ValueError, RecursionError):  # what is no JSON is refused before
-        check_entries(Metadata, json.loads(content), "file", "write it again")
+    """What an exported file says of itself: all of it, or one entry; a byte says which, and JSON what stands there."""
+    text = content.decode("utf-8", "replace")
+    if content[:1] != b"{":
+        entries = json.loads(WHOLE)
+        with suppress(ValueError, RecursionError):  # what is no JSON leaves the entries as they are
+            where = entries
+            *above, last = PLACES[content[0] % len(PLACES)] if content else PLACES[0]
+            for key in above:
+                where = where[key]
+            where[last] = json.loads(content[1:])
+            text = json.dumps(entries)
+    ModelConfig.from_dict(from_json(text, FILE)["model"])
 
 
 def member(array: Any) -> bytes:
@@ -80,7 +109,7 @@ SEEDS: dict[Callable[[bytes], None], list[bytes]] = {
         BETWEEN.join(map(member, (t, np.stack([t, t], 1), np.array("{}"), np.array([5]), np.ones((5, 1), int)))),
     ],
     features: [b"-9.81 cos(q1 - 2 q2) v1^2 v2", b"(q1 - q2)^4", b"1.5e-3 r^-1", b"|v1| v1"],
-    metadata: [b'{"format": 1, "dof": 1, "h": 0.1, "names": ["x"], "box": {"q_low": [0.0]}}'],
+    metadata: [WHOLE.encode(), *(bytes([k % 256]) + b"[0.5]" for k in range(len(PLACES)))],
 }
 
 

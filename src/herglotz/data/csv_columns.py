@@ -258,14 +258,23 @@ def is_number(text: str) -> bool:
 ANGULAR = re.compile(r"(theta|phi|psi|angle|alpha|beta)(_?\d+|_.*)?", re.I)  # names that are given to angles
 
 
+LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
+
+
 def column_table(
     columns: Sequence[tuple[str, str, str]],  # name, role and unit of each column, as it was read
     labels: Labels,  # of what was made of them
     source: str,
     notes: Sequence[str] = (),
 ) -> str:
-    """Return a line a column: its role, and its unit with the conversion that was made; then the notes."""
+    """Return a line a column: its role, and its unit with the conversion that was made; then the notes.
+
+    Of more than `LISTED` columns the first and the last ones are shown, and the number of the others.
+    """
     rows = [("column", "is taken for", "unit"), *column_rows(columns, labels)]
+    left = len(rows) - 1 - LISTED
+    if left > 0:
+        rows[1 + LISTED // 2 : 1 + LISTED // 2 + left] = [("…", f"{left} more", "")]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
     return "\n".join([f"{source or 'table'}:", *lines, *(f"  {note}" for note in notes)])

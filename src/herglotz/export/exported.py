@@ -102,9 +102,9 @@ class ExportedStepper(OneStepMethod):
         """
         if "linearise" not in self.programs:
             raise InputError(f"{self.path}: {self._file} file holds no derivative; use a .pt2, ONNX or C file")
-        state = State(*(x.detach() for x in state))
-        self._check(*state)
         with torch.no_grad():
+            self._check(*state)
+            state = State(*(x.detach() for x in state))
             *out, J = self.programs["linearise"](*map(plain, self._flat(state, h, u)))
         J, size = J.reshape(*state.s.shape, *J.shape[1:]), 2 * self.dof + 1
         by_input = J[..., size + 1 :] if self.inputs else None

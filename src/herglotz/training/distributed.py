@@ -8,6 +8,7 @@ on where its memory lies; what decides the optimiser's path is therefore taken f
 from __future__ import annotations
 
 import functools
+import importlib
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -103,6 +104,9 @@ def process_group() -> Iterator[None]:
     if "RANK" not in os.environ or "WORLD_SIZE" not in os.environ:
         yield
         return
+    # The functions of this module keep the group that is there when the module is first imported, for ever. A fit
+    # imports it (by torch._dynamo): gloo's threads would then outlive the group, and abort while Python ends.
+    importlib.import_module("torch.distributed.nn.functional")
     limit = timedelta(seconds=float(os.environ.get("HERGLOTZ_TIMEOUT", TIMEOUT)))
     dist.init_process_group("nccl" if torch.cuda.is_available() else "gloo", timeout=limit)
     try:

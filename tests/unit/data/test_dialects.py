@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, load, read_csv, save
+from herglotz.data.csv_dialect import cells_of
 from herglotz.data.extra_formats import Table
 from herglotz.data.table import from_frame
 from herglotz.errors import InputError
@@ -183,3 +184,9 @@ def test_folders_without_recordings(tmp_path):  # fails if an empty folder, or t
     (tmp_path / "model.pt").write_text("")
     with pytest.raises(InputError, match="is the folder of a run, not data"):
         load(tmp_path)
+
+
+def test_quoted_names_between_spaces():
+    # fails if spaces at the end of a line, or several side by side, make an empty cell where names have quotes
+    assert cells_of('"t"  "x" ', " ") == ["t", "x"]
+    assert cells_of('"a, b",c', ",") == ["a, b", "c"]

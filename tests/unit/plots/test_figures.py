@@ -308,6 +308,9 @@ def test_what_was_recorded_in_degrees_is_drawn_in_degrees():
     upper, lower = plot_trajectory(run).axes
     assert (upper.get_ylabel(), lower.get_ylabel()) == ("theta (deg)", "residual (deg)")
     assert upper.lines[0].get_ydata() == pytest.approx(factor * run.data.q[:, 0].numpy())
+    missed = float((run.prediction - run.data.q).abs().max())  # the model is turned as the data are
+    drawn = max(np.abs(np.asarray(line.get_ydata())).max() for line in lower.lines)
+    assert drawn == pytest.approx(factor * missed)
     assert trajectory_title(run).split()[3] == "deg"
     plain = plot_bands(fake_run(), bands).axes[0]
     turned = plot_bands(run, bands).axes[0]

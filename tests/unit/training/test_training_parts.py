@@ -1,5 +1,6 @@
 """Small decisions of a fit, each alone: units of parameters, what starts it, which features are tried."""
 
+import math
 from types import SimpleNamespace
 
 import pytest
@@ -98,3 +99,19 @@ def test_the_baseline_in_words(angle, power, in_L, in_force):
     for newton, wanted in ((False, in_L), (True, in_force)):
         what, factor = own_term("x", angle, power, newton)
         assert (what, 3.0 * factor) == wanted
+
+
+@pytest.mark.parametrize("angle", [True, False])
+def test_a_baseline_finds_the_spring_the_tilt_and_the_damping_of_a_swing(angle):
+    # fails if the sine of an angle is its cosine, or an angle is taken for a length: each number is then another one
+    k, b, gamma, h, steps = 4.0, 1.0, 0.2, 0.01, 800
+    q, v, found = 1.5, 0.0, []
+    for _ in range(steps):  # symplectic Euler, with errors of h
+        found.append(q)
+        v -= h * (k * (math.sin(q) if angle else q) + b * (math.cos(q) if angle else 1.0) + gamma * v)
+        q += h * v
+    t, position = h * torch.arange(steps, dtype=torch.float64), torch.tensor(found, dtype=torch.float64)[:, None]
+    data = Trajectories(t, position, (steps,), ("x",), ("rad" if angle else "m",), (angle,))
+    base = estimate_baseline(data)
+    # Measured: each 0.1 % too large, the error of the step.
+    assert (base.stiffness[0], base.tilt[0], base.rate) == pytest.approx((k, b, gamma), rel=2e-3)

@@ -8,10 +8,11 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.progress import ProgressBar
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run
 from herglotz.training.recorded_range import box_of
-from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, tune
+from herglotz.tune import Candidate, Setting, TuneConfig, distil, pareto, search, tune
 from herglotz.tune.config import allowed_failures
 from herglotz.tune.cost import Cost, Timed, measure_costs
 from herglotz.tune.distil import FlowProblem, pairs_of, widened
@@ -206,6 +207,32 @@ def test_the_run_as_it_is_costs_no_error():
     assert found.candidates[1].median > 1e-4  # twice the step, the same model: the rule's error
     assert found.held_out["share_within"] == 1.0
     assert max(map(len, found.table().splitlines())) <= 80  # fails if the table does not fit a terminal as it opens
+
+
+def test_the_run_as_it_is_is_tried_whatever_was_asked_for(monkeypatch):
+    # fails if the eager run, which the others are compared with, is left out where artefacts are C alone, or if other
+    # steps are tried in eager then
+    monkeypatch.setattr(search._Search, "_in_c", lambda *_: iter(()))
+    run, config = run_of(), replace(FAST, artefacts=("c",))
+    training, choosing = (record(run, draw_starts(run, 60, seed), 10 * H) for seed in range(2))
+    with ProgressBar(disable=True) as bar:
+        tried = search._Search(run, search.frozen_double(run), config, 1.0, training, choosing, [], bar)
+        assert [(x.setting.multiple, x.setting.artefact) for x in tried.forms()] == [(1, "eager")]
+
+
+@pytest.mark.parametrize(("progress", "disable"), [(True, False), (False, True), (None, None)])
+def test_the_bar_is_shown_as_asked_for(progress, disable, monkeypatch):
+    # fails if progress=True shows none, or None does not leave it to whether there is a terminal
+    class Asked(Exception):
+        pass
+
+    def asked(**options):
+        assert options["disable"] is disable
+        raise Asked
+
+    monkeypatch.setattr(search, "ProgressBar", asked)
+    with pytest.raises(Asked):
+        tune(run_of(), max_error=0.5, config=FAST, progress=progress)
 
 
 def test_tuned_run_holds_the_chosen_step(tmp_path):
