@@ -59,7 +59,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
             seen, first, model = _going_on(fewer, bare), bare, "friction and inputs alone"
             named = choose(seen, config)
     every = sparsest(seen.kept)
-    asked = replace(config, objective="trajectory") if every > 1 and _drowned(seen) else config
+    asked = _by_trajectories(seen, config, every)
     other = _without_names(data, asked, stages, seen)
     networks = choose(other, asked)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
@@ -144,11 +144,16 @@ def _both(found: dict[str, Any], seen: Look) -> float:
     return (found["windows"] * min(found["rms"], _spread(seen))) ** 0.5
 
 
-def _drowned(seen: Look) -> bool:
-    """Whether noise hides how the motion curves over one recorded step, which it does where steps are fine.
+def _by_trajectories(seen: Look, config: FitConfig, every: int) -> FitConfig:
+    """The settings with which networks that are tried on every m-th sample are fitted as they are tried.
 
-    Networks are tried on fewer samples, whose steps tell more: the last fit would learn another model by these steps.
+    One-step errors of all samples would teach them another model where single recorded steps drown in noise.
     """
+    return replace(config, objective="trajectory") if every > 1 and _drowned(seen) else config
+
+
+def _drowned(seen: Look) -> bool:
+    """Whether noise hides how the motion curves over one recorded step, which it does where steps are fine."""
     t = seen.kept.triples(seen.base.max_step)
     curved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / seen.kept.balance
     return NOISE_OF_R * precision(seen.kept) > DROWNED * float(curved.square().mean().sqrt())
