@@ -64,13 +64,18 @@ def parse_drag(text: str, angles: Sequence[bool]) -> DragFeature:
 
     Raise InputError if it is none, or names a coordinate that the model has not.
     """
-    plain, n = " ".join(text.split()), len(angles)
+    plain = " ".join(text.split())
     if plain == AIR:
         refuse({f"drag '{text}': an angle has no speed through the air; write '|v1| v1'": any(angles)})
         return DragFeature(0, 0, 0, 1, 1, air=True)
     if (dry := _DRY.fullmatch(plain)) is not None:
         return _parse_dry(text, dry.groupdict(), angles)
-    match = _TEXT.fullmatch(plain)
+    return _parse_power(text, plain, angles)
+
+
+def _parse_power(text: str, plain: str, angles: Sequence[bool]) -> DragFeature:
+    """A product of powers, or a constant force."""
+    match, n = _TEXT.fullmatch(plain), len(angles)
     if match is None:
         raise InputError(
             f"drag '{text}': write '|v1| v1', 'v1^3', 'q1^2 v1', '(v1 - v2)', '|v| v', 'load 1' or 'cos(q1) sgn(v1)'"
