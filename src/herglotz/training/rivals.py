@@ -58,8 +58,7 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         if bare["rms"] <= FOLLOWS * _spread(seen) and not bare["rms"] > MARGIN * first["rms"]:
             seen, first, model = _going_on(fewer, bare), bare, "friction and inputs alone"
             named = choose(seen, config)
-    every = sparsest(seen.kept)
-    asked = _by_trajectories(seen, config, every)
+    asked, every = _as_fitted(seen, config, named)
     other = _without_names(data, asked, stages, seen)
     networks = choose(other, asked)
     second = stages.keep("held out, networks", lambda: _held_out(seen, config, networks, every))
@@ -144,12 +143,16 @@ def _both(found: dict[str, Any], seen: Look) -> float:
     return (found["windows"] * min(found["rms"], _spread(seen))) ** 0.5
 
 
-def _by_trajectories(seen: Look, config: FitConfig, every: int) -> FitConfig:
-    """The settings with which networks that are tried on every m-th sample are fitted as they are tried.
+def _as_fitted(seen: Look, config: FitConfig, named: Plan) -> tuple[FitConfig, int]:
+    """The settings of networks, and how many samples are one where they are tried: what is tried is what is fitted.
 
-    One-step errors of all samples would teach them another model where single recorded steps drown in noise.
+    One-step errors of all samples would teach them another model where single recorded steps drown in noise: whole
+    trajectories are tried on the samples that named terms are fitted to.
     """
-    return replace(config, objective="trajectory") if every > 1 and _drowned(seen) else config
+    every = sparsest(seen.kept)
+    if every > 1 and _drowned(seen):
+        return replace(config, objective="trajectory"), named.every
+    return config, every
 
 
 def _drowned(seen: Look) -> bool:

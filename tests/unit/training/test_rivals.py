@@ -52,7 +52,7 @@ def plan(network):
 @pytest.fixture
 def held(monkeypatch):
     """Plans of both rivals with the errors that a test gives them; the looks that were taken are counted."""
-    errors, looks = {}, []
+    errors, looks, thinned = {}, [], []
 
     def look(_data, config, *_, named, zeros):
         looks.append((named, zeros, config.objective))
@@ -63,6 +63,7 @@ def held(monkeypatch):
         return SimpleNamespace(**{**vars(seen), "base": SimpleNamespace(start=start)})
 
     def held_out(seen, config, plan, every=1):  # noqa: ARG001
+        thinned.append(every)
         found = errors["bare" if seen.name == "bare" else plan.network]
         return {"until": min(found["rms"], 1.0)} | found
 
@@ -80,21 +81,22 @@ def held(monkeypatch):
         monkeypatch.setattr(rivals, "_without_terms", lambda _: None if bare is None else less)
         return rivals.held_out_winner(data, FitConfig(), Stages(False, None, "", resume=False), seen)  # type: ignore[arg-type]
 
-    return SimpleNamespace(winner=winner, looks=looks, seen=seen)
+    return SimpleNamespace(winner=winner, looks=looks, seen=seen, thinned=thinned)
 
 
 def test_networks_of_samples_that_drown_in_noise_are_tried_and_fitted_alike(held, monkeypatch):
     # fails if networks that were tried on every 12th sample are fitted to one-step errors of all, most of which are
-    # noise (two joints at 500 Hz: free runs missed by 0.043 rad for 0.0035 in the trial), or by steps of 12 samples
+    # noise (two joints at 500 Hz: free runs missed by 0.043 rad for 0.0035 in the trial), or by other steps
     won = {"rms": NOISE, "sigma": NOISE, "departure": 6e-3, "start": {}}
     monkeypatch.setattr(rivals, "sparsest", lambda _: 12)
     named, networks = replace(plan("none"), every=3), plan("potential")
     monkeypatch.setattr(rivals, "choose", lambda seen, _: networks if seen.name == "networks" else named)
-    for drowned, objective in ((True, "trajectory"), (False, "auto")):
+    for drowned, objective, every in ((True, "trajectory", 3), (False, "auto", 12)):
         monkeypatch.setattr(rivals, "_drowned", lambda _, says=drowned: says)
         held.looks.clear()
         assert held.winner({"rms": 5 * NOISE, "sigma": NOISE}, won)[1].every == 3
         assert held.looks == [(False, (), objective)]
+        assert held.thinned[-1] == every
 
 
 @pytest.mark.parametrize(("h", "noise", "drowned"), [(0.002, 1e-4, True), (0.002, 0.0, False), (0.2, 1e-4, False)])
