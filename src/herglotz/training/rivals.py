@@ -68,7 +68,8 @@ def held_out_winner(data: Trajectories, config: FitConfig, stages: Stages, seen:
         why += f"; both are lost: with errors up to the spread they miss {first['until']:.2g} and {second['until']:.2g}"
     if first[by := "until" if lost else "rms"] <= MARGIN * second[by]:
         return seen, _reasoned(named, why)
-    networks = replace(networks, every=named.every)  # longer steps would change the motion
+    if networks.objective == "trajectory":
+        networks = replace(networks, every=named.every)  # longer steps would change the motion
     if networks.objective == "trajectory" and "departure" in second:
         other = _going_on(other, second)
         networks = replace(

@@ -86,6 +86,16 @@ def test_the_derivative_of_a_step_knows_the_place(sticking):
     assert torch.allclose(D.by_state.detach(), torch.stack(rows, 1).detach(), rtol=1e-7, atol=1e-7)
 
 
+@pytest.mark.parametrize("coefficient", [0.7, -3.0])
+def test_the_closed_form_of_a_slide_knows_the_place(coefficient):
+    # fails if ∂F⁻/∂q0 of set-valued friction has another sign or size than F⁻, or a slope where friction is 0
+    model = body(("q1^2 sgn(v1)",), [coefficient], rate=0.2)
+    q1, s0, h = numbers(0.95), torch.zeros(1, dtype=torch.float64), torch.full((1,), H, dtype=torch.float64)
+    P = model.partials(numbers(0.8), q1, s0, h, 2)
+    by_q0 = torch.func.jacrev(lambda q0: model.partials(q0, q1, s0, h, 1).force.minus)(numbers(0.8))
+    assert torch.allclose(P.force.minus_1.reshape(()), by_q0.reshape(()), rtol=1e-12, atol=1e-14)
+
+
 def test_friction_by_direction_is_friction_and_a_constant_force():
     # fails if a constant force does not shift what holds a joint: τ + a brakes one way, τ − a the other
     tau, a = 1.0, 0.3
