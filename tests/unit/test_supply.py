@@ -168,12 +168,13 @@ def test_the_wheel_and_its_requirements_alone_run_the_example_of_the_readme(tmp_
         for top in {path.parts[0] for path in package.files or []} - {"..", "__pycache__"}:
             (site / top).symlink_to(Path(str(package.locate_file(top))))
     readme = (ROOT / "README.md").read_text("utf-8")
-    (simulate,) = re.findall(r"`(herglotz simulate [^`]*)`", readme.split("--seed 1")[0])
+    recordings = re.findall(r"^(herglotz simulate .*)$", readme, re.M)
+    assert len(recordings) == 2
     (example,) = re.findall(r"^```python\n(import herglotz.*?)^```", readme, re.M | re.S)
     folder = tmp_path / "work"
     folder.mkdir()
-    for more in ("", " --seed 1 --out another.csv"):
-        words = (simulate + more).split()[1:]
+    for line in recordings:
+        words = line.split()[1:]
         subprocess.run([python.with_name("herglotz"), *words], cwd=folder, env={"HOME": str(tmp_path)}, check=True)
     code = f"{example}\nprint(hz.__file__)"
     words = [python, "-I", "-W", "error", "-c", code]
