@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from herglotz import cli
+from herglotz.mechanics.newton import solve
 from herglotz.threads import one_thread
 from herglotz.training import ensemble_bands, fit, laplace, select
 from herglotz.training.predict import predict
@@ -58,3 +59,17 @@ def test_a_command_leaves_no_choice_behind(recorded, monkeypatch, chosen, loaded
     assert seen == [expected]
     assert os.environ.get("OMP_NUM_THREADS") == chosen
     assert recorded == ([1, 7] if loaded else [])
+
+
+def test_large_matrices_are_solved_by_two_threads():
+    # fails if a batch of them is handed to torch at once, which with two threads never came back
+    before = torch.get_num_threads()
+    make = torch.Generator().manual_seed(0)
+    matrix = torch.randn(3, 256, 256, generator=make, dtype=torch.float64) + 256 * torch.eye(256, dtype=torch.float64)
+    x = torch.randn(2, 3, 256, generator=make, dtype=torch.float64)
+    torch.set_num_threads(2)
+    try:
+        found = solve(matrix, (matrix @ x[..., None])[..., 0])
+    finally:
+        torch.set_num_threads(before)
+    torch.testing.assert_close(found, x, rtol=1e-12, atol=1e-12)

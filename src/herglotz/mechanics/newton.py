@@ -34,6 +34,9 @@ class Equation(Protocol):
         ...
 
 
+# Batches of larger matrices are solved one by one: torch 2.13 hands each to a thread of its own, where the LU
+# decomposition of oneMKL, from 190 rows on, never ends or says that a parameter of its own was wrong.
+AT_ONCE = 128
 Number = Any  # (...) a number a sample; a float of one sample that is `alone`
 # The size of the unknown and the size below which a move is rounding, from x, the first point and |J⁻¹F|.
 Sizes = Callable[[Tensor, Point, Number], tuple[Number, Number]]
@@ -53,12 +56,19 @@ def solve(matrix: Tensor, vector: Tensor) -> Tensor:
         return vector / matrix[..., 0]
     if n == 2:
         return _eliminate(matrix, vector)
-    return torch.linalg.solve_ex(matrix, vector[..., None])[0][..., 0]
+    return solve_columns(matrix, vector[..., None])[..., 0]
 
 
 def solve_columns(matrix: Tensor, columns: Tensor) -> Tensor:
     """matrix⁻¹ columns, (..., n, k), likewise."""
-    return columns / matrix if matrix.shape[-1] == 1 else torch.linalg.solve_ex(matrix, columns)[0]
+    n = matrix.shape[-1]
+    if n == 1:
+        return columns / matrix
+    if n <= AT_ONCE or matrix.ndim == 2 or matrix.device.type != "cpu" or torch.get_num_threads() == 1:
+        return torch.linalg.solve_ex(matrix, columns)[0]
+    every = torch.broadcast_shapes(matrix.shape[:-2], columns.shape[:-2])
+    pairs = zip(*(x.expand(*every, *x.shape[-2:]).flatten(0, -3) for x in (matrix, columns)), strict=True)
+    return torch.stack([torch.linalg.solve_ex(a, b)[0] for a, b in pairs]).unflatten(0, every)
 
 
 def _eliminate(matrix: Tensor, vector: Tensor) -> Tensor:

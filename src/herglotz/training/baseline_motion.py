@@ -18,6 +18,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
+from herglotz.progress import beat
 from herglotz.training.baseline import Baseline
 
 ROUNDS = 12  # Gauss–Newton iterations
@@ -98,6 +99,7 @@ class BaselineMotion:
         first = torch.cat([torch.ones_like(v)[None], still[1:]]) if slopes else still
         q, v = torch.cat([q[None], still]), torch.cat([v[None], first])
         for _ in range(self.substeps):
+            beat()
             a1 = a(q, v)
             v2 = v + d / 2 * a1
             a2 = a(q + d / 2 * v, v2)

@@ -19,6 +19,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, coarse, precision, sparsest
 from herglotz.data.smoothing import LocalPolynomials, local_polynomials, smoothed
+from herglotz.progress import FEWER_TERMS, FIRST_TERMS, MORE_TERMS, inside, part
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.exchange import exchanged
@@ -43,7 +44,7 @@ from herglotz.training.problems.prior import prior_of
 from herglotz.training.problems.robust import FREEDOM
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.stages import Stages
-from herglotz.training.subsets import likelier, missing, price_of
+from herglotz.training.subsets import likelier, missing, preferred
 from herglotz.training.task import EXACT, Task, build_model, with_sticking
 from herglotz.training.trajectory_fit import SegmentStages, TrajectoryFit
 
@@ -84,17 +85,20 @@ class DictionarySearch:
         self.coarse = coarse(data)
         self.order = 4 if plain and (self.coarse or self.precision < SMOOTH * self.spread) else 2
 
+    @inside()
     def run(self) -> Found | None:
         """The model that the data ask for; None where not even the shortest segments can be followed."""
+        part(FIRST_TERMS)
         every = sparsest(self.data)
         found = None if every == 1 else self._from_sparse(every)
         if found is not None and found.coloured:
             return found  # more samples do not tell what a term is missing that this many do not show
         if found is None:
-            part = self.data.liveliest(PART)
-            found = self._begun() if part.samples > self.data.samples / 2 else self._from_part(part)
+            few = self.data.liveliest(PART)
+            found = self._begun() if few.samples > self.data.samples / 2 else self._from_part(few)
             if found is None:
                 return None
+        part(MORE_TERMS)
         found = self._braking(found) if found.pushes else found
         self.all = offered(self.data, self.all, found.terms, lacks=all((found.coloured, found.rms > self.floor)))
         self.all = replace(self.all, apart=found.terms.apart)
@@ -107,6 +111,7 @@ class DictionarySearch:
             if more is None or not found.joined_by(more, self.floor):
                 break
             found = self._finer(self._held(self._longer(more)))
+        part(FEWER_TERMS)
         found = exchanged(self._pruned(found), self.all, self.refit, self._missing, self.floor)
         found = self._last_terms(self._likeliest(found))
         return FewerNumbers(self.data, self.floor, self.order, self.refit, self._problem).of(found)
@@ -293,15 +298,9 @@ class DictionarySearch:
         stages, problem = self._problem(found, self.all, found.config.substeps)
         for better in likelier(found, problem, self.all, stages.task.config, self.floor):
             other = self.refit(replace(found, values=better.values), better.terms, states=better.states)
-            if other is not None and not other.pushes and self._preferred(other, found):
+            if other is not None and not other.pushes and preferred(other, found, len(self.all.names), self.floor):
                 return self._likeliest(self._held(self._longer(other)))
         return found
-
-    def _preferred(self, other: Found, found: Found) -> bool:
-        """Whether the criterion of `subsets` prefers the other terms."""
-        log = math.log(self.data.q.numel())
-        price, its = (price_of(len(f.terms.names), len(self.all.names), log) for f in (found, other))
-        return gain(found.rms, other.rms, self.data.q.numel(), self.floor) > its - price
 
     def _simpler(self, found: Found) -> Found:
         """Without terms that make up for steps that are too long, where residuals are no noise."""

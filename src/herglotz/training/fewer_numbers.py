@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from herglotz.data import Trajectories
+from herglotz.progress import FEWER_NUMBERS, part
 from herglotz.training.found_terms import Found
 from herglotz.training.named_terms import NamedTerms
 from herglotz.training.problems.shooting import ShootingProblem
@@ -39,6 +40,7 @@ class FewerNumbers:
 
     def of(self, found: Found) -> Found:
         """The model with as few numbers as the data ask for."""
+        part(FEWER_NUMBERS)
         return self._absent(self._one_rate(self._apart(self._undragged(found))))
 
     def _absent(self, found: Found) -> Found:

@@ -21,6 +21,7 @@ from torch import Tensor
 from herglotz.data import Trajectories
 from herglotz.data.trajectories import every_mth
 from herglotz.models import ContactLagrangian
+from herglotz.progress import beat
 from herglotz.training.baseline import Baseline
 from herglotz.training.free_run import continued
 from herglotz.training.look import Look
@@ -91,6 +92,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     theta, x = problem.parameters.get(), known[problem.grid.start_sample]
     problem.guess_from_states(known)
     cost, A, _ = problem.normal_equations(problem.pack(theta, x[:, : problem.d]))
+    beat()
     if not math.isfinite(float(cost)):
         return None
     runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
@@ -101,6 +103,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if guess is not None:
         ahead.guess_from_states(guess)
     path = None if guess is None else ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
+    beat()
     if path is None:
         return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)

@@ -19,6 +19,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.parameter_vector import ParameterVector
 
 SERIES = 3  # powers of a length beside its spring: more than the potential of an oscillator that is named has
+SIDE = 0.1  # of the way to the farther side of 0: motion that goes less far on the other tells nothing of a bend there
 HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
 WAVES = 3  # highest harmonic of one angle
 BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
@@ -132,8 +133,13 @@ def distances(data: Trajectories) -> tuple[str, ...]:
 
 
 def kinks(data: Trajectories) -> tuple[str, ...]:
-    """Potentials of one length whose force bends at 0: |x| of a spring that is stiffer on one side, and x |x|."""
-    return () if data.dof > 1 or any(data.angles) else ("|q1| q1", "|q1|^3")
+    """Potentials of one length whose force bends at 0: |x| of a spring that is stiffer on one side, and x |x|.
+
+    On one side of 0 they are powers.
+    """
+    away, beyond = sorted((abs(float(data.q.min())), abs(float(data.q.max()))))
+    crossed = float(data.q.min()) < 0 < float(data.q.max()) and away > SIDE * beyond
+    return ("|q1| q1", "|q1|^3") if data.dof == 1 and not any(data.angles) and crossed else ()
 
 
 def offered(data: Trajectories, every: NamedTerms, beside: NamedTerms, *, lacks: bool) -> NamedTerms:

@@ -15,7 +15,7 @@ from torch import Tensor
 from herglotz.data.files import read_bytes, write_atomically
 from herglotz.data.seal import check_seal, sealed_zip
 from herglotz.errors import InputError
-from herglotz.progress import SEARCH, ProgressBar
+from herglotz.progress import FINDING, LOOKING, RIVALS, STAGES, FitBar
 from herglotz.schema import check_entries
 from herglotz.telling import tell
 from herglotz.training.distributed import is_first
@@ -53,7 +53,7 @@ class Callback:
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""
-        self.bar.update(1)
+        self.bar.iterate()
         self.start = cost if self.start is None else self.start
         share = f"cost {cost / self.start:.3g} of its start" if self.start else ""
         self.bar.set_postfix_str(share, refresh=False)
@@ -70,8 +70,7 @@ class Stages:
 
     A fit is deterministic, so resuming is replaying: a stage that the checkpoint holds as finished is not run again,
     and an unfinished one goes on from all that its optimiser and its problem remembered. A resumed fit gives the same
-    bits as one that was not interrupted. One bar over all stages and searches shows their progress: the time of the fit
-    so far, and what is at most left of the stages begun. How long a search takes is not known before its end.
+    bits as one that was not interrupted. One bar over all stages and searches shows their progress.
     """
 
     def __init__(
@@ -86,8 +85,8 @@ class Stages:
         self.lines = progress in ("lines", "iterations") and is_first()
         self.verbose = progress == "iterations" and is_first()
         disable = (None if progress is None else self.lines or not progress) if is_first() else True
-        self.bar = ProgressBar(bar_format=SEARCH, disable=disable, leave=False, dynamic_ncols=True)
-        self.bar.search("looking at the data")
+        self.bar = FitBar(disable=disable)
+        self.bar.part(LOOKING, "looking at the data")
         self.checkpoint, self.key = checkpoint, key
         self.label = ""
         self.history: list[dict[str, Any]] = []
@@ -112,11 +111,12 @@ class Stages:
         """Plain values that something else than an optimisation finds; those of the checkpoint where it has them."""
         name += self.label
         if name not in self.kept:
-            began = time.monotonic()
-            self.bar.search(f"search for {name}")
+            began, rival = time.monotonic(), name.startswith("held out")
+            told = name if rival else f"search for {name}"
+            self.bar.part(RIVALS if rival else FINDING, told)
             self.kept[name] = make()
             if self.lines:
-                tell(f"search for {name}: {time.monotonic() - began:.1f} s")
+                tell(f"{told}: {time.monotonic() - began:.1f} s")
             self._write()
         return self.kept[name]
 
@@ -139,7 +139,7 @@ class Stages:
             result.x = result.x.to(x)
             remind(problem, result.memory)
         else:
-            self.bar.stage(name, total)
+            self.bar.part(STAGES, name, total)
             resumed = None if stored is None else stored["search"]
 
             def store(search: dict[str, Any]) -> None:

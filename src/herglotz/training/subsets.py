@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.training.config import FitConfig
-from herglotz.training.found_terms import Found
+from herglotz.training.found_terms import Found, gain
 from herglotz.training.named_terms import DRY, NamedTerms, places, shapes_of_dry, values_of
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.pruning import joining
@@ -29,6 +29,13 @@ def price_of(size: int, of: int, worth: float) -> float:
     The extended criterion of Chen & Chen (2008): of many subsets some lower the cost much by chance.
     """
     return size * worth / 2 + math.log(math.comb(of, size))
+
+
+def preferred(other: Found, found: Found, of: int, floor: float) -> bool:
+    """Whether the criterion prefers the terms of the other fit out of so many candidates; misfits below `floor` tie."""
+    count = other.fit.problem.data.q.numel()
+    price, its = (price_of(len(f.terms.names), of, math.log(count)) for f in (found, other))
+    return gain(found.rms, other.rms, count, floor) > its - price
 
 
 def missing(found: Found, problem: ShootingProblem, every: NamedTerms) -> str | None:

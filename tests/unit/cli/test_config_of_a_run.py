@@ -112,7 +112,8 @@ def test_angles_and_sensors_are_remembered(driven, tmp_path, told, named):
     words = ["fit", str(driven / "driven.csv"), "--out", str(tmp_path / "again"), "--no-plots"]
     assert main([*words, "--config", str(tmp_path / "run")]) in (0, 3)
     again = load_run(tmp_path / "again")
-    assert again.data.digest() == run.data.digest()
+    for name in ("t", "q", "u"):  # but for the rounding shake, which disturbs tables and no files
+        torch.testing.assert_close(getattr(again.data, name), getattr(run.data, name), rtol=1e-12, atol=0)
     assert again.data.angles == run.data.angles == (bool(named),)
 
 

@@ -1,6 +1,7 @@
 """Springs whose force bends at 0: how they are written, their force, and that a fit finds them unasked."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,3 +87,12 @@ def test_kinks_are_tried_where_a_force_is_missing():
     assert "|q1| q1" not in offered(data, every, cubic, lacks=False).features
     assert "|q1| q1" in offered(data, every, cubic.joined(NamedTerms(("q1^6",))), lacks=False).features  # a series
     assert "|q1|^3" in offered(data, every, NamedTerms(("|q1| q1",)), lacks=False).features
+
+
+def test_a_bend_on_the_far_side_is_no_candidate():
+    # fails if kinks are tried where a motion stays on one side of 0: they are powers there, and the last digit of the
+    # data, or the number of threads, decided which of the two a model has
+    data = hz.simulate("duffing", trajectories=1, steps=60, h=0.1)
+    for q in (data.q.abs(), data.q.clamp_min(-0.05 * float(data.q.max()))):
+        one_side = replace(data, q=q)
+        assert "|q1| q1" not in offered(one_side, candidates(one_side), NamedTerms(), lacks=True).features

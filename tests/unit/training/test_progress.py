@@ -11,7 +11,7 @@ from tqdm import tqdm
 
 import herglotz
 from herglotz.errors import InputError
-from herglotz.progress import ProgressBar
+from herglotz.progress import FEWER_TERMS, FIRST_TERMS, STAGES, FitBar, ProgressBar, beat, inside, part
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.stages import Progress, Stages
@@ -39,14 +39,76 @@ def test_lines_of_stages_and_of_iterations(capsys):
     assert lines[1] == "b, iteration 2: cost 0.25 of its start"
 
 
-def test_one_bar_goes_through_all_stages():  # fails if a stage's unused bound stays in the remaining time
+@pytest.fixture
+def clock(monkeypatch):
+    """[s], which all clocks read."""
+    now = [1000.0]
+    for name in ("time.time", "tqdm.std.time", "time.monotonic"):
+        monkeypatch.setattr(name, lambda: now[0])
+    return now
+
+
+def shown_by(stages):
+    """What its bar draws from now on; (text, last line)."""
+    written = StringIO()
+    stages.bar.ascii, stages.bar.fp, stages.bar.sp = True, written, stages.bar.status_printer(written)
+    return lambda: written.getvalue().split("\r")[-1].strip()
+
+
+def test_one_bar_tells_what_is_left_of_the_fit(clock):
+    # fails if a part's share of typical fits is lost, parts of a search inside one are not of its share, or the bar
+    # goes back
     stages = Stages(True, None, "", False)
+    last, shares = shown_by(stages), []
+
+    @inside()
+    def terms(of=(), first=0.0):
+        part(FIRST_TERMS)
+        assert stages.bar.span[0] == pytest.approx(0.05 + first)
+        for inner in of:
+            terms(*inner)
+        clock[0] += 11.5
+        part(FEWER_TERMS)
+        shares.append(stages.bar.span[0])
+        clock[0] += 1.0
+        return {}
+
     with stages.bar as bar:
-        for name, total in (("a", 100), ("b", 9)):
-            stages.run(name, torch.zeros(1), total, optimise)
-        assert (bar.n, bar.total) == (4, 2 + 9)
-        stages.keep("terms", lambda: {"desc": bar.desc})  # fails if a search has no name while it lasts
-        assert stages.kept["terms"] == {"desc": "search for terms: "}
+        clock[0] += 1.0
+        beat()
+        assert last() == "looking at the data:   0%|          | 00:01, about ? left"
+        stages.keep("terms", lambda: terms([((), 0.0)]))
+        assert shares == pytest.approx([0.05 + 0.6 * 0.65 * 0.7, 0.05 + 0.6 * 0.7])
+        assert bar.expected == pytest.approx(25.0 / (0.05 + 0.6 * 0.7))
+        stages.keep("held out, named terms", dict)
+        assert last() == "held out, named terms:  65%|######5   | 00:26, about 00:14 left"
+        stages.run("b", torch.zeros(1), 9, optimise)
+        clock[0] += 20.0
+        beat()
+        assert last() == "b:  70%|######9   | 00:46, about 00:20 left, cost 0.25 of its start"  # as long again
+        clock[0] += 20.0
+        bar.part(STAGES, "verdict")
+        assert last() == "verdict:  98%|#########7| 01:06, about 00:01 left"  # longer than typical fits
+    assert FitBar.under_way is None
+
+
+def test_a_stage_tells_the_time_of_its_iterations(clock):
+    # fails if a stage of 40 short iterations says 5 minutes because a search of 1000 s stood before it, or says nothing
+    # where no search stood before it
+    stages, left = Stages(progress=True), []
+
+    def slow(x, callback):
+        for k in range(40):
+            clock[0] += 0.5
+            callback(k + 1, 1.0, x, dict)
+            left.append(stages.bar.left)
+        return OptimiserResult(x, 1.0, "done", 40, [1.0], {})
+
+    with stages.bar:
+        stages.run("x", torch.zeros(1), 40, slow)
+    assert stages.bar.expected == 0
+    assert left[9] == pytest.approx(10 * 0.5)  # as many again as there were
+    assert left[29] == pytest.approx(10 * 0.5)  # as many as are left of its bound
 
 
 class Parabola:
@@ -59,30 +121,27 @@ class Parabola:
         return self.cost(x), torch.eye(1), x - 1
 
 
-def test_the_time_of_a_search_goes_on(monkeypatch, capsys):
-    # fails if a bar stands still at 00:00 for the minutes that a search for terms takes, draws a share that nobody
-    # knows, ends with the first fit in it, goes on being drawn after it, or a search has no line without a terminal
-    now = [1000.0]
-    for clock in ("time.time", "tqdm.std.time", "time.monotonic"):
-        monkeypatch.setattr(clock, lambda: now[0])
-    stages, shown = Stages(progress=True), StringIO()
-    stages.bar.fp, stages.bar.sp = shown, stages.bar.status_printer(shown)
+def test_the_time_of_a_search_goes_on(clock, capsys):
+    # fails if a bar stands still for the minutes that a search for terms takes, ends with the first fit in it, goes on
+    # being drawn after it, or a search has no line without a terminal
+    stages = Stages(progress=True)
+    last = shown_by(stages)
 
     def search():
         Stages().run("of a fit in it", torch.zeros(1), 9, optimise)
-        now[0] += 75.0
+        clock[0] += 75.0
         levenberg_marquardt(Parabola(), torch.zeros(1))
         return {}
 
     with stages.bar:
         stages.keep("terms", search)
-        assert shown.getvalue().split("\r")[-1].strip() == "search for terms: 01:15"
-    written = shown.getvalue()
-    now[0] += 75.0
+        assert last() == "search for terms:  35%|###5      | 01:15, about 02:19 left"
+    written = last()
+    clock[0] += 75.0
     levenberg_marquardt(Parabola(), torch.zeros(1))
-    assert shown.getvalue() == written
+    assert last() == written
     capsys.readouterr()
-    Stages("lines").keep("terms", lambda: now.append(now.pop() + 2) or {})
+    Stages("lines").keep("terms", lambda: clock.append(clock.pop() + 2) or {})
     assert capsys.readouterr().err == "search for terms: 2.0 s\n"
 
 
@@ -162,23 +221,3 @@ def test_bars_have_no_thread_that_python_may_end_in(monkeypatch):
     package = Path(herglotz.__file__).parent
     users = [path.name for path in package.rglob("*.py") if "import tqdm" in path.read_text("utf-8")]
     assert users == ["progress.py"]
-
-
-def test_the_remaining_time_leaves_the_search_before_a_stage_out(monkeypatch):
-    # fails if a stage of 40 short iterations says 5 minutes because a search of 1000 s stood before it
-    now = [1000.0]
-    for clock in ("time.time", "tqdm.std.time"):
-        monkeypatch.setattr(clock, lambda: now[0])
-    stages, rates = Stages(progress=True), []
-    now[0] += 1000.0
-
-    def slow(x, callback):
-        for k in range(5):
-            now[0] += 0.5
-            callback(k + 1, 1.0, x, dict)
-            rates.append(stages.bar.format_dict["rate"])
-        return OptimiserResult(x, 1.0, "done", 5, [1.0], {})
-
-    with stages.bar:
-        stages.run("x", torch.zeros(1), 40, slow)
-    assert rates[-1] == pytest.approx(2.0, rel=0.01)  # iterations a second

@@ -19,10 +19,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from herglotz.export.equation import Equations
+from herglotz.export.lower.fuse import fused
 from herglotz.export.lower.interpret import interpret
 from herglotz.export.lower.program import NAME, Program, Ref, literal
 from herglotz.export.step_parts import step_parts
 
+HANDED = re.compile(r"^const REAL (@(\d+) =)")
 PREPARE, BEGIN, EVALUATE, GAINS = range(4)
 Outputs = Mapping[str, Any]  # the place written to → its number, or the list of its numbers
 
@@ -143,16 +145,14 @@ def function(
     """One C function of statements and outputs."""
     name = lambda m: _name(program, int(m[1]), handed_on)  # noqa: E731
     lines: list[str] = []
-    for i in sorted(numbers):
-        statement = program.statements[i]
-        if statement.name:
-            continue
-        if statement.size and i not in handed_on:
-            lines.append(f"REAL t{i}[{statement.size}];")
-        text = statement.text
-        if i in handed_on:
-            text = text.replace(f"const REAL @{i} =", f"@{i} =", 1)
-        lines += NAME.sub(name, text).split("\n")
+    computed = [i for i in sorted(numbers) if not program.statements[i].name]
+    read = {x.statement for row in outputs.values() for x in _row(row) if isinstance(x, Ref)}
+    texts, inner = fused(program, computed, read | set(handed_on))
+    for i in computed:
+        if (size := program.statements[i].size) and i not in handed_on and i not in inner:
+            lines.append(f"REAL t{i}[{size}];")
+    for text in texts:
+        lines += NAME.sub(name, HANDED.sub(lambda m: m[1] if int(m[2]) in handed_on else m[0], text)).split("\n")
     for place, row in outputs.items():
         for i, atom in enumerate(_row(row)):
             right = program.read(atom) if isinstance(atom, Ref) else f"SPREAD({program.read(atom)})"

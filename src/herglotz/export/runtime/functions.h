@@ -1,8 +1,10 @@
 /* Functions that compilers vectorise, and rows of them. */
 
-/* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r in z = r^2. */
+/* The exponential series (e^r - 1 - r) / r^2 and the series of artanh(r) / r in z = r^2; in double precision even and
+   odd powers apart, which are computed side by side. */
 #if hz_SINGLE
 #define hz_LIMIT 20.0
+#define hz_FAR 80.0
 #define hz_LN2_HIGH 6.93359375e-01
 #define hz_LN2_LOW -2.12194440e-04
 #define hz_BIAS 127
@@ -15,35 +17,55 @@
      hz_R(1.0 / 5)) * z + hz_R(1.0 / 3)) * z + hz_R(1.0))
 #else
 #define hz_LIMIT 40.0
+#define hz_FAR 700.0
 #define hz_LN2_HIGH 6.93147180369123816490e-01
 #define hz_LN2_LOW 1.90821492927058770002e-10
 #define hz_BIAS 1023
 #define hz_MANTISSA 52
-#define hz_EXP_TERMS(r)                                                                                               \
-  (((((((((((hz_R(1.0 / 6227020800.0) * r + hz_R(1.0 / 479001600)) * r + hz_R(1.0 / 39916800)) * r +                   \
-           hz_R(1.0 / 3628800)) * r + hz_R(1.0 / 362880)) * r + hz_R(1.0 / 40320)) * r + hz_R(1.0 / 5040)) * r +       \
-       hz_R(1.0 / 720)) * r + hz_R(1.0 / 120)) * r + hz_R(1.0 / 24)) * r + hz_R(1.0 / 6)) * r + hz_R(0.5))
-#define hz_ARTANH_TERMS(z)                                                                                            \
-  (((((((((((((((((hz_R(1.0 / 35) * z + hz_R(1.0 / 33)) * z + hz_R(1.0 / 31)) * z + hz_R(1.0 / 29)) * z +              \
-                hz_R(1.0 / 27)) * z + hz_R(1.0 / 25)) * z + hz_R(1.0 / 23)) * z + hz_R(1.0 / 21)) * z +                \
-            hz_R(1.0 / 19)) * z + hz_R(1.0 / 17)) * z + hz_R(1.0 / 15)) * z + hz_R(1.0 / 13)) * z +                    \
-        hz_R(1.0 / 11)) * z + hz_R(1.0 / 9)) * z + hz_R(1.0 / 7)) * z + hz_R(1.0 / 5)) * z + hz_R(1.0 / 3)) * z +      \
-   hz_R(1.0))
+#define hz_EXP_EVEN(z)                                                                                                 \
+  (((((hz_R(1.0 / 479001600) * z + hz_R(1.0 / 3628800)) * z + hz_R(1.0 / 40320)) * z + hz_R(1.0 / 720)) * z +          \
+    hz_R(1.0 / 24)) * z + hz_R(0.5))
+#define hz_EXP_ODD(z)                                                                                                  \
+  (((((hz_R(1.0 / 6227020800.0) * z + hz_R(1.0 / 39916800)) * z + hz_R(1.0 / 362880)) * z + hz_R(1.0 / 5040)) * z +    \
+    hz_R(1.0 / 120)) * z + hz_R(1.0 / 6))
+#define hz_EXP_TERMS(r) (hz_EXP_EVEN((r * r)) + r * hz_EXP_ODD((r * r)))
+#define hz_ARTANH_EVEN(z)                                                                                              \
+  ((((((((hz_R(1.0 / 33) * z + hz_R(1.0 / 29)) * z + hz_R(1.0 / 25)) * z + hz_R(1.0 / 21)) * z + hz_R(1.0 / 17)) * z + \
+      hz_R(1.0 / 13)) * z + hz_R(1.0 / 9)) * z + hz_R(1.0 / 5)) * z + hz_R(1.0))
+#define hz_ARTANH_ODD(z)                                                                                               \
+  ((((((((hz_R(1.0 / 35) * z + hz_R(1.0 / 31)) * z + hz_R(1.0 / 27)) * z + hz_R(1.0 / 23)) * z + hz_R(1.0 / 19)) * z + \
+      hz_R(1.0 / 15)) * z + hz_R(1.0 / 11)) * z + hz_R(1.0 / 7)) * z + hz_R(1.0 / 3))
+#define hz_ARTANH_TERMS(z) (hz_ARTANH_EVEN((z * z)) + z * hz_ARTANH_ODD((z * z)))
 #endif
 
-/* exp(y) - 1 = 2^k (exp(r) - 1) + 2^k - 1 with |r| <= ln(2)/2, for |y| cut off at hz_LIMIT: a few units in the last
-   place, without branches or calls. Needs IEEE 754 numbers. NaN stays. */
-static inline hz_real hz_growth(hz_real y) {
+/* exp(r) - 1 and 2^k where y = k ln 2 + r with |r| <= ln(2)/2, for |y| <= hz_FAR: a few units in the last place, without
+   branches or calls. Needs IEEE 754 numbers. NaN stays. */
+static inline hz_real hz_reduced(hz_real y, hz_real *power) {
   hz_pun two;
-  hz_real r;
-  int k;
-  y = y > hz_R(hz_LIMIT) ? hz_R(hz_LIMIT) : y;
-  y = y < hz_R(-hz_LIMIT) ? hz_R(-hz_LIMIT) : y;
-  r = y == y ? y * hz_R(1.44269504088896340736) : hz_R(0.0);
-  k = (int)(r + (r < hz_R(0.0) ? hz_R(-0.5) : hz_R(0.5)));
+  hz_real r = y == y ? y * hz_R(1.44269504088896340736) : hz_R(0.0);
+  const int k = (int)(r + (r < hz_R(0.0) ? hz_R(-0.5) : hz_R(0.5)));
   r = (y - (hz_real)k * hz_R(hz_LN2_HIGH)) - (hz_real)k * hz_R(hz_LN2_LOW);
   two.bits = (hz_bits_t)(k + hz_BIAS) << hz_MANTISSA;
-  return two.number * (r + r * r * hz_EXP_TERMS(r)) + (two.number - hz_R(1.0));
+  *power = two.number;
+  return r + r * r * hz_EXP_TERMS(r);
+}
+
+/* exp(y) - 1 for |y| cut off at hz_LIMIT. */
+static inline hz_real hz_growth(hz_real y) {
+  hz_real two, e;
+  y = y > hz_R(hz_LIMIT) ? hz_R(hz_LIMIT) : y;
+  y = y < hz_R(-hz_LIMIT) ? hz_R(-hz_LIMIT) : y;
+  e = hz_reduced(y, &two);
+  return two * e + (two - hz_R(1.0));
+}
+
+static inline hz_real hz_expm1(hz_real x) { return hz_fabs(x) <= hz_R(hz_LIMIT) ? hz_growth(x) : hz_expm1_of(x); }
+
+static inline hz_real hz_exp(hz_real x) {
+  hz_real two, e;
+  if (!(hz_fabs(x) <= hz_R(hz_FAR))) return hz_exp_of(x);
+  e = hz_reduced(x, &two);
+  return two * e + two;
 }
 
 static inline hz_real hz_tanh(hz_real x) {
@@ -57,6 +79,13 @@ static inline hz_real hz_sigmoid(hz_real x) { return hz_R(0.5) + hz_R(0.5) * hz_
 static inline hz_real hz_softplus(hz_real x) {
   const hz_real size = hz_fabs(x), y = hz_R(1.0) + hz_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
   return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
+}
+
+/* artanh(x), by its series where |x| <= 1/3. */
+#define hz_SERIES hz_R(0.1111111111111111)
+static inline hz_real hz_atanh(hz_real x) {
+  const hz_real z = x * x;
+  return z <= hz_SERIES ? x * hz_ARTANH_TERMS(z) : hz_atanh_of(x);
 }
 
 static inline hz_real hz_choose(hz_real a, hz_real b, hz_real x, hz_real y) { return a > b ? x : y; }
@@ -99,20 +128,28 @@ static inline hz_lanes hz_wide_choose(hz_lanes a, hz_lanes b, hz_lanes x, hz_lan
   return hz_select((hz_masks)(a > b), x, y);
 }
 
-static inline hz_lanes hz_wide_growth(hz_lanes y) {
-  const hz_lanes most = hz_spread(hz_R(hz_LIMIT)), zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
-  hz_lanes r, whole;
+static inline hz_lanes hz_wide_reduced(hz_lanes y, hz_lanes *power) {
+  const hz_lanes zero = hz_spread(hz_R(0.0)), half = hz_spread(hz_R(0.5));
+  hz_lanes r = hz_select((hz_masks)(y == y), y * hz_R(1.44269504088896340736), zero), whole;
   hz_counts k;
-  hz_masks two;
-  y = hz_select((hz_masks)(y > most), most, y);
-  y = hz_select((hz_masks)(y < -most), -most, y);
-  r = hz_select((hz_masks)(y == y), y * hz_R(1.44269504088896340736), zero);
   r += hz_select((hz_masks)(r < zero), -half, half);
   k = __builtin_convertvector(r, hz_counts);
   whole = __builtin_convertvector(k, hz_lanes);
   r = (y - whole * hz_R(hz_LN2_HIGH)) - whole * hz_R(hz_LN2_LOW);
-  two = __builtin_convertvector(k + hz_BIAS, hz_masks) << hz_MANTISSA;
-  return (hz_lanes)two * (r + r * r * hz_EXP_TERMS(r)) + ((hz_lanes)two - hz_R(1.0));
+  *power = (hz_lanes)(__builtin_convertvector(k + hz_BIAS, hz_masks) << hz_MANTISSA);
+  return r + r * r * hz_EXP_TERMS(r);
+}
+
+static inline hz_lanes hz_wide_cut(hz_lanes y, hz_real limit) {
+  const hz_lanes most = hz_spread(limit);
+  y = hz_select((hz_masks)(y > most), most, y);
+  return hz_select((hz_masks)(y < -most), -most, y);
+}
+
+static inline hz_lanes hz_wide_growth(hz_lanes y) {
+  hz_lanes two;
+  const hz_lanes e = hz_wide_reduced(hz_wide_cut(y, hz_R(hz_LIMIT)), &two);
+  return two * e + (two - hz_R(1.0));
 }
 
 static inline hz_lanes hz_wide_fabs(hz_lanes x) { return hz_select((hz_masks)(x < hz_spread(hz_R(0.0))), -x, x); }
@@ -129,6 +166,34 @@ static inline hz_lanes hz_wide_softplus(hz_lanes x) {
   return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
+/* y_w = f(x_w) by <math.h> where the other formula does not hold. */
+#define hz_ELSE(holds, function)           \
+  do {                                     \
+    int w;                                 \
+    for (w = 0; w < hz_LANES; w++)         \
+      if (!(holds)) y[w] = function(x[w]); \
+  } while (0)
+static inline hz_lanes hz_wide_atanh(hz_lanes x) {
+  const hz_lanes z = x * x;
+  hz_lanes y = x * hz_ARTANH_TERMS(z);
+  hz_ELSE(z[w] <= hz_SERIES, hz_atanh_of);
+  return y;
+}
+
+static inline hz_lanes hz_wide_expm1(hz_lanes x) {
+  hz_lanes y = hz_wide_growth(x);
+  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_LIMIT), hz_expm1_of);
+  return y;
+}
+
+static inline hz_lanes hz_wide_exp(hz_lanes x) {
+  hz_lanes two, y = hz_wide_reduced(hz_wide_cut(x, hz_R(hz_FAR)), &two);
+  y = two * y + two;
+  hz_ELSE(hz_fabs(x[w]) <= hz_R(hz_FAR), hz_exp_of);
+  return y;
+}
+#undef hz_ELSE
+
 /* A function of <math.h>, lane by lane. */
 #define hz_LANE_BY_LANE(function)                           \
   static inline hz_lanes hz_wide_##function(hz_lanes x) {   \
@@ -138,10 +203,7 @@ static inline hz_lanes hz_wide_softplus(hz_lanes x) {
   }
 hz_LANE_BY_LANE(sin)
 hz_LANE_BY_LANE(cos)
-hz_LANE_BY_LANE(exp)
-hz_LANE_BY_LANE(expm1)
 hz_LANE_BY_LANE(sqrt)
-hz_LANE_BY_LANE(atanh)
 #undef hz_LANE_BY_LANE
 
 static inline hz_lanes hz_wide_pow(hz_lanes x, hz_real power) {

@@ -11,20 +11,20 @@
 #if hz_SINGLE
 #define hz_sin sinf
 #define hz_cos cosf
-#define hz_exp expf
-#define hz_expm1 expm1f
+#define hz_exp_of expf
+#define hz_expm1_of expm1f
 #define hz_sqrt sqrtf
-#define hz_atanh atanhf
+#define hz_atanh_of atanhf
 #define hz_pow powf
 #define hz_fabs fabsf
 #define hz_floor_of floorf
 #else
 #define hz_sin sin
 #define hz_cos cos
-#define hz_exp exp
-#define hz_expm1 expm1
+#define hz_exp_of exp
+#define hz_expm1_of expm1
 #define hz_sqrt sqrt
-#define hz_atanh atanh
+#define hz_atanh_of atanh
 #define hz_pow pow
 #define hz_fabs fabs
 #define hz_floor_of floor

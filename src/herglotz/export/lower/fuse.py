@@ -1,0 +1,91 @@
+"""Loops over rows of the same length as one loop, whose numbers stay in registers.
+
+A program has a loop for every operation on a row, and each stores what the next one loads. Loops that read one another
+entry by entry run as one here; rows that nothing else reads are not stored.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterable
+from typing import NamedTuple
+
+from herglotz.export.lower.program import NAME, Program
+
+LOOP_OVER = re.compile(r"for \(k = 0; k < (\d+); k\+\+\) @(\d+)\[k\] = (.*);")
+ENTRY = re.compile(r"@(\d+)\[k\]")
+
+
+class Loop(NamedTuple):
+    """A statement that computes a row, entry k out of numbers and entries k."""
+
+    number: int
+    count: int
+    right: str
+
+    @property
+    def whole_rows(self) -> set[int]:
+        """The statements that it reads otherwise than entry by entry."""
+        return {int(x) for x in NAME.findall(ENTRY.sub("", self.right))}
+
+
+def fused(program: Program, numbers: Iterable[int], kept: Collection[int]) -> tuple[list[str], set[int]]:
+    """The texts of these statements in an order in which they can run, and those whose results are no variables.
+
+    Rows of `kept` statements are stored.
+    """
+    texts, inner = [], set()
+    parts = _parts(program, sorted(numbers))
+    reads = [set().union(*(program.statements[i].reads for i in part)) for part in parts]
+    for at, part in enumerate(parts):
+        outside = set(kept).union(*reads[:at], *reads[at + 1 :])
+        loops = [loop for i in part if (loop := _loop(program, i)) is not None]
+        inside = {x.number for x in loops} - outside if len(part) > 1 else set()
+        texts.append(_one_loop(loops, inside) if len(part) > 1 else program.statements[part[0]].text)
+        inner |= inside
+    return texts, inner
+
+
+def _parts(program: Program, order: list[int]) -> list[list[int]]:
+    """Statements that are alone, and loops that are one: each goes on until a row of it is needed."""
+    loops = {i: loop for i in order if (loop := _loop(program, i)) is not None}
+    parts: list[list[int]] = []
+    waiting: dict[int, set[int]] = {}  # loops, and those of them that each needs, its own number among them
+
+    def run(needed: set[int]) -> None:
+        done = set().union(*(waiting.pop(i) for i in list(waiting) if i in needed))
+        for i in [i for i in waiting if i in done]:
+            del waiting[i]
+        if done:
+            parts.append(sorted(done))
+        for needs in waiting.values():
+            needs -= done
+
+    for i in order:
+        reads, loop = program.statements[i].reads, loops.get(i)
+        if loop is None:
+            run(reads & set(waiting))
+            parts.append([i])
+            continue
+        if any(loops[j].count != loop.count for j in waiting):
+            run(set(waiting))
+        run(loop.whole_rows & set(waiting))
+        waiting[i] = {i}.union(*(waiting[j] for j in reads if j in waiting))
+    run(set(waiting))
+    return parts
+
+
+def _loop(program: Program, number: int) -> Loop | None:
+    match = LOOP_OVER.fullmatch(program.statements[number].text)
+    return None if match is None else Loop(number, int(match[1]), match[3])
+
+
+def _one_loop(loops: list[Loop], inside: set[int]) -> str:
+    """Loops as one; numbers that no other statement reads, those `inside`, are not stored."""
+    own, lines = {x.number for x in loops}, []
+    for x in loops:
+        right = ENTRY.sub(lambda m: f"v{m[1]}" if int(m[1]) in own else m[0], x.right)
+        lines.append(f"  const REAL v{x.number} = {right};")
+        if x.number not in inside:
+            lines.append(f"  @{x.number}[k] = v{x.number};")
+    return "\n".join([f"for (k = 0; k < {loops[0].count}; k++) {{", *lines, "}"])
