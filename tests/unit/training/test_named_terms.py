@@ -360,11 +360,12 @@ def test_likelier_terms_do_not_push(monkeypatch, pushes):  # fails if friction t
     search: Any = object.__new__(DictionarySearch)
     found, other = (SimpleNamespace(terms=SimpleNamespace(names=names), coloured=False) for names in (("a", "b"), ()))
     found.config, other.pushes = SimpleNamespace(substeps=1), pushes
-    search.data, search.all, search.floor = SimpleNamespace(dof=1), None, 0.0
+    search.data, search.all, search.floor = SimpleNamespace(dof=1), SimpleNamespace(names=()), 0.0
     search._problem = lambda *_: (SimpleNamespace(task=SimpleNamespace(config=None)), None)
-    search.refit, search._preferred = lambda *_, **_settings: other, lambda *_: True
+    search.refit = lambda *_, **_settings: other
     search._held = search._longer = lambda it: it
     monkeypatch.setattr(dictionary_search, "likelier", lambda *_: [SimpleNamespace(values={}, terms=(), states=None)])
+    monkeypatch.setattr(dictionary_search, "preferred", lambda *_: True)
     monkeypatch.setattr(dictionary_search, "replace", lambda it, **_: it)
     assert search._likeliest(found) is (found if pushes else other)
 
