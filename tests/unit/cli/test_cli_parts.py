@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-from herglotz.cli import SIGNALS, _internal, _orderly, main, rollout
+from herglotz.cli import SIGNALS, _importing, _internal, _orderly, main, rollout
 from herglotz.cli.common import exit_code, print_next_of, print_table, warn_of_misfit
 from herglotz.cli.tune import _whole
 from herglotz.data import driving
@@ -146,3 +146,12 @@ def test_nothing_is_made_of_a_run_that_does_not_fit(capsys):  # fails if `select
         run: Any = SimpleNamespace(metrics={"verdict": verdict})
         print_next_of(run, Path("my run"), ["x"])
         assert capsys.readouterr().out.startswith(f"Next: {said}")
+
+
+def test_an_interrupt_knows_whether_a_module_is_imported():
+    # fails if every frame counts as an import, after which Ctrl-C ended the process at once, or the first frame ends it
+    frame = sys._getframe()
+    assert not _importing(frame)
+    assert not _importing(None)
+    inside = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
+    assert _importing(SimpleNamespace(f_code=frame.f_code, f_back=inside))

@@ -88,3 +88,23 @@ def test_two_equations_are_solved_by_hand(matrix):
 @pytest.mark.parametrize("matrix", [[0.0, 1.0, 0.0, 2.0], [1.0, 2.0, 2.0, 4.0]])
 def test_two_singular_equations_move_nowhere(matrix):  # fails if a division by zero is raised
     assert all(math.isnan(x) for x in _eliminate_numbers(*[*matrix, 3.0, -1.0]))
+
+
+@pytest.mark.parametrize("alone", [False, True])
+@pytest.mark.parametrize(("steep", "third"), [(30.0, -4.5e-5), (1.5, -5e-5)])
+def test_an_old_jacobian_that_misleads(steep, third, alone):
+    # fails if a move by an old Jacobian that raises |F| thirtyfold is taken, as where sharp friction turns joints back,
+    # or one that lowers it slowly is not: the third trial is at half of the first move, or one move on
+    tried = []
+
+    def equation(x, second):
+        tried.append(float(x))
+        slope = torch.where(x < 0, steep, 1.0)
+        return Point(slope * x + 1e-4, slope[..., None] if second else None)
+
+    def sizes(*_):
+        return (1.0, 1e3 * EPS) if alone else (torch.ones(1).double(), 1e3 * EPS * torch.ones(1).double())
+
+    found = newton(equation, torch.full((1, 1), 1e-5).double(), Rules(4 * EPS, 60, keep=True), sizes, alone=alone)
+    assert bool(found.done.all())
+    assert tried[:3] == pytest.approx([1e-5, -1e-4, third], rel=1e-6)
