@@ -12,7 +12,7 @@ run at different times, and hand on what a later piece reads as members of two s
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -143,25 +143,35 @@ def function(
     program: Program, head: str, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
 ) -> str:
     """One C function of statements and outputs."""
-    name = lambda m: _name(program, int(m[1]), handed_on)  # noqa: E731
-    lines: list[str] = []
+    lines = [*_computed(program, numbers, outputs, handed_on), *_written(program, outputs)]
+    text = NAME.sub(lambda m: _name(program, int(m[1]), handed_on), "\n".join(lines))
+    body = "".join(f"  {line}\n" for line in text.splitlines())
+    unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
+                     if not re.search(rf"\b{x}\b", body))  # fmt: skip
+    counter = "  int k;\n" if "(k = 0;" in body else ""
+    return f"{head} {{\n{counter}{unused}{body}}}\n"
+
+
+def _computed(
+    program: Program, numbers: Iterable[int], outputs: Outputs, handed_on: Mapping[int, str]
+) -> Iterator[str]:
+    """Rows as variables, unless a structure holds them or no one but their loop reads them, and all statements."""
     computed = [i for i in sorted(numbers) if not program.statements[i].name]
     read = {x.statement for row in outputs.values() for x in _row(row) if isinstance(x, Ref)}
     texts, inner = fused(program, computed, read | set(handed_on))
     for i in computed:
         if (size := program.statements[i].size) and i not in handed_on and i not in inner:
-            lines.append(f"REAL t{i}[{size}];")
+            yield f"REAL t{i}[{size}];"
     for text in texts:
-        lines += NAME.sub(name, HANDED.sub(lambda m: m[1] if int(m[2]) in handed_on else m[0], text)).split("\n")
+        yield HANDED.sub(lambda m: m[1] if int(m[2]) in handed_on else m[0], text)
+
+
+def _written(program: Program, outputs: Outputs) -> Iterator[str]:
+    """The outputs, put in their places."""
     for place, row in outputs.items():
         for i, atom in enumerate(_row(row)):
             right = program.read(atom) if isinstance(atom, Ref) else f"SPREAD({program.read(atom)})"
-            lines.append(f"{place if row is atom else f'{place}[{i}]'} = {NAME.sub(name, right)};")
-    body = "".join(f"  {line}\n" for line in lines)
-    unused = "".join(f"  (void){x};\n" for x in re.findall(r"(\w+)(?:\[\w+\])?(?=[,)])", head.rsplit("static", 1)[1])
-                     if not re.search(rf"\b{x}\b", body))  # fmt: skip
-    counter = "  int k;\n" if "(k = 0;" in body else ""
-    return f"{head} {{\n{counter}{unused}{body}}}\n"
+            yield f"{place if row is atom else f'{place}[{i}]'} = {right};"
 
 
 def _row(numbers: Any) -> list[Any]:

@@ -48,31 +48,28 @@ def fused(program: Program, numbers: Iterable[int], kept: Collection[int]) -> tu
 
 def _parts(program: Program, order: list[int]) -> list[list[int]]:
     """Statements that are alone, and loops that are one: each goes on until a row of it is needed."""
-    loops = {i: loop for i in order if (loop := _loop(program, i)) is not None}
     parts: list[list[int]] = []
     waiting: dict[int, set[int]] = {}  # loops, and those of them that each needs, its own number among them
-
-    def run(needed: set[int]) -> None:
-        done = set().union(*(waiting.pop(i) for i in list(waiting) if i in needed))
-        for i in [i for i in waiting if i in done]:
-            del waiting[i]
-        if done:
-            parts.append(sorted(done))
-        for needs in waiting.values():
-            needs -= done
-
+    length = 0
     for i in order:
-        reads, loop = program.statements[i].reads, loops.get(i)
+        reads, loop = program.statements[i].reads, _loop(program, i)
         if loop is None:
-            run(reads & set(waiting))
-            parts.append([i])
+            parts += [*_run(waiting, reads), [i]]
             continue
-        if any(loops[j].count != loop.count for j in waiting):
-            run(set(waiting))
-        run(loop.whole_rows & set(waiting))
+        parts += _run(waiting, set(waiting) if loop.count != length else loop.whole_rows)
+        length = loop.count
         waiting[i] = {i}.union(*(waiting[j] for j in reads if j in waiting))
-    run(set(waiting))
-    return parts
+    return [*parts, *_run(waiting, set(waiting))]
+
+
+def _run(waiting: dict[int, set[int]], needed: set[int]) -> list[list[int]]:
+    """The waiting loops whose rows are needed, with those that they need, as one part; they wait no more."""
+    done = set().union(*(needs for i, needs in waiting.items() if i in needed))
+    for i in done:
+        del waiting[i]
+    for needs in waiting.values():
+        needs -= done
+    return [sorted(done)] if done else []
 
 
 def _loop(program: Program, number: int) -> Loop | None:
