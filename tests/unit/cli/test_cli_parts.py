@@ -153,5 +153,6 @@ def test_an_interrupt_knows_whether_a_module_is_imported():
     frame = sys._getframe()
     assert not _importing(frame)
     assert not _importing(None)
-    inside = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
-    assert _importing(SimpleNamespace(f_code=frame.f_code, f_back=inside))
+    inside: Any = SimpleNamespace(f_code=SimpleNamespace(co_filename="<frozen importlib._bootstrap>"), f_back=None)
+    around: Any = SimpleNamespace(f_code=frame.f_code, f_back=inside)
+    assert _importing(around)
