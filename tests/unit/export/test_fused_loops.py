@@ -47,3 +47,19 @@ def test_loops_of_different_lengths_are_apart():  # fails if one counter runs ov
     product(program, x, x)
     product(program, x[:9], 3.0)
     assert [text.split(";")[1] for text in fused(program, {1, 2}, ())[0]] == [" k < 16", " k < 9"]
+
+
+def test_a_row_that_is_needed_later_is_stored():
+    # fails if a row that a later statement reads stays inside its loop, or a loop that has run is run again
+    program = Program()
+    x = np.array([*program.given("x", 16), None], object)[:-1]
+    double = product(program, x, 2.0)  # 1
+    square = product(program, double, x)  # 2
+    cube = product(program, square, x)  # 3
+    program.sum(square)  # 4
+    program.sum(cube)  # 5
+    texts, inner = fused(program, {1, 2, 3, 4, 5}, ())
+    assert [text.split(" = ")[0].strip() for text in texts] == ["for (k", "const REAL @4", "for (k", "const REAL @5"]
+    assert "@2[k] = v2;" in texts[0]
+    assert texts[2] == "for (k = 0; k < 16; k++) @3[k] = @2[k] * @0[k];"
+    assert inner == {1}
