@@ -99,14 +99,29 @@ class Potential(nn.Module):
             self.network = Network(sizes, 1.0, generator, activation=config.activation)
             self.network.blind = blind(config, 0)
 
-    def baseline(self, q: Jet) -> Jet:
-        """The part of V that no network is needed for."""
-        columns, q = [], q if self.across is None else q.linear(self.across)
-        for i, angle in enumerate(self.angles):
-            x = q.select(i)
-            columns.append((1.0 - x.cos() if angle else x * x * 0.5) * self.stiffness[i])
-            columns.append((x.sin() if angle else x) * self.tilt[i])
-        return sum(columns[1:], columns[0])
+    def baseline(self, q: Tensor, order: int) -> Jet:
+        """The part of V that no network is needed for: Σ f(xᵢ) with x = A q, so V′ = Aᵀf′ and V″ = Aᵀ diag(f″) A."""
+        n, A = q.shape[-1], self.across
+        f = self._own(q if A is None else q @ A.T)
+        rows = [f[0].sum(-1)[None], (f[1] if A is None else f[1] @ A).movedim(-1, 0)]
+        if order == 2:
+            A = torch.eye(n, dtype=q.dtype, device=q.device) if A is None else A
+            i, j = pairs(n, q.device)
+            rows.append((f[2] @ (A[:, i] * A[:, j])).movedim(-1, 0))
+        return Jet(torch.cat(rows), n, order)
+
+    def _own(self, x: Tensor) -> list[Tensor]:
+        """Each coordinate's own f(x), f′ and f″, (..., n)."""
+        k, b, angles = self.stiffness, self.tilt, self.angles
+        straight = [k * (x * x * 0.5) + b * x, k * x + b, k.expand(x.shape)]
+        if not any(angles):
+            return straight
+        sin, cos = x.sin(), x.cos()
+        turning = [k * (1.0 - cos) + b * sin, k * sin + b * cos, k * cos - b * sin]
+        if all(angles):
+            return turning
+        angle = torch.tensor(angles, device=x.device)
+        return [torch.where(angle, turned, moved) for turned, moved in zip(turning, straight, strict=True)]
 
     def departure(self, q: Jet) -> Jet | None:
         """The network's part of V, or None where the model has no network."""
@@ -117,7 +132,7 @@ class Potential(nn.Module):
     def forward(self, q: Tensor, order: int) -> Jet:
         """V as a jet over the n components of q."""
         x = coordinates(q, order)
-        V = self.baseline(x)
+        V = self.baseline(q, order)
         departure = self.departure(x)
         V = V if departure is None else V + departure
         for own in (term.potential(x) for term in self.more):

@@ -89,6 +89,7 @@ class Stages:
         self.bar.part(LOOKING, "looking at the data")
         self.checkpoint, self.key = checkpoint, key
         self.label = ""
+        self.begun: set[str] = set()
         self.history: list[dict[str, Any]] = []
         self.done: dict[str, dict[str, Any]] = {}
         self.kept: dict[str, dict[str, Any]] = {}
@@ -133,6 +134,9 @@ class Stages:
         `problem` is what the stage optimises, where later work goes on from what it remembers.
         """
         name += self.label
+        while name in self.begun:  # it starts elsewhere: the result of the first is not its own
+            name += ", again"
+        self.begun.add(name)
         stored = self.done.get(name)
         if stored is not None and stored["done"]:
             result = OptimiserResult(**{k: v for k, v in stored.items() if k != "done"})

@@ -39,6 +39,18 @@ def test_lines_of_stages_and_of_iterations(capsys):
     assert lines[1] == "b, iteration 2: cost 0.25 of its start"
 
 
+def test_a_second_stage_of_a_name_is_run():  # fails if it is given the first one's result, which started elsewhere
+    stages, starts = Stages(False, None, "", False), []
+
+    def kept(x, callback):
+        starts.append(float(x))
+        return optimise(x, callback)
+
+    found = [stages.run("b", torch.full((1,), start), 9, kept) for start in (1.0, 2.0, 3.0)]
+    assert starts == [float(result.x) for result in found] == [1.0, 2.0, 3.0]
+    assert list(stages.done) == ["b", "b, again", "b, again, again"]
+
+
 @pytest.fixture
 def clock(monkeypatch):
     """[s], which all clocks read."""

@@ -57,6 +57,7 @@ class Prior:
         force = float(self._baseline_force().square().mean().sqrt())
         self.force = force if force > 0 else 1.0
         self.index, self.spread = self._own(model, weight, rate_spread)
+        self.networks = self._index(*NETWORKS).to(self.start.device)  # what departures depend on
         with torch.no_grad():
             self.departs = departure is not None and bool(self._departures(self.start, self.grid, self.velocity))
 
@@ -76,9 +77,14 @@ class Prior:
         A = torch.zeros_like(theta).index_add(0, self.index, self.spread**-2).diag()
         if self.departs:
             # Point by point: the derivative of all outputs at all points at once took 44 GB for twenty coordinates.
-            slopes = vmap(jacrev(lambda *x: (r := self._departed(*x), r), has_aux=True), (None, 0, 0), out_dims=1)
-            J, r = (x.flatten(0, 1) for x in slopes(theta, self.grid, self.velocity))
-            cost, A, b = cost + r.square().sum() / 2, A + J.T @ J, b + J.T @ r
+            def departed(x: Tensor, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+                r = self._departed(theta.index_copy(0, self.networks, x), q, v)
+                return r, r
+
+            slopes = vmap(jacrev(departed, has_aux=True), (None, 0, 0), out_dims=1)
+            J, r = (x.flatten(0, 1) for x in slopes(theta[self.networks], self.grid, self.velocity))
+            A[self.networks[:, None], self.networks] += J.T @ J
+            cost, b = cost + r.square().sum() / 2, b.index_add(0, self.networks, J.T @ r)
         return cost, A, b
 
     def _own(self, model: ContactLagrangian, weight: float, rate_spread: float) -> tuple[Tensor, Tensor]:
@@ -105,7 +111,7 @@ class Prior:
     def _baseline_force(self) -> Tensor:
         with torch.no_grad():
             potential = self.parameters.model.potential
-            own = potential.baseline(coordinates(self.grid, 1)).gradient
+            own = potential.baseline(self.grid, 1).gradient
             if potential.features is None or bool(own.any()):
                 return own
             return potential.features(self.grid, 1).gradient  # the potential is made of features alone
