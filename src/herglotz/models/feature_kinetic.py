@@ -28,30 +28,32 @@ class FeatureKinetic(nn.Module):
         super().__init__()
         self.base = base
         self.sum = Combination(features, known, dof)
-        self.monomials: dict[tuple[int, ...], list[int]] = {}  # products by their velocities
-        for a, p in enumerate(self.sum.products):
-            self.monomials.setdefault(tuple(sorted(p.velocities)), []).append(a)
+        velocities = [tuple(sorted(p.velocities)) for p in self.sum.products]
+        self.monomials = list(dict.fromkeys(velocities))
+        of = [[float(own == monomial) for own in velocities] for monomial in self.monomials]
+        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)  # (monomials, A)
+        self.of: Tensor
 
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
         K = self.base(phase)
-        f = self._functions(phase, 0)
-        for velocities, which in self.monomials.items():
-            K = K + _times(_sum(f, which), phase.velocity, velocities) * phase.h
+        f = self._functions(phase, 0).linear(self.of)
+        for k, velocities in enumerate(self.monomials):
+            K = K + _times(f.select(k), phase.velocity, velocities) * phase.h
         return K
 
     def mass(self, q: Tensor) -> Tensor:
         """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
         c, n = self.sum, self.sum.dof
-        f = c.ridge(q @ c.form.T, 0) * c.weights()
+        f = (c.ridge(q @ c.form.T, 0) * c.weights()) @ self.of.T
         out = q.new_zeros(*q.shape, n)
-        for velocities, which in self.monomials.items():
+        for k, velocities in enumerate(self.monomials):
             if len(velocities) == 2:
                 i, j = velocities
                 unit = torch.zeros(n, n, dtype=q.dtype, device=q.device)
                 unit[i, j] += 1.0
                 unit[j, i] += 1.0
-                out = out + f[..., which].sum(-1)[..., None, None] * unit
+                out = out + f[..., k, None, None] * unit
         return out
 
     def straight(self, phase: Phase, rate: Tensor) -> Jet:
@@ -59,24 +61,24 @@ class FeatureKinetic(nn.Module):
         f = self._functions(phase, 0) * (rate * rate)
         w = phase.velocity.linear(self.sum.form)
         f = f + (self._functions(phase, 1) * (2 * rate) + self._functions(phase, 2) * w) * w
-        out = phase.velocity.select(0) * 0.0
-        for velocities, which in self.monomials.items():
-            out = out + _times(_sum(f, which), phase.velocity, velocities)
+        f, out = f.linear(self.of), phase.velocity.select(0) * 0.0
+        for k, velocities in enumerate(self.monomials):
+            out = out + _times(f.select(k), phase.velocity, velocities)
         return out
 
     def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
         """Return bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, b and y (..., n) constant; up to two velocities."""
         c, v = self.sum, phase.velocity
         f, slope = self._functions(phase, 0), self._functions(phase, 1)
-        turned = slope * (b @ c.form.T)
-        drag = slope * v.linear(c.form) + f * rate
-        out = v.select(0) * 0.0
-        for velocities, which in self.monomials.items():
-            out = out + _times(_sum(turned, which), v, velocities)
-            out = out - _sum(drag, which) * _derivative(v, velocities, b)
+        turned = (slope * (b @ c.form.T)).linear(self.of)
+        drag = (slope * v.linear(c.form) + f * rate).linear(self.of)
+        f, out = f.linear(self.of), v.select(0) * 0.0
+        for k, velocities in enumerate(self.monomials):
+            out = out + _times(turned.select(k), v, velocities)
+            out = out - drag.select(k) * _derivative(v, velocities, b)
             if len(velocities) == 2:
                 i, j = velocities
-                out = out - _sum(f, which) * (b[..., i] * y[..., j] + b[..., j] * y[..., i])
+                out = out - f.select(k) * (b[..., i] * y[..., j] + b[..., j] * y[..., i])
         return out
 
     def _functions(self, phase: Phase, k: int) -> Jet:
@@ -93,10 +95,6 @@ def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | P
     mass = PositionKinetic(config, generator) if config.mass_width else Kinetic(n, config.alike, config.diagonal)
     learned, known = (sorted_features(names, config.angles)[1] for names in (config.features, config.known))
     return FeatureKinetic(mass, learned, known, n) if learned or known else mass
-
-
-def _sum(f: Jet, which: list[int]) -> Jet:
-    return Jet(f.data[..., which].sum(-1), f.tangents, f.order)
 
 
 def _times(f: Jet, v: Jet, velocities: tuple[int, ...]) -> Jet:

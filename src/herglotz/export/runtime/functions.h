@@ -78,7 +78,7 @@ static inline hz_real hz_sigmoid(hz_real x) { return hz_R(0.5) + hz_R(0.5) * hz_
 /* log(1 + e^x), by log(1 + y) = 2 artanh(y / (2 + y)) with y = e^-|x|. */
 static inline hz_real hz_softplus(hz_real x) {
   const hz_real size = hz_fabs(x), y = hz_R(1.0) + hz_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
-  return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
+  return (x > hz_R(0.0) ? x : hz_R(0.0)) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
 /* artanh(x), by its series where |x| <= 1/3. */
@@ -163,7 +163,8 @@ static inline hz_lanes hz_wide_sigmoid(hz_lanes x) { return hz_R(0.5) + hz_R(0.5
 
 static inline hz_lanes hz_wide_softplus(hz_lanes x) {
   const hz_lanes size = hz_wide_fabs(x), y = hz_R(1.0) + hz_wide_growth(-size), r = y / (hz_R(2.0) + y), z = r * r;
-  return hz_R(0.5) * (x + size) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
+  const hz_lanes zero = hz_spread(hz_R(0.0));
+  return hz_select((hz_masks)(x > zero), x, zero) + hz_R(2.0) * r * hz_ARTANH_TERMS(z);
 }
 
 /* y_w = f(x_w) by <math.h> where the other formula does not hold. */
