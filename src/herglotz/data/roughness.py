@@ -52,6 +52,11 @@ def precision(data: Trajectories) -> float:
     return min(roughness(data, degree) for degree in DEGREES)
 
 
+def spread(data: Trajectories) -> float:
+    """Return the RMS of the positions about their means, in units of q."""
+    return float((data.q - data.q.mean(0)).square().mean().sqrt())
+
+
 def coarse(data: Trajectories) -> bool:
     """Whether `precision` is that of the polynomials, and the noise may be far below: the last degree still halves it.
 

@@ -39,7 +39,7 @@ LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "p
           "drag.coefficient")  # fmt: skip
 STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
 AT_ONCE = 1_000_000  # numbers of J formed together: 8 MB
-LARGE = 2.0**30  # coefficient
+LARGE = 2.0**30  # coefficient beside which the fixed masses, of size 1, are lost; a power of two divides out
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
 
 

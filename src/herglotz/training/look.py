@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
-from herglotz.data.roughness import roughness
+from herglotz.data.roughness import roughness, spread
 from herglotz.data.sensors import measured
 from herglotz.data.spikes import spikes, without
 from herglotz.data.windows import Triples
@@ -190,10 +190,9 @@ def _searched(first: Look, user_settings: FitConfig, stages: Stages, seen: Look,
     find = lambda: search(kept, base, plain, outliers=first.outliers, holds=holds)  # noqa: E731
     found = kept_structure("terms", find, base, settings, stages)
     at_one_step = not (_fine(seen.base) or kept.irregular)  # a network may learn what the rule misses at this step
-    if exact or (seen.baseline_motion is not None and at_one_step):
-        spread = float((kept.q - kept.q.mean(0)).square().mean().sqrt())
-        if found.sigma is None or found.sigma > SURE * spread:
-            return seen
+    explained = exact or (seen.baseline_motion is not None and at_one_step)
+    if explained and (found.sigma is None or found.sigma > SURE * spread(kept)):
+        return seen
     apart = MAY_DIFFER if found.apart and not seen.zeros else ""
     seen = replace(seen, structure=found.reason, found=found, apart=apart)
     return seen if found.sigma is None else replace(seen, settings=found.config, base=found.base, baseline_motion=None)

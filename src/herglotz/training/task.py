@@ -38,12 +38,6 @@ class Task:
         return max(self.base.scale)
 
     @property
-    def spread(self) -> float:
-        """RMS of the positions about their means, in units of q."""
-        q = self.data.q
-        return float((q - q.mean(0)).square().mean().sqrt())
-
-    @property
     def exact(self) -> float:
         """σ of exact data, in units of q."""
         return EXACT[self.config.dtype] * self.size

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import precision
+from herglotz.data.roughness import precision, spread
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
@@ -214,7 +214,7 @@ class SegmentStages:
         used = None if bool(first.problem.used.all()) else first.problem.used
         followed = 0.0
         if self.model.capabilities.sticking:  # no restoring force: errors grow with the length, and are the objective
-            followed = FOLLOWED * self.task.spread
+            followed = FOLLOWED * spread(self.task.data)
         for length in self.lengths[1:]:
             if not self.frozen:
                 sigma = last.noise if freedom else max(sigma, last.noise)
@@ -275,7 +275,7 @@ def fit_trajectories(
         least = min(departures)
         strongest = fit("strongest prior", least)
         held_out = {} if strongest is None else {least: strongest.held_out_errors()}
-        if strongest is not None and float(held_out[least].square().mean().sqrt()) > task.spread:
+        if strongest is not None and float(held_out[least].square().mean().sqrt()) > spread(task.data):
             return Chosen(strongest, least, held_out)
     # The weakest prior twice: the first round finds the noise, which then stays the same for all.
     noise = (fit("noise", max(departures)) or last).noise

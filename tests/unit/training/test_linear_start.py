@@ -5,7 +5,9 @@ import math
 import pytest
 import torch
 
-from herglotz.training.linear_start import LinearFit
+from herglotz.data.windows import Triples
+from herglotz.training import linear_start
+from herglotz.training.linear_start import LinearFit, NamedForces
 
 NAMES = ("mass", "mass", "potential.stiffness", "potential.stiffness", "potential.features.sum.coefficient")
 
@@ -56,3 +58,22 @@ def test_single_precision_gives_numbers():
     single = LinearFit(torch.zeros_like(fit.R).float(), fit.J.float(), NAMES)
     assert math.isfinite(single._misfit(x))
     assert torch.equal(single._polished(x), x)
+
+
+@pytest.mark.parametrize("large", [2.0**10, 2.0**40])
+@pytest.mark.parametrize(
+    ("angles", "names"), [((False, False), ("q1^4", "(q1 - q2)^2")), ((True, True), ("cos(q1)", "cos(q1 - q2) v1 v2"))]
+)
+def test_columns_are_derivatives(monkeypatch, angles, names, large):
+    # fails if a column is not linear in its coefficient (a difference then changes with its size), or loses digits
+    make = torch.Generator().manual_seed(0)
+    q0, q1, q2, u = torch.randn(4, 7, 2, generator=make, dtype=torch.float64)
+    h0, h1 = 0.1 + torch.rand(2, 7, generator=make, dtype=torch.float64)
+    t, rows = Triples(q0, q1, q2, h0, h1, torch.zeros(7, dtype=torch.long), torch.arange(7)), []
+    forces = NamedForces(drag=("|v1| v1" if all(angles) else "q1^2 v1",), dry=(1.0, 1.0), u=u)
+    for size in (linear_start.LARGE, large):
+        monkeypatch.setattr(linear_start, "LARGE", size)
+        rows.append(LinearFit.of(angles, names, t, torch.ones(2, dtype=torch.float64), forces))
+    assert set(rows[0].names) >= {"drag.coefficient", "friction.coulomb", "friction.input_map", "friction.viscous"}
+    torch.testing.assert_close(rows[0].R, rows[1].R, rtol=1e-10, atol=1e-10)
+    torch.testing.assert_close(rows[0].J, rows[1].J, rtol=1e-10, atol=1e-10)

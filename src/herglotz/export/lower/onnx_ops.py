@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import fx
 
+from herglotz.errors import InputError
 from herglotz.export.lower.onnx_writer import NUMPY, Writer, described
 
 aten = torch.ops.aten
@@ -61,6 +62,12 @@ def write_scaled(w: Writer, node: Any) -> str | None:
     return None
 
 
+def require(holds: bool, node: Any) -> None:
+    """Raise InputError where somebody's own term has an operation in a form that is not written."""
+    if not holds:
+        raise InputError(f"ONNX export does not know this form of {node.target}; export to --format pt2 or c")
+
+
 def write_slice(w: Writer, node: Any) -> str:
     """x[start:end:step] along one axis."""
     x, axis, start, end, *step = node.args
@@ -88,10 +95,9 @@ def write_item(w: Writer, node: Any) -> str:
         w.values[source] = w.several("Split", (w.name(x), w.integers(*sizes)), len(sizes), axis=axis_of(axis, x))
         return w.values[source][index]
     if source.target == aten.linalg_inv_ex.default:
-        assert index == 0
+        require(index == 0, source)
         return write_inverse(w, source.args[0])
-    assert source.target == aten.log_sigmoid_forward.default
-    assert index == 0
+    require(source.target == aten.log_sigmoid_forward.default and index == 0, source)
     return write_log_sigmoid(w, source.args[0])
 
 
@@ -122,7 +128,7 @@ def write_unflatten(w: Writer, node: Any) -> str:
     """The first axis as several."""
     x, axis, shape = node.args
     axis = axis_of(axis, x)
-    assert axis == 0
+    require(axis == 0, node)
     tail = w.emit("Shape", w.name(x), start=1)
     return w.emit("Reshape", w.name(x), w.emit("Concat", w.sizes(shape), tail, axis=0))
 
@@ -197,7 +203,7 @@ def write_truth(kind: str) -> Callable[[Writer, Any], str]:
 def write_addmm(w: Writer, node: Any) -> str:
     """C + A B."""
     c, a, b = node.args
-    assert not node.kwargs
+    require(not node.kwargs, node)
     return w.emit("Gemm", w.name(a), w.name(b), w.name(c))
 
 
@@ -257,7 +263,7 @@ def write_sigmoid_backward(w: Writer, node: Any) -> str:
 def write_nan_to_num(w: Writer, node: Any) -> str:
     """x, and a number where it is not finite."""
     x, nan, large = node.args
-    assert nan == large
+    require(nan == large, node)
     return w.emit("Where", w.finite(x), w.name(x), w.name(nan, described(node).dtype))
 
 
