@@ -85,8 +85,8 @@ class FeatureKinetic(nn.Module):
         """Return θ times the k-th derivatives of the functions, vector-valued (..., A)."""
         c, x = self.sum, phase.mean
         x = x.linear(c.form)
-        f0, f1 = c.ridge(x.value, k), c.ridge(x.value, k + 1)
-        return x.map(f0, f1, c.ridge(x.value, k + 2) if x.order == 2 else None) * c.weights()
+        f = (c.ridge(x.value, k + j) if j <= x.order else None for j in range(1, 3))
+        return x.map(c.ridge(x.value, k), *f) * c.weights()
 
 
 def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:

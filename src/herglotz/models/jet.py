@@ -6,7 +6,8 @@ A jet holds f, ∂_i f and ∂_i ∂_j f (i ≤ j) with respect to d tangent dir
 
     L = (c - 1) * (s0 - h / 2 * V0) + K - h / 2 * (V0 + V1)
 
-At order 1 the Hessian rows are absent. Every operation is an ordinary torch operation: autograd and vmap go through.
+At order 1 the Hessian rows are absent, at order 0 there are no tangent directions. Every operation is an ordinary torch
+operation: autograd and vmap go through.
 """
 
 from __future__ import annotations
@@ -52,22 +53,30 @@ def _embed_index(d: int, size: int, offset: int, order: int, device: torch.devic
 class Jet:
     """Value, gradient and (order 2) Hessian of a function of d variables."""
 
-    __slots__ = ("data", "order", "tangents")
+    __slots__ = ("_parts", "data", "order", "tangents")
 
     def __init__(self, data: Tensor, tangents: int, order: int):
         self.data = data  # (rows, ...)
         self.tangents = tangents
         self.order = order
+        self._parts: tuple[Tensor, ...] | None = None
+
+    def _split(self) -> tuple[Tensor, ...]:
+        """The rows of f, its gradient and its Hessian: what is split at once is joined at once on the way back."""
+        if self._parts is None:
+            d = self.tangents
+            self._parts = self.data.split([1, d, len(self.data) - 1 - d])
+        return self._parts
 
     @property
     def value(self) -> Tensor:
         """f, shape (...)."""
-        return self.data[0]
+        return self._split()[0][0]
 
     @property
     def gradient(self) -> Tensor:
         """∂_i f, shape (d, ...)."""
-        return self.data[1 : 1 + self.tangents]
+        return self._split()[1]
 
     def hessian(self) -> Tensor:
         """∂_i ∂_j f, shape (d, d, ...)."""
@@ -75,17 +84,18 @@ class Jet:
 
     @property
     def _second(self) -> Tensor:
-        return self.data[1 + self.tangents :]
+        return self._split()[2]
 
     def _with(self, *rows: Tensor) -> Jet:
         return Jet(torch.cat(rows), self.tangents, self.order)
 
-    def map(self, f0: Tensor, f1: Tensor, f2: Tensor | None) -> Jet:
-        """Chain rule for f(self), given f, f′ and f″ at the value."""
+    def map(self, f0: Tensor, f1: Tensor | None, f2: Tensor | None) -> Jet:
+        """Chain rule for f(self), given f and, as far as the order goes, f′ and f″ at the value."""
+        if f1 is None or not self.order:
+            return self._with(f0[None])
         g = self.gradient
-        if self.order == 1:
+        if f2 is None or self.order == 1:
             return self._with(f0[None], f1 * g)
-        assert f2 is not None
         i, j = pairs(self.tangents, self.data.device)
         return self._with(f0[None], f1 * g, f1 * self._second + f2 * (g[i] * g[j]))
 
@@ -159,7 +169,7 @@ class Jet:
             return Jet(self.data * other, self.tangents, self.order)
         a, b, ga, gb = self.value, other.value, self.gradient, other.gradient
         first = a * gb + b * ga
-        if self.order == 1:
+        if self.order < 2:
             return self._with((a * b)[None], first)
         i, j = pairs(self.tangents, self.data.device)
         second = a * other._second + b * self._second + ga[i] * gb[j] + ga[j] * gb[i]
@@ -204,6 +214,7 @@ def variable(x: Tensor, index: int, size: int, order: int) -> Jet:
 
 def affine(value: Tensor, slope: Tensor, order: int) -> Jet:
     """A vector-valued jet (..., m) with constant gradient: slope (d, m) or (d, ..., m) is ∂_i of each component."""
+    slope = slope if order else slope[:0]
     d = slope.shape[0]
     slope = slope.reshape(d, *(1,) * (value.ndim - slope.ndim + 1), *slope.shape[1:])
     rows = [value[None], slope.expand(d, *value.shape)]

@@ -65,27 +65,29 @@ class Slope:
 
     def _force(self) -> Tensor:
         """The force e, (..., n)."""
-        if self.features is not None:
-            return self._columns(torch.zeros_like(self.phase.q0)).value.movedim(0, -1)
         _, slope = self.potential.value_and_slope(self.phase.mean.value)
-        return -slope - self.rate * (self.phase.velocity.value @ self.constant)
+        e = -slope - self.rate * (self.phase.velocity.value @ self.constant)
+        if self.features is None:
+            return e
+        still = torch.zeros_like(e)
+        return e + self.features.along(*self._copies(still, 0), self.rate).value.movedim(0, -1)
 
     def _slope(self, y: Tensor) -> Tensor:
         """The derivatives of e − M y along (q0, q1) for a constant y, (..., n, 2n)."""
         if self.features is not None:
-            return self._columns(y).gradient.movedim((1, 0), (-2, -1))
+            return self._along(*self._copies(y, 1)).gradient.movedim((1, 0), (-2, -1))
         bend = self.potential(self.phase.mean.value, 2).hessian().movedim((0, 1), (-2, -1)) / 2
         drag = self.rate * self.constant / self.phase.h[..., None, None]
         return torch.cat([drag - bend, -drag - bend], -1)
 
-    def _columns(self, y: Tensor) -> Jet:
-        """The n components of e − M y, (n, ...), for a constant y: all at once, each with its own copy of (q0, q1)."""
+    def _copies(self, y: Tensor, order: int) -> tuple[Phase, Tensor, Tensor]:
+        """One copy of (q0, q1) and of y for each coordinate, (n, ...), with its direction: all of e − M y at once."""
         p, n = self.phase, self.phase.q0.shape[-1]
         delta = None if p.delta is None else p.delta.expand(n, *p.q0.shape)
         h = p.h.expand(n, *p.q0.shape[:-1])
         unit = torch.eye(n, dtype=y.dtype, device=y.device).reshape(n, *(1,) * (y.ndim - 1), n)
-        phase = Phase(p.q0.expand(n, *p.q0.shape), p.q1.expand(n, *p.q1.shape), h, 1, p.sizes, delta)
-        return self._along(phase, unit.expand(n, *y.shape), y.expand(n, *y.shape))
+        phase = Phase(p.q0.expand(n, *p.q0.shape), p.q1.expand(n, *p.q1.shape), h, order, p.sizes, delta)
+        return phase, unit.expand(n, *y.shape), y.expand(n, *y.shape)
 
 
 def missing(slope: Slope, V0: Jet, V1: Jet, root: Tensor) -> Jet:

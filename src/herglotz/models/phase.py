@@ -20,7 +20,7 @@ class Phase:
         q0: Tensor,  # (..., n)
         q1: Tensor,  # (..., n)
         h: Tensor,  # (...)
-        order: int,  # 1 or 2
+        order: int,  # 0, 1 or 2
         sizes: ModelConfig,  # angles, scale and speed of the coordinates
         delta: Tensor | None = None,  # (..., n) q1 − q0 where it is known better than by subtraction
     ):

@@ -330,10 +330,9 @@ class DictionarySearch:
     def _finer(self, found: Found, *, longer: bool = True) -> Found:
         """With as many model steps in a recorded one as the misfit asks for, over `longer` segments where it can be."""
         while self._too_long(found):
-            m, count = found.config.substeps, self.data.q.numel()
-            finer = (self.refit(found, found.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
-            lost = ((f, gain(f.rms, found.rms, count, FINE * self.floor)) for f in finer if f is not None)
-            other = next((f for f, by in lost if by < math.log(count) / 2), None)  # as much as one number is worth
+            m, of = found.config.substeps, found
+            finer = (self.refit(of, of.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
+            other = next((f for f in finer if f is not None and of.worth_halving(f, FINE * self.floor)), None)
             if other is None:
                 self.in_vain = (m, found.config.sticking), found.rms
                 break  # the terms make up for the longer steps

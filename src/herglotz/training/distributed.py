@@ -18,7 +18,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-PARTS, LEAST = 8, 512  # rows are divided into at most PARTS parts of at least LEAST rows
+PARTS, LEAST = 8, 1024  # rows are divided into at most PARTS parts of at least LEAST rows
 LANES = 2  # part k joins sum k mod 2, so that one process and two add the same numbers in the same order
 TIMEOUT = 60  # seconds that a process waits for the others; they do equal shares of the work between two sums
 

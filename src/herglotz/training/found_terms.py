@@ -105,6 +105,17 @@ class Found:
         count = self.fit.problem.data.q.numel()
         return gain(self.rms, more.rms, count, floor) > math.log(count) / 2
 
+    def worth_halving(self, finer: Found, floor: float) -> bool:
+        """Whether the same terms with shorter steps are worth their time.
+
+        The first time they may miss as much, for the terms may have made up for longer steps. Where steps have been
+        halved before, and a force is missing still, they have to miss less by a twentieth.
+        """
+        count = self.fit.problem.data.q.numel()
+        again = self.coloured and self.config.substeps > 1
+        worth = count * math.log(MARGIN) if again else -math.log(count) / 2
+        return gain(self.rms, finer.rms, count, floor) > worth
+
     def as_good(self, other: Found, floor: float) -> bool:
         """Whether these terms miss held-out blocks as little as the other ones, and all data by less than √2 times."""
         return self.rms <= 2**0.5 * max(other.rms, floor) and not self.beaten_by(other, floor)
