@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 
 import torch
 from torch import Tensor, nn
@@ -10,7 +11,7 @@ from torch import Tensor, nn
 from herglotz.models.config import ModelConfig
 from herglotz.models.feature_potential import Combination, sorted_features
 from herglotz.models.features import Feature
-from herglotz.models.jet import Jet
+from herglotz.models.jet import Jet, affine, of_mean_and_velocity
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.phase import Phase
 from herglotz.models.terms import Kinetic
@@ -30,22 +31,19 @@ class FeatureKinetic(nn.Module):
         self.sum = Combination(features, known, dof)
         velocities = [tuple(sorted(p.velocities)) for p in self.sum.products]
         self.monomials = list(dict.fromkeys(velocities))
-        of = [[float(own == monomial) for own in velocities] for monomial in self.monomials]
-        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)  # (monomials, A)
+        of = [[float(own == monomial) for monomial in self.monomials] for own in velocities]
+        self.register_buffer("of", torch.tensor(of, dtype=torch.float64), persistent=False)  # (A, monomials)
         self.of: Tensor
 
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
-        K = self.base(phase)
-        f = self._functions(phase, 0).linear(self.of)
-        for k, velocities in enumerate(self.monomials):
-            K = K + _times(f.select(k), phase.velocity, velocities) * phase.h
-        return K
+        K, v = self.base(phase), self._velocity(phase)
+        return K + self._summed(phase, {0: self._each([_times(v, of) for of in self.monomials])}) * phase.h
 
     def mass(self, q: Tensor) -> Tensor:
         """Return the features' part of ∂²K/∂v², (..., n, n), at q (..., n)."""
         c, n = self.sum, self.sum.dof
-        f = (c.ridge(q @ c.form.T, 0) * c.weights()) @ self.of.T
+        f = (c.ridge(q @ c.form.T, 0) * c.weights()) @ self.of
         out = q.new_zeros(*q.shape, n)
         for k, velocities in enumerate(self.monomials):
             if len(velocities) == 2:
@@ -58,35 +56,49 @@ class FeatureKinetic(nn.Module):
 
     def straight(self, phase: Phase, rate: Tensor) -> Jet:
         """Return K_qq[v, v] + 2γ K_q v + γ² K of the features: the change of K along the straight line."""
-        f = self._functions(phase, 0) * (rate * rate)
-        w = phase.velocity.linear(self.sum.form)
-        f = f + (self._functions(phase, 1) * (2 * rate) + self._functions(phase, 2) * w) * w
-        f, out = f.linear(self.of), phase.velocity.select(0) * 0.0
-        for k, velocities in enumerate(self.monomials):
-            out = out + _times(f.select(k), phase.velocity, velocities)
-        return out
+        v = self._velocity(phase)
+        P, w = self._each([_times(v, of) for of in self.monomials]), v.linear(self.sum.form)
+        Pw = P * w
+        return self._summed(phase, {0: P * (rate * rate), 1: Pw * (2 * rate), 2: Pw * w})
 
     def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
         """Return bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, b and y (..., n) constant; up to two velocities."""
-        c, v = self.sum, phase.velocity
-        f, slope = self._functions(phase, 0), self._functions(phase, 1)
-        turned = (slope * (b @ c.form.T)).linear(self.of)
-        drag = (slope * v.linear(c.form) + f * rate).linear(self.of)
-        f, out = f.linear(self.of), v.select(0) * 0.0
-        for k, velocities in enumerate(self.monomials):
-            out = out + _times(turned.select(k), v, velocities)
-            out = out - drag.select(k) * _derivative(v, velocities, b)
-            if len(velocities) == 2:
-                i, j = velocities
-                out = out - f.select(k) * (b[..., i] * y[..., j] + b[..., j] * y[..., i])
-        return out
+        v, form = self._velocity(phase), self.sum.form
+        P = self._each([_times(v, of) for of in self.monomials])
+        by_b = self._each([_derivative(v, of, b) for of in self.monomials])
+        twice = torch.stack([_second(of, b, y) for of in self.monomials], -1) @ self.of.T
+        return self._summed(phase, {1: P * (b @ form.T) - by_b * v.linear(form), 0: by_b * -rate - twice})
 
-    def _functions(self, phase: Phase, k: int) -> Jet:
-        """Return θ times the k-th derivatives of the functions, vector-valued (..., A)."""
-        c, x = self.sum, phase.mean
-        x = x.linear(c.form)
-        f = (c.ridge(x.value, k + j) if j <= x.order else None for j in range(1, 3))
-        return x.map(c.ridge(x.value, k), *f) * c.weights()
+    def _velocity(self, phase: Phase) -> Jet:
+        """Return v as a jet over its own components."""
+        v = phase.velocity.value
+        return affine(v, torch.eye(v.shape[-1], dtype=v.dtype, device=v.device), phase.order)
+
+    def _each(self, monomials: list[Jet]) -> Jet:
+        """Return for each product what belongs to its monomial, (..., A), of scalar jets."""
+        first = monomials[0]
+        return Jet(torch.stack([m.data for m in monomials], -1) @ self.of.T, first.tangents, first.order)
+
+    def _summed(self, phase: Phase, by_order: dict[int, Jet]) -> Jet:
+        """Return Σ_g θ_g Σ_k f_g⁽ᵏ⁾(w_g·q̄) R_k,g(v) over (q0, q1), for jets R_k over v, (..., A), by k.
+
+        As each f is a function of one number, its derivatives are those of f times w and w wᵀ: no jets are multiplied.
+        """
+        c, order = self.sum, phase.order
+        x, weights = phase.mean.value @ c.form.T, c.weights()
+        f = [c.ridge(x, k) * weights for k in range(max(by_order) + order + 1)]
+        whole = lambda part: reduce(torch.add, [part(k, R) for k, R in by_order.items()])  # noqa: E731
+        value = whole(lambda k, R: f[k] * R.value).sum(-1)
+        if not order:
+            return Jet(value[None], 0, 0)
+        by_q = whole(lambda k, R: f[k + 1] * R.value) @ c.form
+        by_v = whole(lambda k, R: f[k] * R.gradient).sum(-1)
+        second = None
+        if order == 2:
+            by_qq = whole(lambda k, R: f[k + 2] * R.value) @ c.outer
+            by_vq = whole(lambda k, R: f[k + 1] * R.gradient) @ c.form
+            second = by_qq.movedim(-1, 0), by_vq.movedim(-1, 1), whole(lambda k, R: f[k] * R.second).sum(-1)
+        return of_mean_and_velocity(value, by_q.movedim(-1, 0), by_v, second, phase.h)
 
 
 def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | PositionKinetic | FeatureKinetic:
@@ -97,11 +109,12 @@ def kinetic_term(config: ModelConfig, generator: torch.Generator) -> Kinetic | P
     return FeatureKinetic(mass, learned, known, n) if learned or known else mass
 
 
-def _times(f: Jet, v: Jet, velocities: tuple[int, ...]) -> Jet:
-    """Return the product f ∏v."""
-    for i in velocities:
-        f = f * v.select(i)
-    return f
+def _times(v: Jet, velocities: tuple[int, ...]) -> Jet:
+    """Return the product ∏v, without velocities 1."""
+    product = v.select(velocities[0])
+    for i in velocities[1:]:
+        product = product * v.select(i)
+    return product
 
 
 def _derivative(v: Jet, velocities: tuple[int, ...], b: Tensor) -> Jet:
@@ -110,3 +123,11 @@ def _derivative(v: Jet, velocities: tuple[int, ...], b: Tensor) -> Jet:
         return v.select(0) * 0.0 + b[..., velocities[0]]
     i, j = velocities
     return v.select(i) * b[..., j] + v.select(j) * b[..., i]
+
+
+def _second(velocities: tuple[int, ...], b: Tensor, y: Tensor) -> Tensor:
+    """Return the second derivative of ∏v along b and y, for at most two velocities."""
+    if len(velocities) == 1:
+        return torch.zeros_like(b[..., 0])
+    i, j = velocities
+    return b[..., i] * y[..., j] + b[..., j] * y[..., i]

@@ -80,10 +80,11 @@ class Jet:
 
     def hessian(self) -> Tensor:
         """∂_i ∂_j f, shape (d, d, ...)."""
-        return self._second[_unpack_index(self.tangents, self.data.device)]
+        return self.second[_unpack_index(self.tangents, self.data.device)]
 
     @property
-    def _second(self) -> Tensor:
+    def second(self) -> Tensor:
+        """∂_i ∂_j f for i ≤ j, shape (d(d+1)/2, ...)."""
         return self._split()[2]
 
     def _with(self, *rows: Tensor) -> Jet:
@@ -97,7 +98,7 @@ class Jet:
         if f2 is None or self.order == 1:
             return self._with(f0[None], f1 * g)
         i, j = pairs(self.tangents, self.data.device)
-        return self._with(f0[None], f1 * g, f1 * self._second + f2 * (g[i] * g[j]))
+        return self._with(f0[None], f1 * g, f1 * self.second + f2 * (g[i] * g[j]))
 
     def exp(self) -> Jet:
         """e^f."""
@@ -172,7 +173,7 @@ class Jet:
         if self.order < 2:
             return self._with((a * b)[None], first)
         i, j = pairs(self.tangents, self.data.device)
-        second = a * other._second + b * self._second + ga[i] * gb[j] + ga[j] * gb[i]
+        second = a * other.second + b * self.second + ga[i] * gb[j] + ga[j] * gb[i]
         return self._with((a * b)[None], first, second)
 
     def __truediv__(self, other: Constant) -> Jet:
@@ -194,8 +195,29 @@ def of_mean(jet: Jet) -> Jet:
     rows = [jet.value[None], half, half]
     if jet.order == 2:
         i, j = pairs(2 * n, jet.data.device)
-        rows.append(jet._second[_unpack_index(n, jet.data.device)[i % n, j % n]] / 4)
+        rows.append(jet.second[_unpack_index(n, jet.data.device)[i % n, j % n]] / 4)
     return Jet(torch.cat(rows), 2 * n, jet.order)
+
+
+def of_mean_and_velocity(
+    value: Tensor,  # (...)
+    by_q: Tensor,  # (n, ...)
+    by_v: Tensor,  # (n, ...)
+    second: tuple[Tensor, Tensor, Tensor] | None,  # rows ∂q_i ∂q_j for i ≤ j, ∂v_i ∂q_j (n, n, ...), rows ∂v_i ∂v_j
+    h: Tensor,  # (...)
+) -> Jet:
+    """A function of q̄ = (q0 + q1)/2 and v = (q1 − q0)/h as a jet over (q0, q1), from its derivatives by q̄ and v."""
+    n, half, slope = len(by_q), by_q / 2, by_v / h
+    rows = [value[None], half - slope, half + slope]
+    if second is not None:
+        unpack = _unpack_index(n, value.device)
+        same, move, mixed = second[0][unpack] / 4, second[2][unpack] / (h * h), second[1] / (2 * h)
+        turned = mixed.transpose(0, 1)
+        ends, sides, across = same + move, mixed + turned, same - move + turned - mixed
+        every = torch.cat([torch.cat([ends - sides, across], 1), torch.cat([across.transpose(0, 1), ends + sides], 1)])
+        i, j = pairs(2 * n, value.device)
+        rows.append(every[i, j])
+    return Jet(torch.cat(rows), 2 * n, 1 if second is None else 2)
 
 
 def coordinates(q: Tensor, order: int) -> Jet:
