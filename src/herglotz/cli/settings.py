@@ -137,8 +137,9 @@ MODEL = (
 OPTIMISER = (
     "objective and optimiser",
     setting("--objective", "residual: one-step error, for exact data. trajectory: whole trajectories, for noisy data. "
-            "smoothing: every state, and a little noise in every step, for pushes and chaos. auto: the first or the "
-            "second, by the noise. raw: a plain network on |R|, which collapses, for demonstration (default auto)",
+            "smoothing: every state, and a little noise in every step, for pushes and chaos. auto: trajectory where "
+            "named terms follow the data, else the first or the second, by the noise. raw: a plain network on |R|, "
+            "which collapses, for demonstration (default auto)",
             choices=OBJECTIVES),
     setting("--optimiser", "lm: Levenberg–Marquardt. adam, adamw: for residual and raw only (default lm)",
             choices=OPTIMISERS),
