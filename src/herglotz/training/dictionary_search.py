@@ -331,7 +331,8 @@ class DictionarySearch:
         """With as many model steps in a recorded one as the misfit asks for, over `longer` segments where it can be."""
         while self._too_long(found):
             m, of = found.config.substeps, found
-            finer = (self.refit(of, of.terms, shorter) for shorter in (2 * m, 4 * m) if shorter <= self.finest)
+            tried = (2 * m,) if of.halved_before else (2 * m, 4 * m)
+            finer = (self.refit(of, of.terms, shorter) for shorter in tried if shorter <= self.finest)
             other = next((f for f in finer if f is not None and of.worth_halving(f, FINE * self.floor)), None)
             if other is None:
                 self.in_vain = (m, found.config.sticking), found.rms

@@ -105,15 +105,19 @@ class Found:
         count = self.fit.problem.data.q.numel()
         return gain(self.rms, more.rms, count, floor) > math.log(count) / 2
 
+    @property
+    def halved_before(self) -> bool:
+        """Whether steps of several coordinates, which cost more, are halved ones, and a force is missing still."""
+        return self.coloured and self.config.substeps > 1 and self.fit.problem.n > 1
+
     def worth_halving(self, finer: Found, floor: float) -> bool:
         """Whether the same terms with shorter steps are worth their time.
 
-        The first time they may miss as much, for the terms may have made up for longer steps. Where steps have been
-        halved before, and a force is missing still, they have to miss less by a twentieth.
+        They may miss as much, for the terms may have made up for longer steps; where steps were halved before, they
+        have to miss less by a twentieth.
         """
         count = self.fit.problem.data.q.numel()
-        again = self.coloured and self.config.substeps > 1
-        worth = count * math.log(MARGIN) if again else -math.log(count) / 2
+        worth = count * math.log(MARGIN) if self.halved_before else -math.log(count) / 2
         return gain(self.rms, finer.rms, count, floor) > worth
 
     def as_good(self, other: Found, floor: float) -> bool:
