@@ -21,14 +21,14 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
-from herglotz.data import simulate
+from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
 from herglotz.stepping import Event, State, Stepper
 from herglotz.theory import boundary_value
-from herglotz.training import FitConfig, fit
+from herglotz.training import FitConfig, Run, fit
 
 HINGES = torch.tensor([[0.2, -0.1], [-0.1, 0.1]]).double()  # two viscous hinges 0.1, angles from the vertical
 
@@ -104,6 +104,13 @@ ROWS = [
 ]  # fmt: skip
 
 
+def fitted(data: Trajectories, settings: FitConfig) -> tuple[Run, dict[str, float]]:
+    """A fit, with what every row tells of it: its processor time and the numbers of its model."""
+    began = time.process_time()
+    run = fit(data, settings, progress=False)
+    return run, {"cpu_s": time.process_time() - began, "parameters": run.metrics["parameters"]}
+
+
 def free_run(model: ContactLagrangian, row: Row, of: Scene, seed: int) -> tuple[float, float]:
     """RMS and median of |error| over a free run from 10 unseen starts."""
     n, m = of.dof, row.told.substeps
@@ -125,22 +132,17 @@ def motion(row: Row, seed: int) -> dict:
     """One fit of one row."""
     of = row.make()
     data = simulate(of, trajectories=row.trajectories, steps=row.steps, h=row.h, seed=seed)
-    began = time.process_time()
-    run = fit(data, replace(row.told, seed=seed), progress=False)
-    cpu = time.process_time() - began
+    run, cost = fitted(data, replace(row.told, seed=seed))
     rms, median = free_run(run.model, row, of, seed)
-    return {"rms": rms, "median": median, "one_step": run.metrics["one_step_rms"], "cpu_s": cpu,
-            "parameters": run.metrics["parameters"]}  # fmt: skip
+    return {"rms": rms, "median": median, "one_step": run.metrics["one_step_rms"], **cost}
 
 
 def falling(seed: int) -> dict:
     """The parachute at the affine level: terminal speed and landing time, relative errors."""
     of, h = scene("parachute"), 0.05
     data = simulate(of, trajectories=10, steps=120, h=h, seed=seed)
-    began = time.process_time()
-    run = fit(data, told(level="affine", features=("1",), alike=True, damping_width=0, correction_width=0, seed=seed),
-              progress=False)  # fmt: skip
-    cpu = time.process_time() - began
+    settings = told(level="affine", features=("1",), alike=True, damping_width=0, correction_width=0, seed=seed)
+    run, cost = fitted(data, settings)
     q, v, s = torch.tensor([[100.0]]).double(), torch.tensor([[-5.0]]).double(), torch.zeros(1).double()
     p = of.momentum(q, v, s)
     stepper = Stepper(run.model)
@@ -153,8 +155,7 @@ def falling(seed: int) -> dict:
         middle = (low + high) / 2
         low, high = (middle, high) if float(of.flow(q, p, s, middle)[0]) > 0 else (low, middle)
     exact = -((of.parameters["g"] / of.parameters["lam"]) ** 0.5)
-    return {"terminal": abs(float(speed) / exact - 1), "landing": abs(landed / low - 1), "cpu_s": cpu,
-            "parameters": run.metrics["parameters"]}  # fmt: skip
+    return {"terminal": abs(float(speed) / exact - 1), "landing": abs(landed / low - 1), **cost}
 
 
 def braking(seed: int) -> dict:
@@ -166,15 +167,12 @@ def braking(seed: int) -> dict:
     of, h = scene("quadratic_drag"), 0.05
     data = simulate(of, trajectories=10, steps=120, h=h, seed=seed)
     settings = told(level="affine", alike=True, damping_width=0, correction_width=0, seed=seed)
-    began = time.process_time()
-    run, coarse = (fit(data.thinned(every), settings, progress=False) for every in (1, 2))
-    cpu = time.process_time() - began
+    (run, cost), (coarse, more) = (fitted(data.thinned(every), settings) for every in (1, 2))
     row = Row("", scene, h, 0, 0, PLAIN, 200, True, 0.0)  # type: ignore[arg-type]
     drag, double = (float(r.model.get_parameter("damping.drag").detach()[0]) / 2 for r in (run, coarse))
     wanted = of.parameters["lam"]
     return {"coefficient": abs(drag / wanted - 1), "coefficient, h → 0": abs((4 * drag - double) / 3 / wanted - 1),
-            "rms": free_run(run.model, row, of, seed)[0], "cpu_s": cpu,
-            "parameters": run.metrics["parameters"]}  # fmt: skip
+            "rms": free_run(run.model, row, of, seed)[0], **cost, "cpu_s": cost["cpu_s"] + more["cpu_s"]}  # fmt: skip
 
 
 FALLS = {"parachute, falling": (falling, ("terminal", "landing"), 1e-5),

@@ -156,13 +156,9 @@ DOUBLE = torch.tensor([[0.5, 0.5, 9.81, 4.905, 0.05, 0.05]], dtype=torch.float64
 def double_motion(q: Tensor, v: Tensor, h: float, samples: int) -> tuple[Tensor, Tensor]:
     """Positions and velocities (B, samples, 2) in the joint angles (θ1, θ2 − θ1), by short Runge–Kutta steps."""
     equation, y = Equation(relative=True), torch.cat([q, v], -1)
-
-    def field(y: Tensor) -> Tensor:
-        return torch.cat([y[:, 2:], equation.acceleration(y[:, :2], y[:, 2:], DOUBLE.expand(len(y), -1))], -1)
-
     out = [y]
     for _ in range(samples - 1):
-        y = rk4(field, y, h, 24)
+        y = rk4(lambda y: equation.field(y, DOUBLE), y, h, 24)
         out.append(y)
     both = torch.stack(out, 1)
     return both[..., :2], both[..., 2:]
