@@ -10,7 +10,19 @@ from collections.abc import Callable, Iterable
 import torch
 from torch import Tensor
 
-Flow = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+Triple = tuple[Tensor, Tensor, Tensor]
+Flow = Callable[[Tensor, Tensor, Tensor], Triple]
+
+
+def join(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """(q, p, s) as one tensor (..., 2n+1)."""
+    return torch.cat([q, p, s[..., None]], -1)
+
+
+def split(x: Tensor) -> Triple:
+    """Inverse of `join`."""
+    n = x.shape[-1] // 2
+    return x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
 
 
 def contact_form(p: Tensor) -> Tensor:
@@ -18,7 +30,7 @@ def contact_form(p: Tensor) -> Tensor:
     return torch.cat([-p, torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
 
 
-def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[Triple, Tensor]:
     """Value (q1, p1, s1) and derivative DΦ (..., 2n+1, 2n+1) of a map Φ of (q, p, s), by autograd, batched."""
     return flow_derivatives([flow], q, p, s)[0]
 
@@ -28,18 +40,18 @@ def flow_derivatives(
     q: Tensor,
     p: Tensor,
     s: Tensor,
-) -> list[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
+) -> list[tuple[Triple, Tensor]]:
     """Values and derivatives of Φ_1, Φ_2∘Φ_1, …, as `flow_derivative` has them, with every map evaluated once."""
-    n, found = q.shape[-1], []
+    found = []
     with torch.enable_grad():
-        x = torch.cat([q, p, s[..., None]], -1).detach().requires_grad_()
-        q, p, s = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
+        x = join(q, p, s).detach().requires_grad_()
+        q, p, s = split(x)
         for flow in flows:
             q, p, s = flow(q, p, s)
-            y = torch.cat([q, p, s[..., None]], -1)
+            y = join(q, p, s)
             rows = [
                 torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
-                for i in range(2 * n + 1)
+                for i in range(x.shape[-1])
             ]
             found.append(((q.detach(), p.detach(), s.detach()), torch.stack(rows, -2)))
     return found

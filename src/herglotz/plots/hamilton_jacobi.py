@@ -135,14 +135,10 @@ def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.nda
     distances, residuals = [], []
     off = fan.generating_functions(max(NULL_STEPS) + 1, moved)
     for k in NULL_STEPS:
-        S0, S1 = (_repeated(x, count) for x in (S[k - 1], S[k]))
+        S0, S1 = (S[j].map(lambda x: torch.cat([x] * count)) for j in (k - 1, k))
         distances.append((off[k].q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
         residuals.append(_residual(fan, S0, off[k], S1).reshape(count, -1).nanmedian(1).values)
     return torch.stack(distances).double().cpu().numpy(), torch.stack(residuals).double().cpu().numpy()
-
-
-def _repeated(S: GeneratingFunction, count: int) -> GeneratingFunction:
-    return GeneratingFunction(**{name: torch.cat([x] * count) for name, x in vars(S).items()})
 
 
 def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:

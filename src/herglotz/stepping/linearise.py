@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.contact import join
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.equation import model_equation
 from herglotz.stepping.partials_equation import PartialsEquation
@@ -92,7 +93,7 @@ def step_jacobian(
     def values(z: Tensor) -> Tensor:
         q, p, s, h, *u, delta = z.split(sizes, -1)
         F, p1, L = functions(q, p, s[..., 0], h[..., 0], delta, u[0] if u else None)
-        return torch.cat([F, p1, L[..., None]], -1)
+        return join(F, p1, L)
 
     rows = (slopes or forward_slopes)(values, point)  # (..., 2n+1, 3n+2+m) of F, p1 and L
     by_start, by_delta = rows[..., :-n], rows[..., -n:]

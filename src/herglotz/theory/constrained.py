@@ -23,7 +23,7 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.mechanics.newton import Root, attached, find_root
+from herglotz.mechanics.newton import Root, find_root
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
 from herglotz.theory.continuous import jacobian
@@ -126,22 +126,18 @@ class ConstrainedStepper(OneStepMethod):
             impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
             scale = torch.cat([size.expand(q0.shape), impulse], -1)
             root = find_root(equations, start, scale)
-        x = root.x
-        if torch.is_grad_enabled():
-            x = attached(x, root.J, balance(x, 1)[0])
+        x = root.with_slope(lambda x: balance(x, 1)[0])
         return x[..., :n], x[..., n:], root
 
     def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
         """The momentum p + Dgᵀμ with Dg·v = 0; where v is linear in p one Newton step finds μ."""
 
-        def equations(mu: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
             v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
             return (Dg @ v[..., None])[..., 0], Dg @ v_p @ Dg.mT
 
         start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
         scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
-        root = find_root(lambda mu: equations(mu, p), start, scale, iterations=PROJECTIONS)
-        mu = root.x
-        if torch.is_grad_enabled():
-            mu = attached(mu, root.J, equations(mu, p)[0])
+        root = find_root(equations, start, scale, iterations=PROJECTIONS)
+        mu = root.with_slope(lambda mu: equations(mu)[0])
         return p + (Dg.mT @ mu[..., None])[..., 0]

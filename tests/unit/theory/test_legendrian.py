@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import join, split
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -15,7 +16,6 @@ from herglotz.theory import (
     prolongation,
 )
 from herglotz.theory.continuous import jacobian
-from herglotz.theory.jacobi import join, split
 
 H = torch.tensor(0.1, dtype=torch.float64)
 
