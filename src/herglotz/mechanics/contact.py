@@ -6,6 +6,7 @@ Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -48,13 +49,30 @@ def flow_derivatives(
         q, p, s = split(x)
         for flow in flows:
             q, p, s = flow(q, p, s)
-            y = join(q, p, s)
-            rows = [
-                torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
-                for i in range(x.shape[-1])
-            ]
-            found.append(((q.detach(), p.detach(), s.detach()), torch.stack(rows, -2)))
+            found.append(((q.detach(), p.detach(), s.detach()), _rows(join(q, p, s), x, create_graph=False)))
     return found
+
+
+def jacobian(
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart
+    x: Tensor,  # (..., m)
+) -> tuple[Tensor, Tensor]:
+    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph where x or something inside f wants a gradient."""
+    keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
+    with torch.enable_grad():
+        x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
+        y = f(x)
+        if not y.requires_grad:  # a constant map
+            return y, y.new_zeros(*y.shape, x.shape[-1])
+        J = _rows(y, x, keep_graph)
+    return (y, J) if keep_graph else (y.detach(), J)
+
+
+def _rows(y: Tensor, x: Tensor, create_graph: bool) -> Tensor:
+    """∂y/∂x row by row, (..., k, m)."""
+    options: dict[str, Any] = {"retain_graph": True, "materialize_grads": True, "allow_unused": True}
+    options["create_graph"] = create_graph
+    return torch.stack([torch.autograd.grad(one.sum(), x, **options)[0] for one in y.unbind(-1)], -2)
 
 
 def contact_defect(

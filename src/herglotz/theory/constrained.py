@@ -23,10 +23,10 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.newton import Root, find_root
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
-from herglotz.theory.continuous import jacobian
 
 Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
 Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)

@@ -24,11 +24,10 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.mechanics.contact import Triple
+from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
-from herglotz.theory.continuous import jacobian
 from herglotz.theory.legendrian import contact_product_point
 
 RANK = 0.5  # power of eps: singular values below this times the largest count as zero

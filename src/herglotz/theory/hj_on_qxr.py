@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives, jacobian
+from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives
 
 Section = Callable[[Tensor, Tensor], Tensor]  # p = γ(q, s), (..., n) and (...) → (..., n)
 

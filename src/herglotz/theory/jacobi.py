@@ -15,8 +15,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.contact import Triple, contact_form, join, split
-from herglotz.theory.continuous import ScalarField, derivatives, jacobian
+from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
+from herglotz.theory.continuous import ScalarField, derivatives
 
 Field = Callable[[Tensor, Tensor, Tensor], Triple]
 

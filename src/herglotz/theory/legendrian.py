@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import Triple, contact_form, join, split
-from herglotz.theory.continuous import jacobian
+from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
 from herglotz.theory.function_germ import Function
 from herglotz.theory.jacobi import sharp_bivector
 

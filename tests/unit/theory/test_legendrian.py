@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import join, split
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -15,7 +15,6 @@ from herglotz.theory import (
     product_potential,
     prolongation,
 )
-from herglotz.theory.continuous import jacobian
 
 H = torch.tensor(0.1, dtype=torch.float64)
 

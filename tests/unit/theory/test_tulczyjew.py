@@ -5,7 +5,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_form
-from herglotz.mechanics.contact import join, split
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.scenes import scene
 from herglotz.stepping import Status
 from herglotz.theory import (
@@ -19,7 +19,6 @@ from herglotz.theory import (
     right_leg_states,
     tulczyjew_triple,
 )
-from herglotz.theory.continuous import jacobian
 
 
 def nonlinear(q0, q1, s0, h):
