@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
+from herglotz.data.splits import leading
 from herglotz.data.units import as_recorded, common_unit, size
 from herglotz.errors import InputError
 from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, label, new_figure, styled, with_unit
@@ -129,11 +130,7 @@ def trajectory_title(run: Run) -> str:
 
 def trained_mask(run: Run) -> torch.Tensor:
     """Return which samples were trained on, (N,) bool: the first `train_lengths` of every trajectory."""
-    data = run.data
-    mask = torch.zeros(data.samples, dtype=torch.bool)
-    for start, count in zip(data.offsets, run.train_lengths, strict=True):
-        mask[start : start + count] = True
-    return mask
+    return leading(run.data.lengths, run.train_lengths)
 
 
 def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
