@@ -40,7 +40,6 @@ class Problem:
     judge: Callable[[Predictor, bool], Metrics]  # (predictor, exact) → `rms`, `median`, `failures`, …
     simulated: bool = True  # whether exact velocities exist
     relative: bool = False  # whether the second coordinate of a double pendulum is the angle between its arms
-    dof: int = 1
     # Seed → metrics and parameters of ours, where it is judged by the free run from its own fitted states.
     own: Callable[[int], tuple[Metrics, int]] | None = None
 
@@ -207,7 +206,7 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
         return errors(model.rollout(q[:, 0], q[:, 1], steps, state), q, energy)
 
     title = f"double pendulum, friction at both joints, 100 × 100 positions, h = {h:g}; {steps} steps from 100 releases"
-    return Problem(title, samples, judge, relative=True, dof=2)
+    return Problem(title, samples, judge, relative=True)
 
 
 def on_grid(index: Tensor, q: Tensor) -> Tensor:
@@ -292,7 +291,7 @@ def ibm() -> Problem:
         return found | {"after": after}
 
     title = "measured chaotic double pendulum (IBM), runs 2 and 3 → windows of run 4; 0.5 s ahead"
-    return Problem(title, samples, judge, simulated=False, dof=2)
+    return Problem(title, samples, judge, simulated=False)
 
 
 # Steps h of the pendulum: 31, 13 and 6 samples a period.
