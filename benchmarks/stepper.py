@@ -86,10 +86,7 @@ def rolls(stepper: Any, state: State, steps: int) -> Callable[[], Any]:
 def row(what: str, most: float | None = None, *, least: float | None = None, unit: str = "", **found: Any) -> Row:
     """A row of the table: what was measured, its target, and whether the target was met."""
     value = found["ratio"]["median"] if "ratio" in found else found.get("value")
-    if most is not None and least is not None:
-        target = f"{least:g} … {most:g}"
-    else:
-        target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
+    target = f"<= {most:g}" if most is not None else f">= {least:g}" if least is not None else ""
     met = None if value is None or not target else (least or -math.inf) <= value <= (most or math.inf)
     return {"what": what, "target": f"{target} {unit}".strip() if target else "", "met": met, "unit": unit, **found}
 
