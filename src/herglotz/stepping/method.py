@@ -19,6 +19,7 @@ class OneStepMethod(ABC):
     """A stepper of states (q, p, s). A concrete one implements `step`; what follows is the same for all."""
 
     throw: bool = False  # raise `StepError` at the first sample that fails
+    iterates: bool = False  # whether steps want a guess
 
     @abstractmethod
     def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
@@ -84,7 +85,7 @@ class OneStepMethod(ABC):
         if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
             raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
         plan = Plan(h_all.shape[-1], every, chunk, checkpoint)
-        track = roll_out(start, Drive(self._single_step, h_all, plan, inputs, watch, self._iterates, self._check_step))
+        track = roll_out(start, Drive(self._single_step, h_all, plan, inputs, watch, self.iterates, self._check_step))
         q, p, s = track.states
         return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events, track.outside)
 
@@ -95,11 +96,6 @@ class OneStepMethod(ABC):
     def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002
         """The inputs (K, m) or (..., K, m) as a step takes them, beside positions `like`; refused if it takes none."""
         raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
-
-    @property
-    def _iterates(self) -> bool:
-        """Whether steps want a guess."""
-        return False
 
     def _single_step(self) -> OneStep:
         """The function that a rollout's steps are taken by."""

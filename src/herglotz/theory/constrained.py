@@ -49,6 +49,8 @@ class ConstrainedStepper(OneStepMethod):
     Source: section 6 of `docs/mathematics.md`.
     """
 
+    iterates = True
+
     def __init__(self, L_d: DiscreteLagrangian, constraint: Constraint, velocity: Velocity):
         self.L_d, self.constraint, self.velocity = L_d, constraint, velocity
 
@@ -80,10 +82,6 @@ class ConstrainedStepper(OneStepMethod):
         """λ of one step, (..., m); 2λ/h tends to the constraint's force (half of each impulse acts at each end)."""
         state = check_state(state)
         return self._solve(state, check_h(h, state.q), None)[1]
-
-    @property
-    def _iterates(self) -> bool:
-        return True
 
     def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """G(q) and Dg(q), (..., m) and (..., m, n)."""

@@ -64,6 +64,8 @@ class LegendrianStepper(OneStepMethod):
     Source: section 6 of `docs/mathematics.md`; the paper treats regular L_d only.
     """
 
+    iterates = True
+
     def __init__(self, L_d: DiscreteLagrangian, *, ahead: int = 1):
         if ahead < 0:
             raise InputError(f"ahead must be >= 0, got {ahead}")
@@ -112,10 +114,6 @@ class LegendrianStepper(OneStepMethod):
         y, status, _, _ = self._least_squares(lambda y: self._chain(moved(y), h, y[..., n:]), start)
         nan = torch.where(status == Status.CONVERGED, torch.zeros_like(s0), torch.nan)
         return State(moved(y).q + nan[..., None], p0, s0)
-
-    @property
-    def _iterates(self) -> bool:
-        return True
 
     def _chain(self, state: State, h: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """All c_j p_j + D1 L_d(q_j, q_{j+1}, s_j) for x = (q1, q2, …), and the size of their terms."""
