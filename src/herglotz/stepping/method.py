@@ -11,7 +11,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.stepping.events import Event, Watch
-from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
+from herglotz.stepping.rollout import Drive, OneStep, Plan, Track, roll_out
 from herglotz.stepping.state import Rollout, State, Step, check_h, check_state, step_sizes, throw_failure
 
 
@@ -81,13 +81,25 @@ class OneStepMethod(ABC):
         if events and checkpoint is not None:
             raise InputError("events and checkpoint exclude one another; leave one out")
         watch = Watch(events, start) if events else None
-        h_all = step_sizes(check_h(h, start.s), steps)
-        if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
-            raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
-        plan = Plan(h_all.shape[-1], every, chunk, checkpoint)
-        track = roll_out(start, Drive(self._single_step, h_all, plan, inputs, watch, self.iterates, self._check_step))
+        track = self._roll_out(start, h, steps, inputs, watch, every=every, chunk=chunk, checkpoint=checkpoint)
         q, p, s = track.states
         return Rollout(q, p, s, track.sigma, track.status, track.residual, track.events, track.outside)
+
+    def _roll_out(
+        self,
+        start: Any,
+        h: Tensor | float,
+        steps: int | None,
+        inputs: Tensor | None = None,
+        watch: Watch | None = None,
+        **plan: Any,
+    ) -> Track:
+        """The rollout of any named tuple of tensors whose last entry is (...); exported files have their own loop."""
+        h_all = step_sizes(check_h(h, start[-1]), steps)
+        if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
+            raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
+        cut = Plan(h_all.shape[-1], **plan)
+        return roll_out(start, Drive(self._single_step, h_all, cut, inputs, watch, self.iterates, self._check_step))
 
     def _checked(self, state: State) -> State:
         """The state, if this stepper can start from it."""
