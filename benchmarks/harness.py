@@ -1,4 +1,4 @@
-"""What all benchmarks share: flags, the machine, one JSON file that runs add to, tables and pictures.
+"""What all benchmarks share: flags, the machine, C files, one JSON file that runs add to, tables and pictures.
 
 Every command writes `NAME.json`, what was measured, and `NAME.md`, the table made from it. What an earlier run measured
 is kept, so that parts can be run alone and an interrupted run goes on where it stopped.
@@ -7,6 +7,7 @@ is kept, so that parts can be run alone and an interrupted run goes on where it 
 from __future__ import annotations
 
 import argparse
+import ctypes
 import io
 import json
 import math
@@ -14,6 +15,7 @@ import os
 import platform
 import statistics
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
@@ -23,6 +25,7 @@ from typing import Any
 import torch
 
 from herglotz.data.files import write_atomically
+from herglotz.export.c_wrapper import compiler
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -81,6 +84,16 @@ def _version(package: str) -> str:
         return version(package)
     except PackageNotFoundError:
         return "not installed"
+
+
+def compiled(source: str, header: str, text: str, *flags: str) -> ctypes.CDLL:
+    """A C file of this folder as a library; `text` is the header that it includes by the name `header`."""
+    with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
+        Path(folder, header).write_text(text)
+        library = Path(folder, "library.so")
+        files = [f"-I{folder}", str(Path(__file__).with_name(source)), "-o", str(library), "-lm"]
+        subprocess.run([*compiler(), *flags, "-shared", "-fPIC", *files], check=True)
+        return ctypes.CDLL(str(library))
 
 
 def seconds(run: Callable[[], Any], clock: Callable[[], float] = time.process_time) -> float:

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 import ctypes
-import subprocess
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from herglotz.export.c_wrapper import compiler
+from benchmarks.harness import compiled
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import Kinetic
 
-HAND_FLAGS = ("-std=c99", "-O3", "-march=native", "-ffast-math", "-shared", "-fPIC")
+HAND_FLAGS = ("-std=c99", "-O3", "-march=native", "-ffast-math")
 
 
 def parts(model: ContactLagrangian) -> dict[str, Tensor]:
@@ -46,7 +43,7 @@ def parts(model: ContactLagrangian) -> dict[str, Tensor]:
 class Hand:
     """`hand_written.c` with this model's weights."""
 
-    def __init__(self, model: ContactLagrangian, folder: Path):
+    def __init__(self, model: ContactLagrangian):
         dtype = next(model.parameters()).dtype
         self.dtype, self.n = dtype, model.config.dof
         single = dtype == torch.float32
@@ -64,12 +61,7 @@ class Hand:
         for name, value in arrays.items():
             numbers = ", ".join(repr(x) for x in value.double().reshape(-1).tolist())
             lines.append(f"static const real {name}[] = {{{numbers}}};")
-        (folder / "weights.h").write_text("\n".join(lines) + "\n")
-        source = Path(__file__).with_name("hand_written.c")
-        library = folder / "hand.so"
-        command = [*compiler(), *HAND_FLAGS, f"-I{folder}", str(source), "-o", str(library), "-lm"]
-        subprocess.run(command, check=True)
-        self.library = ctypes.CDLL(str(library))
+        self.library = compiled("hand_written.c", "weights.h", "\n".join(lines) + "\n", *HAND_FLAGS)
 
     def rollout(self, q: Tensor, p: Tensor, s: Tensor, h: float, steps: int) -> Tensor:
         """Positions after each step, (steps, n)."""
@@ -79,11 +71,6 @@ class Hand:
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*state, out)]
         self.library.hand_rollout(ctypes.c_long(steps), real(h), *pointers)
         return out
-
-
-def hand_written(model: ContactLagrangian) -> Hand:
-    with tempfile.TemporaryDirectory(prefix="herglotz-bench-") as folder:
-        return Hand(model, Path(folder))
 
 
 def jax_rollout(model: ContactLagrangian, iterations: int) -> Callable[..., Any] | None:

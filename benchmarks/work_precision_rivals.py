@@ -9,12 +9,9 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
-import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +19,11 @@ import torch
 from torch import Tensor
 from torch.func import jacrev, vmap
 
-from benchmarks.harness import seconds
+from benchmarks.harness import compiled, seconds
 from benchmarks.peers.rollouts import rk4
 from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
 from herglotz.data import simulate
-from herglotz.export.c_wrapper import FLAGS, compiler
+from herglotz.export.c_wrapper import FLAGS
 from herglotz.scenes.rigid_body import FreeBody
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt
@@ -87,15 +84,8 @@ class Native:
         if weights is not None:
             defines |= {"IN": weights.inputs, "WIDTH": weights.width, "LAYERS": weights.layers}
             defines["ANGLES"] = int(weights.angles)
-        with tempfile.TemporaryDirectory() as folder:
-            here = Path(folder)
-            (here / "dop853_step.h").write_text(dop853_source())
-            words = [f"-D{k}={v}" for k, v in defines.items()]
-            source = Path(__file__).with_name("work_precision.c")
-            target = here / "m.so"
-            command = [*compiler(), *FLAGS, *words, f"-I{here}", "-w", "-shared", "-fPIC", "-o", target, source, "-lm"]
-            subprocess.run([str(x) for x in command], check=True)
-            self.library = ctypes.CDLL(str(target))
+        words = [f"-D{k}={v}" for k, v in defines.items()]
+        self.library = compiled("work_precision.c", "dop853_step.h", dop853_source(), *FLAGS, *words, "-w")
         self.library.motions.restype = ctypes.c_long
         if weights is not None:
             values = weights.values.double().contiguous()
@@ -297,14 +287,12 @@ def _classic(point: dict, library: Native, case: Case, y: Tensor, method: str, x
 def neural(case: Case) -> list[Timed]:
     """Neural ODEs of several sizes, by RK4 and DOP853."""
     setup = case.setup
-    if not setup.neural:
-        return []
     size = {"trajectories": setup.trajectories, "steps": setup.steps, "h": setup.h, "seed": case.seed}
     data = simulate(setup.scene, **size, keep_state=True)
     y = torch.cat([case.start.q, setup.scene.velocity(*case.start)], -1)
     found, began = [], time.process_time()
     for width, layers in setup.neural:
-        weights: Weights = train_neural_ode(data, setup, width, layers, setup.neural_iterations, case.seed)
+        weights = train_neural_ode(data, setup, width, layers, setup.neural_iterations, case.seed)
         for dtype in ("float64", "float32"):
             library = Native(setup.name, dtype, weights, setup.scene.dof)
             for method in ("RK4", "DOP853"):

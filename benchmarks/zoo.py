@@ -23,10 +23,10 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from benchmarks.zoo_systems.drawing import draw
-from benchmarks.zoo_systems.ours import fit_ours, plain
+from benchmarks.zoo_systems.ours import fit_ours
 from benchmarks.zoo_systems.peers import fit_sindy
 from benchmarks.zoo_systems.prediction import MechanismModel, own_predictions, trained
-from benchmarks.zoo_systems.report import Predictions, outcome, relative, report, score, shares, shown
+from benchmarks.zoo_systems.report import Predictions, number, outcome, relative, report, score, shares, shown
 from benchmarks.zoo_systems.systems import ZooSystem
 
 KEPT = ("level", "objective", "train_rms", "extrapolation_rms", "follows_data", "verdict", "departure", "parameters")
@@ -40,10 +40,10 @@ def measure(of: ZooSystem, folder: Path, limit: float) -> dict[str, Any]:
         found = own_predictions(of, fit(of))
         row[name] = {**numbers(of, found), "cpu_s": time.process_time() - began}
     ours = fit_ours(of, folder, limit)
-    row["ours"] = {**numbers(of, ours.predictions), "cpu_s": ours.cpu, "said": ours.said, **plain(ours.metrics, KEPT)}
-    mine, theirs = (math.inf if row[name]["score"] is None else row[name]["score"] for name in ("ours", "sindy"))
-    size = math.inf if row["ours"]["relative"] is None else row["ours"]["relative"]
-    row["outcome"] = outcome(mine, size, bool(ours.said))
+    kept = {name: ours.metrics[name] for name in KEPT if name in ours.metrics}
+    row["ours"] = {**numbers(of, ours.predictions), "cpu_s": ours.cpu, "said": ours.said, **kept}
+    mine, theirs = (number(row[name]["score"]) for name in ("ours", "sindy"))
+    row["outcome"] = outcome(mine, number(row["ours"]["relative"]), bool(ours.said))
     row["ahead_of_sindy"] = math.isfinite(mine) and mine <= max(theirs, 1.0)
     return row
 

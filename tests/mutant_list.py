@@ -151,7 +151,7 @@ MUTANTS = [
     ("theory/caustics.py", 'first = count if len(margins) == 1 else first', 'first = torch.ones_like(count)'),
     ("theory/caustics.py", 'crossed = torch.where(passed & (crossed < 0), k, crossed)', 'crossed = torch.where(passed, k, crossed)'),
     ("theory/caustics.py", 'J[..., k, :, :].mT @ torch.linalg', 'J[..., k, :, :] @ torch.linalg'),
-    ("theory/caustics.py", 'return P.D11 + cross + cross.mT', 'return P.D11'),
+    ("theory/caustics.py", 'A, kinetic = left_hessian(P, p)', 'A, kinetic = P.D11'),
     ("theory/caustics.py", 'torch.where(turned, 0, _negative(-symmetric))', '_negative(-symmetric)'),
     ("theory/caustics.py", 'slope = torch.where(regular[..., None, None], carried, slope)', 'slope = carried'),
     ("theory/caustics.py", 'final = torch.where(regular, final, torch.stack(margins, -1).amin(-1))', 'pass'),

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib.util import find_spec
 
-from .continuous import train_delan, train_dissipative_hnn, train_hnn, train_lnn, train_neural_ode
-from .discrete import train_discrete_lagrangian, train_forced_discrete_lagrangian, train_mlp
+from .continuous import train_delan, train_hnn, train_lnn, train_neural_ode
+from .discrete import train_discrete_lagrangian, train_mlp
 from .known_equation import train_known_equation
 from .packages import train_ours, train_phlearn, train_sindy
 from .rollouts import Predictor
@@ -44,7 +45,7 @@ PEERS = {
     "mlp": Peer("MLP step map", train_mlp, "positions",
                 "net of (q1, (q1 − q0)/h) for the second difference, one step"),
     "hnn": Peer("HNN", train_hnn, "velocities", "Greydanus et al. 2019: net H(q, p), rates; cannot dissipate"),
-    "dissipative_hnn": Peer("dissipative HNN", train_dissipative_hnn, "velocities",
+    "dissipative_hnn": Peer("dissipative HNN", partial(train_hnn, dissipative=True), "velocities",
                             "Sosanya & Greydanus 2022: nets H and D, rates"),
     "lnn": Peer("LNN", train_lnn, "velocities",
                 "Cranmer et al. 2020: net L(q, v) on top of ½v·v, accelerations; no friction"),
@@ -53,7 +54,8 @@ PEERS = {
     "discrete_lagrangian": Peer("discrete Lagrangian net", train_discrete_lagrangian, "positions",
                                 "Lishkova et al. 2023, base point of Offen 2024: net L_d(q0, q1), residual; cannot "
                                 "dissipate"),
-    "forced_discrete_lagrangian": Peer("discrete forced Lagrangian net", train_forced_discrete_lagrangian, "positions",
+    "forced_discrete_lagrangian": Peer("discrete forced Lagrangian net",
+                                       partial(train_discrete_lagrangian, forced=True), "positions",
                                        "Hansen, Celledoni & Tapley 2025: nets L and F at midpoints, residual, penalty "
                                        "(log det)² on 128 pairs"),
     "phlearn": Peer("phlearn", train_phlearn, "velocities",

@@ -55,17 +55,12 @@ class Hamiltonian:
 
 
 def train_hnn(samples: Samples, seed: int, budget: float, *, dissipative: bool = False) -> Flow:
-    """Fit H to rates; the momentum is the velocity where only positions were given."""
+    """Fit H, and D where dissipative, to rates; the momentum is the velocity where only positions were given."""
     generator = torch.Generator().manual_seed(seed)
     motion = samples.motion()
     scales = Scales.of(samples.angles, torch.cat(samples.q), motion.p, motion.f)
     model = Hamiltonian(scales, generator, dissipative=dissipative)
     return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=True)
-
-
-def train_dissipative_hnn(samples: Samples, seed: int, budget: float) -> Flow:
-    """Fit H and D to rates."""
-    return train_hnn(samples, seed, budget, dissipative=True)
 
 
 def acceleration(L: Tensor, q: Tensor, v: Tensor) -> Tensor:

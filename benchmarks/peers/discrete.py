@@ -71,7 +71,9 @@ def regularity(mixed: Tensor) -> Tensor:
 
 
 def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, forced: bool = False) -> ThreePoint:
-    """Least squares of the residual with the penalty: |mixed − 1|² at a base point, or `regularity` where forced."""
+    """Least squares of the residual with the penalty |mixed − 1|² at a base point; where forced with discrete forces,
+    and `regularity` in its place.
+    """
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of_triples(samples)
     inputs = scales.q_inputs + samples.dof
@@ -92,11 +94,6 @@ def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, for
     fit, judge = (lambda i: loss(rows[i]) + REGULAR * penalty()), (lambda: loss(held) + REGULAR * penalty())
     train(fit, len(rows), judge, model.weights, generator, budget)
     return ThreePoint(model.residual, count(model.weights))
-
-
-def train_forced_discrete_lagrangian(samples: Samples, seed: int, budget: float) -> ThreePoint:
-    """With discrete forces."""
-    return train_discrete_lagrangian(samples, seed, budget, forced=True)
 
 
 class StepMap:

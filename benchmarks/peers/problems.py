@@ -40,7 +40,6 @@ class Problem:
     judge: Callable[[Predictor, bool], Metrics]  # (predictor, exact) → `rms`, `median`, `failures`, …
     simulated: bool = True  # whether exact velocities exist
     relative: bool = False  # whether the second coordinate of a double pendulum is the angle between its arms
-    dof: int = 1
     # Seed → metrics and parameters of ours, where it is judged by the free run from its own fitted states.
     own: Callable[[int], tuple[Metrics, int]] | None = None
 
@@ -156,13 +155,9 @@ DOUBLE = torch.tensor([[0.5, 0.5, 9.81, 4.905, 0.05, 0.05]], dtype=torch.float64
 def double_motion(q: Tensor, v: Tensor, h: float, samples: int) -> tuple[Tensor, Tensor]:
     """Positions and velocities (B, samples, 2) in the joint angles (θ1, θ2 − θ1), by short Runge–Kutta steps."""
     equation, y = Equation(relative=True), torch.cat([q, v], -1)
-
-    def field(y: Tensor) -> Tensor:
-        return torch.cat([y[:, 2:], equation.acceleration(y[:, :2], y[:, 2:], DOUBLE.expand(len(y), -1))], -1)
-
     out = [y]
     for _ in range(samples - 1):
-        y = rk4(field, y, h, 24)
+        y = rk4(lambda y: equation.field(y, DOUBLE), y, h, 24)
         out.append(y)
     both = torch.stack(out, 1)
     return both[..., :2], both[..., 2:]
@@ -211,7 +206,7 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
         return errors(model.rollout(q[:, 0], q[:, 1], steps, state), q, energy)
 
     title = f"double pendulum, friction at both joints, 100 × 100 positions, h = {h:g}; {steps} steps from 100 releases"
-    return Problem(title, samples, judge, relative=True, dof=2)
+    return Problem(title, samples, judge, relative=True)
 
 
 def on_grid(index: Tensor, q: Tensor) -> Tensor:
@@ -296,7 +291,7 @@ def ibm() -> Problem:
         return found | {"after": after}
 
     title = "measured chaotic double pendulum (IBM), runs 2 and 3 → windows of run 4; 0.5 s ahead"
-    return Problem(title, samples, judge, simulated=False, dof=2)
+    return Problem(title, samples, judge, simulated=False)
 
 
 # Steps h of the pendulum: 31, 13 and 6 samples a period.

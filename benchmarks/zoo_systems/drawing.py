@@ -71,7 +71,7 @@ def _attempt(rng: Generator, kind: str, seed: int, index: int) -> ZooSystem | No
     jitter = 0.25 if rng.random() < 0.2 else 0.0
     warmup = int(max(20, np.ceil(rate / 2)))
     rest = int(np.clip(4 * rate, 40, 250))
-    amplitude = float(rng.uniform(0.3, 1.0))
+    amplitude = _between(rng, 0.3, 1.0)
     noise = 0.0 if rng.random() < 0.3 else _log_uniform(rng, 0.001, 0.03)
     length_unit, time_unit = _log_uniform(rng, 1e-3, 10), 1 / _log_uniform(rng, 0.5, 30)
     drawn = []
@@ -130,14 +130,6 @@ def _pendulum(rng: Generator, _: int) -> Values:
     return values
 
 
-def _chain(rng: Generator, n: int) -> Values:
-    return {f"k{j}": _between(rng, 0.3, 1.5) for j in range(n + 1)} | {"k3": _between(rng, 0.0, 2.0)}
-
-
-def _pendulums(rng: Generator, n: int) -> Values:
-    return {f"g{i}": _between(rng, 0.7, 1.3) for i in range(n)} | {"k": _between(rng, 0.1, 0.6)}
-
-
 def _cart_pole(rng: Generator, _: int) -> Values:
     values: Values = {"m": _between(rng, 0.1, 0.4), "r": _between(rng, 0.5, 1.5), "g": 1.0}
     if rng.random() < 0.5:
@@ -151,8 +143,8 @@ def _spring(rng: Generator, _: int) -> Values:
     if shape == "van der Pol":
         return {"k": 1.0, "z0": _log_uniform(rng, 0.2, 2.0)}
     if shape == "double well":
-        return {"k": -1.0, "k3": float(rng.uniform(0.5, 2.0))}
-    values: Values = {"k": float(rng.uniform(0.3, 1.5))}
+        return {"k": -1.0, "k3": _between(rng, 0.5, 2.0)}
+    values: Values = {"k": _between(rng, 0.3, 1.5)}
     if shape != "linear":
         values["k3"] = _log_uniform(rng, 0.3, 10.0)
     if shape == "lopsided":
@@ -165,8 +157,8 @@ POTENTIALS: dict[str, Callable[[Generator, int], Values]] = {
     "spring": _spring,
     "pendulum": _pendulum,
     "axis": lambda rng, _: {"o0": _between(rng, -0.05, 0.05)},
-    "chain": _chain,
-    "pendulums": _pendulums,
+    "chain": lambda rng, n: {f"k{j}": _between(rng, 0.3, 1.5) for j in range(n + 1)} | {"k3": _between(rng, 0.0, 2.0)},
+    "pendulums": lambda rng, n: {f"g{i}": _between(rng, 0.7, 1.3) for i in range(n)} | {"k": _between(rng, 0.1, 0.6)},
     "double_pendulum": lambda rng, _: {"m": _between(rng, 0.3, 1.0), "r": _between(rng, 0.6, 1.2), "g": 1.0},
     "cart_pole": _cart_pole,
 }
@@ -177,12 +169,10 @@ def _friction(rng: Generator, friction: str, i: int, axis: bool) -> Values:
     if friction in ("viscous", "dry", "stribeck", "quadratic"):
         values[f"d{i}"] = _log_uniform(rng, 0.2, 0.8) if axis else _log_uniform(rng, 0.01, 0.3)
     if friction in ("dry", "stribeck"):
-        values[f"c{i}"] = float(rng.uniform(0.05, 0.2)) if axis else _log_uniform(rng, 0.01, 0.06)
+        values[f"c{i}"] = _between(rng, 0.05, 0.2) if axis else _log_uniform(rng, 0.01, 0.06)
     if friction == "stribeck":
-        values |= {
-            f"e{i}": float(values[f"c{i}"]) * float(rng.uniform(0.3, 1.0)),
-            f"w{i}": float(rng.uniform(0.05, 0.3)),
-        }
+        values[f"e{i}"] = float(values[f"c{i}"]) * _between(rng, 0.3, 1.0)
+        values[f"w{i}"] = _between(rng, 0.05, 0.3)
     if friction == "quadratic":
         values[f"a{i}"] = _log_uniform(rng, 0.03, 0.4)
     return values

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import os
 import resource
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,10 +55,9 @@ def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
 
 def complaint(metrics: dict[str, Any]) -> str:
     """What the metrics say against the fit; empty if nothing."""
-    verdict = metrics.get("verdict")
-    verdict = verdict.get("text", "") if isinstance(verdict, dict) else verdict or ""
-    if str(verdict).startswith("does not fit"):
-        return str(verdict)
+    verdict = str(metrics.get("verdict", ""))
+    if verdict.startswith("does not fit"):
+        return verdict
     if metrics.get("follows_data") is False:
         return "follows_data: false"
     status = metrics.get("extrapolation_status", "ok")
@@ -111,8 +108,3 @@ def _run_fit(folder: Path, limit: float) -> tuple[int | None, str, float]:
 def _children() -> float:
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
-
-
-def plain(metrics: dict[str, Any], names: Sequence[str]) -> dict[str, Any]:
-    """Some of the metrics, for the results."""
-    return {name: metrics[name] for name in names if name in metrics and json.dumps(metrics[name])}

@@ -55,6 +55,11 @@ def shown(score: float | None) -> str:
     return "not reached" if score is None else f"{score:.3g}"
 
 
+def number(score: float | None) -> float:
+    """An error for comparisons."""
+    return float("inf") if score is None else score
+
+
 def shares(rows: Sequence[Row]) -> dict[str, float]:
     """Share of the systems with each outcome, and of those where our free runs are not behind SINDy's."""
     found = {name: sum(row["outcome"] == name for row in rows) / len(rows) for name in OUTCOMES}
@@ -64,7 +69,7 @@ def shares(rows: Sequence[Row]) -> dict[str, float]:
 def report(rows: Sequence[Row], seed: int, limit: float) -> str:
     """Markdown."""
     commits = ", ".join(sorted({row["commit"] for row in rows}))
-    medians = {name: statistics.median(_number(row[name]["score"]) for row in rows) for name in METHODS}
+    medians = {name: statistics.median(number(row[name]["score"]) for row in rows) for name in METHODS}
     cpu = statistics.median(row["ours"]["cpu_s"] for row in rows)
     lines = [
         f"# The zoo: {len(rows)} systems drawn by seed {seed}",
@@ -93,7 +98,3 @@ def report(rows: Sequence[Row], seed: int, limit: float) -> str:
         ])  # fmt: skip
     head = ("", "system", "samples", "outcome", "ours", "SINDy", "known", "time, s", "what the fit said")
     return "\n".join([*lines, *table(head, cells), ""])
-
-
-def _number(score: float | None) -> float:
-    return float("inf") if score is None else score

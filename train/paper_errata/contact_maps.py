@@ -7,6 +7,7 @@ from collections.abc import Callable
 from torch import Tensor
 
 from herglotz.mechanics import Partials, mixed_hessian, momentum_minus, partials
+from herglotz.mechanics.contact import jacobian
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.theory import (
@@ -19,7 +20,6 @@ from herglotz.theory import (
     prolongation,
     relatedness_defect,
 )
-from herglotz.theory.continuous import jacobian
 from paper_errata.erratum import (
     OSCILLATOR,
     PARACHUTE,

@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import partials
+from herglotz.mechanics.contact import jacobian
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -24,7 +25,7 @@ from herglotz.theory import (
     prolongation,
     riccati_step,
 )
-from herglotz.theory.continuous import derivatives, jacobian
+from herglotz.theory.continuous import derivatives
 from paper_errata.erratum import OSCILLATOR, Erratum, Row, oscillator_start, printed_left, size, tensor
 
 

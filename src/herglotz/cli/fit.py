@@ -56,7 +56,11 @@ def run(arguments: argparse.Namespace) -> int:
     data, reading = data_of(arguments, columns_of(arguments))
     _fit_into(out, data, config, reading, arguments)
     result = load_run(out)  # what later commands will see, and on the cpu
-    drawn = _draw(result, out) if not arguments.no_plots else []
+    drawn: list[Path] = []
+    if not arguments.no_plots:
+        from herglotz.plots import save_figures
+
+        drawn = save_figures(result, out)
     if arguments.json:
         print_json(result.metrics)
     else:
@@ -99,12 +103,6 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     if drawn:
         say(f"Figures in {out}: {', '.join(path.name for path in drawn)}")
     print_next_of(result, out, ["report", out], ["verify", out], ["export", out, "--out", f"{out.name}.pt2"])
-
-
-def _draw(result: Run, out: Path) -> list[Path]:
-    from herglotz.plots import save_figures
-
-    return save_figures(result, out)
 
 
 def _make(folder: Path) -> list[Path]:

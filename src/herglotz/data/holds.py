@@ -67,7 +67,11 @@ def held(
     start = torch.minimum(torch.maximum(row - (count // 2 - 1), first), last - count + 1)
     near = start[..., None] + torch.arange(count, device=u.device)  # (..., count)
     x = t[near] - time[..., None]
-    # Lagrange's polynomials at 0: Π_{j ≠ i} x_j / (x_j − x_i).
-    ratio = x[..., None, :] / (x[..., None, :] - x[..., :, None]).where(~torch.eye(count, dtype=torch.bool), 1.0)
-    weights = ratio.where(~torch.eye(count, dtype=torch.bool), 1.0).prod(-1)
-    return (weights[..., None] * u[near]).sum(-2)
+    return (lagrange(x)[..., None] * u[near]).sum(-2)
+
+
+def lagrange(x: Tensor) -> Tensor:
+    """Weights of values at the nodes x in the polynomial through them at 0, Π_{j ≠ i} x_j / (x_j − x_i); (..., k)."""
+    own, other = x[..., :, None], x[..., None, :]
+    same = torch.eye(x.shape[-1], dtype=torch.bool, device=x.device)
+    return torch.where(same, 1.0, other / torch.where(same, 1.0, other - own)).prod(-1)

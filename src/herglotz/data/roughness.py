@@ -7,6 +7,7 @@ import math
 import torch
 from torch import Tensor
 
+from herglotz.data.holds import lagrange
 from herglotz.data.trajectories import Trajectories
 
 SAMPLES, DEGREE = 9, 5  # a polynomial of this degree is fitted to so many samples in a row
@@ -99,7 +100,5 @@ def _missed(data: Trajectories, every: int) -> float:
         return math.inf
     at, middle = rows[:, None] + every * torch.arange(4), rows + every + every // 2
     t, q = data.t.double().cpu(), (data.q / data.balance).double().cpu()
-    times = t[at] - t[middle][:, None]
-    own, other, same = times[:, :, None], times[:, None, :], torch.eye(4, dtype=torch.bool)
-    weights = torch.where(same, 1.0, other / torch.where(same, 1.0, other - own)).prod(-1)  # Lagrange's, at 0
+    weights = lagrange(t[at] - t[middle][:, None])
     return float(((weights[..., None] * q[at]).sum(1) - q[middle]).square().mean().sqrt())

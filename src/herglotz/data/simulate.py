@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,39 +12,10 @@ from torch import Tensor
 from herglotz.data.checks import DTYPES, MIN_SAMPLES, check_positive
 from herglotz.data.trajectories import Trajectories
 from herglotz.errors import InputError
-from herglotz.scenes import scene as scene_named
+from herglotz.scenes import Scene, scene as scene_named
 
 LONGEST_GAP = 3  # consecutive samples that one gap deletes at most
 Range = tuple[float | Sequence[float] | Tensor, float | Sequence[float] | Tensor]
-
-
-class Scene(Protocol):
-    """What `simulate` needs of a scene; the scenes of `herglotz.scenes` provide it."""
-
-    @property
-    def name(self) -> str: ...  # noqa: D102
-    @property
-    def dof(self) -> int: ...  # noqa: D102
-    @property
-    def coordinates(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def units(self) -> tuple[str, ...]: ...  # noqa: D102
-    @property
-    def angles(self) -> tuple[bool, ...]: ...  # noqa: D102
-    @property
-    def h(self) -> float: ...  # noqa: D102
-    @property
-    def q_range(self) -> Range: ...  # noqa: D102
-    @property
-    def v_range(self) -> Range: ...  # noqa: D102
-
-    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, /) -> tuple[Tensor, Tensor, Tensor]:
-        """Return (q, p, s) a time h later."""
-        ...
-
-    def momentum(self, q: Tensor, v: Tensor, s: Tensor, /) -> Tensor:
-        """Return p = ∂L/∂v."""
-        ...
 
 
 OF_AN_L_D = (

@@ -25,10 +25,8 @@ def time_split(
     samples.
     """
     check_fraction(fraction)
-    train, test = [], []
     cuts = tuple(round(fraction * length) for length in lengths)
     rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True))
-    start = 0
     for b, (cut, left) in enumerate(zip(cuts, rest, strict=True)):
         if min(cut, left) < MIN_SAMPLES:
             raise InputError(
@@ -36,16 +34,18 @@ def time_split(
                 f"into {cut} and {left}, each part needs {MIN_SAMPLES}; record more, change the fraction, or leave the "
                 "trajectory out"
             )
-        train.append(torch.arange(start, start + cut))
-        test.append(torch.arange(start + cut, start + cut + left))
-        start += cut + left
-    return (torch.cat(train), cuts), (torch.cat(test), rest)
+    train = leading(lengths, cuts)
+    return (train.nonzero()[:, 0], cuts), ((~train).nonzero()[:, 0], rest)
+
+
+def leading(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
+    """Which samples are the first `lengths[b]` ones of their trajectory b, which has `of[b]`; (N,) bool."""
+    return torch.cat([torch.arange(count) < k for count, k in zip(of, lengths, strict=True)])
 
 
 def leading_rows(of: Sequence[int], lengths: Sequence[int]) -> Tensor:
-    """Rows of the first `lengths[b]` samples of every trajectory b, which has `of[b]`."""
-    spans = [torch.arange(first, first + k) for first, k in zip(offsets_of(of), lengths, strict=True)]
-    return torch.cat(spans)
+    """Rows of these samples."""
+    return leading(of, lengths).nonzero()[:, 0]
 
 
 def liveliest_rows(q: Tensor, lengths: Sequence[int], most: int) -> Part:

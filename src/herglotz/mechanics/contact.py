@@ -6,11 +6,24 @@ Tangent vectors of (q, p, s) are ordered q₁…q_n, p₁…p_n, s, so a map's d
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
 
-Flow = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
+Triple = tuple[Tensor, Tensor, Tensor]
+Flow = Callable[[Tensor, Tensor, Tensor], Triple]
+
+
+def join(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
+    """(q, p, s) as one tensor (..., 2n+1)."""
+    return torch.cat([q, p, s[..., None]], -1)
+
+
+def split(x: Tensor) -> Triple:
+    """Inverse of `join`."""
+    n = x.shape[-1] // 2
+    return x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
 
 
 def contact_form(p: Tensor) -> Tensor:
@@ -18,7 +31,7 @@ def contact_form(p: Tensor) -> Tensor:
     return torch.cat([-p, torch.zeros_like(p), torch.ones_like(p[..., :1])], -1)
 
 
-def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[tuple[Tensor, Tensor, Tensor], Tensor]:
+def flow_derivative(flow: Flow, q: Tensor, p: Tensor, s: Tensor) -> tuple[Triple, Tensor]:
     """Value (q1, p1, s1) and derivative DΦ (..., 2n+1, 2n+1) of a map Φ of (q, p, s), by autograd, batched."""
     return flow_derivatives([flow], q, p, s)[0]
 
@@ -28,21 +41,38 @@ def flow_derivatives(
     q: Tensor,
     p: Tensor,
     s: Tensor,
-) -> list[tuple[tuple[Tensor, Tensor, Tensor], Tensor]]:
+) -> list[tuple[Triple, Tensor]]:
     """Values and derivatives of Φ_1, Φ_2∘Φ_1, …, as `flow_derivative` has them, with every map evaluated once."""
-    n, found = q.shape[-1], []
+    found = []
     with torch.enable_grad():
-        x = torch.cat([q, p, s[..., None]], -1).detach().requires_grad_()
-        q, p, s = x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
+        x = join(q, p, s).detach().requires_grad_()
+        q, p, s = split(x)
         for flow in flows:
             q, p, s = flow(q, p, s)
-            y = torch.cat([q, p, s[..., None]], -1)
-            rows = [
-                torch.autograd.grad(y[..., i].sum(), x, retain_graph=True, materialize_grads=True, allow_unused=True)[0]
-                for i in range(2 * n + 1)
-            ]
-            found.append(((q.detach(), p.detach(), s.detach()), torch.stack(rows, -2)))
+            found.append(((q.detach(), p.detach(), s.detach()), _rows(join(q, p, s), x, create_graph=False)))
     return found
+
+
+def jacobian(
+    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart
+    x: Tensor,  # (..., m)
+) -> tuple[Tensor, Tensor]:
+    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph where x or something inside f wants a gradient."""
+    keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
+    with torch.enable_grad():
+        x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
+        y = f(x)
+        if not y.requires_grad:  # a constant map
+            return y, y.new_zeros(*y.shape, x.shape[-1])
+        J = _rows(y, x, keep_graph)
+    return (y, J) if keep_graph else (y.detach(), J)
+
+
+def _rows(y: Tensor, x: Tensor, create_graph: bool) -> Tensor:
+    """∂y/∂x row by row, (..., k, m)."""
+    options: dict[str, Any] = {"retain_graph": True, "materialize_grads": True, "allow_unused": True}
+    options["create_graph"] = create_graph
+    return torch.stack([torch.autograd.grad(one.sum(), x, **options)[0] for one in y.unbind(-1)], -2)
 
 
 def contact_defect(

@@ -307,6 +307,10 @@ class Root:
         """(..., m) x, NaN in the samples that did not converge."""
         return torch.where(self.converged[..., None], self.x, torch.nan)
 
+    def with_slope(self, F: Callable[[Tensor], Tensor]) -> Tensor:
+        """(..., m) x with its derivative where gradients are on; F(x), 0 at the solution, has the graph."""
+        return attached(self.x, self.J, F(self.x)) if torch.is_grad_enabled() else self.x
+
 
 def find_root(
     equations: Callable[[Tensor], tuple[Tensor, Jacobian]],  # x (..., m) → F (..., m) and its Jacobian

@@ -8,7 +8,7 @@ differentiates with autograd. No other module calls autograd on a Lagrangian.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Protocol, cast, runtime_checkable
 
 import torch
@@ -243,24 +243,20 @@ def autograd_partials(
         forces = L_d.forces(a, b, s, h) if isinstance(L_d, Forced) else None
         force = None if forces is None else _autograd_forces(forces, (a, b, s), order, keep_graph)
         D1, D2, D3 = _grad(L, (a, b, s), create_graph=keep_graph or order == 2)
-        if order == 1:
-            return _detach(Partials(L, D1, D2, D3, force=force), keep_graph)
-        n = q0.shape[-1]
-        by_q0, by_q1, by_s = _rows(torch.cat([D1, D2, D3[..., None]], -1), (a, b, s), keep_graph)
-        second = Partials(
-            L,
-            D1,
-            D2,
-            D3,
-            D11=by_q0[..., :n, :],
-            D12=by_q1[..., :n, :],
-            D22=by_q1[..., n : 2 * n, :],
-            D13=by_s[..., :n],
-            D23=by_s[..., n : 2 * n],
-            D33=by_s[..., 2 * n],
-            force=force,
-        )
-        return _detach(second, keep_graph)
+        P = Partials(L, D1, D2, D3, force=force)
+        if order == 2:
+            n = q0.shape[-1]
+            by_q0, by_q1, by_s = _rows(torch.cat([D1, D2, D3[..., None]], -1), (a, b, s), keep_graph)
+            P = replace(
+                P,
+                D11=by_q0[..., :n, :],
+                D12=by_q1[..., :n, :],
+                D22=by_q1[..., n : 2 * n, :],
+                D13=by_s[..., :n],
+                D23=by_s[..., n : 2 * n],
+                D33=by_s[..., 2 * n],
+            )
+    return P if keep_graph else P.map(Tensor.detach)
 
 
 def _autograd_forces(
@@ -305,9 +301,3 @@ def _rows(y: Tensor, xs: tuple[Tensor, Tensor, Tensor], create_graph: bool) -> t
             found = tuple(None if rows[0] is None else torch.stack(rows) for rows in one_by_one)
     rows = (x.new_zeros(m, *x.shape) if g is None else g for g, x in zip(found, xs, strict=True))
     return tuple(g.movedim(0, batch) for g in rows)
-
-
-def _detach(P: Partials, keep_graph: bool) -> Partials:
-    if keep_graph:
-        return P
-    return P.map(Tensor.detach)

@@ -93,9 +93,12 @@ def regularity(
         )
 
 
-def left_hessian(P: Partials) -> Tensor:
-    """Return c D1D1 L⁻ = D11 + p0 ⊗ D13 + D13 ⊗ p0 + D33 p0 ⊗ p0, (..., n, n): H⁻ exists where it is not singular."""
-    p0 = momentum_minus(P)
+def left_hessian(P: Partials, p0: Tensor | None = None) -> Tensor:
+    """Return c D1D1 L⁻ = D11 + p0 ⊗ D13 + D13 ⊗ p0 + D33 p0 ⊗ p0, (..., n, n): H⁻ exists where it is not singular.
+
+    It is the second derivative of L_d(x, q1, s0 + p0·(x − q0)) in x; p0 is that of the step unless it is given.
+    """
+    p0 = momentum_minus(P) if p0 is None else p0
     cross = p0[..., :, None] * P.D13[..., None, :]
     return P.D11 + cross + cross.mT + P.D33[..., None, None] * p0[..., :, None] * p0[..., None, :]
 
@@ -105,9 +108,13 @@ def scaled_margin(X: Tensor, *sizes: Tensor) -> Tensor:
     scale = torch.stack([x.diagonal(dim1=-2, dim2=-1).abs() for x in sizes]).sum(0)
     scale = torch.where(scale > 0, scale, 1.0).rsqrt()
     scaled = scale[..., :, None] * X * scale[..., None, :]
-    usable = torch.isfinite(scaled).all(-1).all(-1)
-    value = torch.linalg.svdvals(torch.where(usable[..., None, None], scaled, 0.0))[..., -1]
-    return torch.where(usable, value, torch.nan)
+    return torch.where(torch.isfinite(scaled).all(-1).all(-1), least_singular_value(scaled), torch.nan)
+
+
+def least_singular_value(X: Tensor) -> Tensor:
+    """Of X (..., m, n), shape (...); 0 where X is not finite, which svdvals refuses for the whole batch."""
+    finite = torch.isfinite(X).all(-1).all(-1)
+    return torch.linalg.svdvals(torch.where(finite[..., None, None], X, 0.0))[..., -1]
 
 
 def _where(index: list[int]) -> str:

@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.data.units import common_unit
 from herglotz.errors import InputError
-from herglotz.plots import style
 from herglotz.plots.fan import Fan, point_fan, regular, spread_fan
 from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled, with_unit
 from herglotz.stepping import State
@@ -109,7 +109,7 @@ def plot_hamilton_jacobi_residual(source: Any, *, h: float | None = None) -> Fig
         figure = new_figure(10.2, 4.2, title)
         left, right = figure.subplots(1, 2, width_ratios=[1.15, 1.0])
         _draw_table(figure, left, fan, np.maximum(table, floor))
-        unit = style.one_unit(source.data.units if hasattr(source, "data") else ("",))
+        unit = common_unit(source.data.units) if hasattr(source, "data") else ""
         far = with_unit(r"distance of $q_{k+1}$ from the flow", unit)
         _draw_null(right, distance, off_flow, max(worst, floor), far)
     return figure
@@ -135,14 +135,10 @@ def _off_flow(fan: Fan, S: list[GeneratingFunction]) -> tuple[np.ndarray, np.nda
     distances, residuals = [], []
     off = fan.generating_functions(max(NULL_STEPS) + 1, moved)
     for k in NULL_STEPS:
-        S0, S1 = (_repeated(x, count) for x in (S[k - 1], S[k]))
+        S0, S1 = (S[j].map(lambda x: torch.cat([x] * count)) for j in (k - 1, k))
         distances.append((off[k].q - S1.q).norm(dim=-1).reshape(count, -1).nanmedian(1).values)
         residuals.append(_residual(fan, S0, off[k], S1).reshape(count, -1).nanmedian(1).values)
     return torch.stack(distances).double().cpu().numpy(), torch.stack(residuals).double().cpu().numpy()
-
-
-def _repeated(S: GeneratingFunction, count: int) -> GeneratingFunction:
-    return GeneratingFunction(**{name: torch.cat([x] * count) for name, x in vars(S).items()})
 
 
 def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:

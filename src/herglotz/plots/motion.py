@@ -12,22 +12,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from herglotz.data import Trajectories
-from herglotz.data.units import as_recorded
+from herglotz.data.splits import leading
+from herglotz.data.units import as_recorded, common_unit, size
 from herglotz.errors import InputError
-from herglotz.plots.style import (
-    INK,
-    MODEL,
-    MUTED,
-    SHADE,
-    UNSEEN,
-    captions,
-    label,
-    new_figure,
-    number,
-    one_unit,
-    styled,
-    with_unit,
-)
+from herglotz.plots.style import INK, MODEL, MUTED, SHADE, UNSEEN, captions, label, new_figure, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training import Run
@@ -117,7 +105,7 @@ def _prediction_title(found: Prediction) -> str:
         return "The free run fails at its first step"
     data, factor = as_recorded(found.data)
     names = zip(data.names, [rms * by for rms, by in zip(each, factor.tolist(), strict=True)], data.units, strict=True)
-    text = "Free run: RMS " + ", ".join(f"{name} {number(rms, unit)}" for name, rms, unit in names)
+    text = "Free run: RMS " + ", ".join(f"{name} {size(rms, unit)}" for name, rms, unit in names)
     lost = found.failed_steps
     return text if lost == 0 else f"{text}; {100 * lost:.3g} % not reached"
 
@@ -125,28 +113,24 @@ def _prediction_title(found: Prediction) -> str:
 def trajectory_title(run: Run) -> str:
     """Return the message of the figure: the distance of the free run from data that the fit has not seen."""
     data, factor = as_recorded(run.data)
-    unit, error = one_unit(data.units), (run.prediction * factor - data.q).detach()
+    unit, error = common_unit(data.units), (run.prediction * factor - data.q).detach()
     unseen = ~trained_mask(run)
     lost = ~torch.isfinite(error).all(-1)
     if bool(lost.any()):
         row = int(lost.nonzero()[0])
-        return f"The free run breaks off at {number(float(data.t[row]), data.time_unit)}"
+        return f"The free run breaks off at {size(float(data.t[row]), data.time_unit)}"
     rms = float(error[unseen if bool(unseen.any()) else ~unseen].square().mean().sqrt())
     if not bool(unseen.any()):
-        return f"Training RMS {number(rms, unit)}; nothing was held out"
+        return f"Training RMS {size(rms, unit)}; nothing was held out"
     part = float(unseen.double().mean())
     near = min(FRACTIONS, key=lambda x: abs(x - part))
     words = FRACTIONS[near] if abs(near - part) < 0.02 else f"{100 * part:.0f} %"
-    return f"Extrapolation RMS {number(rms, unit)} over the unseen {words}"
+    return f"Extrapolation RMS {size(rms, unit)} over the unseen {words}"
 
 
 def trained_mask(run: Run) -> torch.Tensor:
     """Return which samples were trained on, (N,) bool: the first `train_lengths` of every trajectory."""
-    data = run.data
-    mask = torch.zeros(data.samples, dtype=torch.bool)
-    for start, count in zip(data.offsets, run.train_lengths, strict=True):
-        mask[start : start + count] = True
-    return mask
+    return leading(run.data.lengths, run.train_lengths)
 
 
 def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, labelled: bool) -> None:
@@ -177,7 +161,7 @@ def _draw_motion(motion: _Motion, b: int, i: int, top: Axes, bottom: Axes, *, la
         captions(top, [("● data", "#777777"), *([(f"━ {motion.words[0]}", MODEL)] if count else [])])
     if labelled and count < len(t):
         captions(top, [(f"━ {motion.words[1]}", UNSEEN)], "upper right")
-    _write_rms(bottom, t, residual, count, one_unit(data.units))
+    _write_rms(bottom, t, residual, count, common_unit(data.units))
 
 
 def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, unit: str) -> None:
@@ -188,7 +172,7 @@ def _write_rms(bottom: Axes, t: np.ndarray, residual: np.ndarray, count: int, un
     for span, color, where in ((slice(0, count), MODEL, 0.0), (slice(count, None), UNSEEN, split)):
         part = residual[span]
         if len(part) and (where or split == 0.0 or split > ROOM_FOR_RMS):
-            text = f"RMS {number(math.sqrt(float(np.mean(part**2))), unit)}"
+            text = f"RMS {size(math.sqrt(float(np.mean(part**2))), unit)}"
             place = {"xycoords": bottom.get_xaxis_transform(), "xytext": (5, -2), "va": "top"}
             label(bottom, t[0] + where * (t[-1] - t[0]), 1.0, text, color, **place)
 

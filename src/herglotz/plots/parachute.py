@@ -15,7 +15,8 @@ import torch
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, number, styled
+from herglotz.data.units import size
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, captions, label, new_figure, styled
 from herglotz.scenes import scene
 from herglotz.scenes.printed_parachute import MAP_START, PrintedParachute
 from herglotz.stepping import State, Stepper
@@ -85,7 +86,7 @@ def plot_printed_map(orbit: PrintedOrbit) -> Figure:
 def plot_fall(fall: Fall) -> Figure:
     """Draw the fall with λ = +0.01: height and velocity to the ground, and D2S^k(q_k) on the momentum."""
     with styled():
-        title = f"A parachute lands after {number(fall.landing_time, 's')} at {number(-fall.landing_speed, 'm/s')}"
+        title = f"A parachute lands after {size(fall.landing_time, 's')} at {size(-fall.landing_speed, 'm/s')}"
         figure = new_figure(9.2, 5.0, title)
         grid = figure.add_gridspec(2, 2, height_ratios=[1.6, 1.0])
         _draw_height(figure.add_subplot(grid[0, 0]), fall)

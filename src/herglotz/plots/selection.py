@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, one_unit, styled, with_unit
+from herglotz.data.units import common_unit
+from herglotz.plots.style import MODEL, MUTED, UNSEEN, label, new_figure, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.training.selection import Selection
@@ -35,6 +36,6 @@ def plot_selection(selection: Selection) -> Figure:
         ax.set_ylim(min(finite) / 3, 1.5 * ceiling)  # at least a decade, so that a few per cent look small
         names = [f"{c.level}\n{c.parameters} parameters\n{c.step_us:.0f} µs a step" for c in candidates]
         ax.set_xticks(range(len(names)), names)
-        ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=with_unit("held-out RMS", one_unit(selection.run.data.units)))
+        ax.set(xlim=(-0.6, len(names) - 0.3), ylabel=with_unit("held-out RMS", common_unit(selection.run.data.units)))
         ax.grid(axis="y", color="#EEEEEE", lw=0.8)
     return figure

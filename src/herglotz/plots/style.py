@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -132,13 +132,3 @@ def position_axis(ax: Axes, data: Trajectories, i: int) -> None:
         at = [x for x in map(float, ticks) if math.degrees(low) <= x <= math.degrees(high)]
         ax.set_xticks([math.radians(x) for x in at], [f"{x:g}".replace("-", "−") for x in at])
     ax.set_xlabel(with_unit(data.names[i], "deg" if in_degrees else data.units[i]))
-
-
-def one_unit(units: Sequence[str]) -> str:
-    """Return the unit that all have, or none."""
-    return units[0] if len(set(units)) == 1 else ""
-
-
-def number(value: float, unit: str = "") -> str:
-    """Return a number with three significant digits and its unit."""
-    return f"{value:.3g}" + ("" if unit in ("", "1") else f" {unit}")

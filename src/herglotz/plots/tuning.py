@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, one_unit, styled, with_unit
+from herglotz.data.units import common_unit
+from herglotz.plots.style import ACCENT, INK, MODEL, MUTED, UNSEEN, label, new_figure, styled, with_unit
 
 if TYPE_CHECKING:
     from herglotz.tune.result import Candidate, Tuning
@@ -52,7 +53,7 @@ def plot_tuning(tuning: Tuning) -> Figure:
         label(ax, chosen.us, max(chosen.bound, FLOOR), chosen.setting.name, UNSEEN, xytext=(10, -18))
         _draw_limits(ax, tuning)
         ax.set(xscale="log", yscale="log", xlabel=f"cost (µs per {'unit of time' if unit == '1' else unit})")
-        ax.set_ylabel(with_unit(f"error that {share} keep", one_unit(tuning.run.data.units)))
+        ax.set_ylabel(with_unit(f"error that {share} keep", common_unit(tuning.run.data.units)))
         ax.grid(color="#EEEEEE", lw=0.8)
         ax.legend(fontsize=8, loc="best")
     return figure

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import find_root
 from herglotz.scenes.motion import Motion
 from herglotz.theory.continuous import square_jacobian
@@ -94,7 +95,7 @@ class Collocation:
         s = self.s0[:, None].expand(-1, self.count)
         y = self.motion.start(q, ((self.q1 - self.q0) / self.h[:, None])[:, None].expand_as(q), s)
         s = s + self.h[:, None] * (self.motion.balance(q, y, s)[3] @ a.mT)
-        return torch.cat([q, y, s[..., None]], -1)
+        return join(q, y, s)
 
     def nodes(self, guess: Tensor | None, iterations: int) -> tuple[Tensor, Tensor]:
         """The nodes, and where Newton's method has converged, (B,)."""
@@ -110,7 +111,7 @@ class Collocation:
 
     def log_c(self, x: Tensor) -> Tensor:
         """The integral ln c = ∫ L_s dt, (B,)."""
-        rate = self.motion.balance(*_split(x))[4]
+        rate = self.motion.balance(*split(x))[4]
         return self.h * (rate @ lobatto(self.count)[1][-1].to(x))
 
     def _equations(self, x: Tensor) -> tuple[Tensor, ...]:
@@ -121,7 +122,7 @@ class Collocation:
         difference[:, 0] -= 1.0
 
         def rates(x: Tensor) -> Tensor:  # p, q̇, ṗ, ṡ, L_s
-            q_dot, p, p_dot, s_dot, rate = self.motion.balance(*_split(x))
+            q_dot, p, p_dot, s_dot, rate = self.motion.balance(*split(x))
             return torch.cat([p, q_dot, p_dot, s_dot[..., None], rate[..., None]], -1)
 
         R, J = square_jacobian(rates, x, 3 * n + 2)
@@ -157,11 +158,6 @@ class Collocation:
         return End(
             z[:, 0, n:-1], z[:, -1, n:-1], z[:, -1, -1] - self.s0, log_c.exp(), D[:, -1], gradient, opened
         ), error
-
-
-def _split(x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    n = x.shape[-1] // 2
-    return x[..., :n], x[..., n : 2 * n], x[..., -1]
 
 
 def _regular(D: Tensor, n: int) -> Tensor:

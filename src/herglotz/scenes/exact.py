@@ -39,7 +39,6 @@ class Shot:
     """The motion that joins q0 to q1, and everything that L_d is asked for."""
 
     P: Partials  # order 2, NaN where `reason` is not NONE
-    p0: Tensor  # (..., n)
     reason: Tensor  # (...) Reason values
 
 
@@ -122,7 +121,7 @@ class NumericallyExact:
             P = _second(End(*ends))
             nan = torch.where(reason == Reason.NONE, 0.0, torch.nan)
             P = P.map(lambda x: x + nan.reshape(shape + (1,) * (x.ndim - len(shape))))
-        return Shot(P, -P.D1 / P.c[..., None], reason)
+        return Shot(P, reason)
 
 
 def exact_discrete_lagrangian(system: Motion | StateFunction, **options: Any) -> NumericallyExact:

@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import join, split
 from herglotz.theory.continuous import Lagrangian
 
 VectorField = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor]]
@@ -55,15 +56,13 @@ def reference_solve(
     n, dtype = q.shape[-1], q.dtype
     h = torch.as_tensor(h, dtype=torch.float64, device=q.device)
     batch = torch.broadcast_shapes(q.shape[:-1], p.shape[:-1], s.shape, h.shape)
-    x0 = torch.cat([q.expand(*batch, n), p.expand(*batch, n), s.expand(batch)[..., None]], -1).double()
+    x0 = join(q.expand(*batch, n), p.expand(*batch, n), s.expand(batch)).double()
 
     def f(x: Tensor) -> Tensor:
-        q_dot, p_dot, s_dot = vector_field(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
-        return torch.cat([q_dot, p_dot, s_dot[..., None]], -1)
+        return join(*vector_field(*split(x)))
 
     x, error = _integrated(f, x0, h.expand(batch), max_substeps)
-    x = x.to(dtype)
-    return ReferenceSolution(x[..., :n], x[..., n : 2 * n], x[..., 2 * n], error)
+    return ReferenceSolution(*split(x.to(dtype)), error)
 
 
 def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> tuple[Tensor, Tensor]:

@@ -12,9 +12,10 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.newton import find_root, solve
 from herglotz.scenes.special import as_step
-from herglotz.theory.continuous import Lagrangian, jacobian
+from herglotz.theory.continuous import Lagrangian
 
 MAX_NEWTON = 30  # ends a scalar equation without a solution
 # With the Jacobian held fixed each Newton step inside the graph makes derivatives exact one order further.

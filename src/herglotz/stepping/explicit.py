@@ -21,6 +21,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.contact import join
 from herglotz.models import ContactLagrangian
 from herglotz.models.terms import Kinetic, LinearDamping
 from herglotz.stepping.field import Field, FieldOf
@@ -147,7 +148,7 @@ def explicit_status(q1: Tensor, p1: Tensor, s1: Tensor, c: Tensor, regular: bool
         numbers = (*q1.flatten().tolist(), *p1.flatten().tolist(), s1.item())
         if all(map(isfinite, numbers)):
             return None
-    total = (torch.cat([q1, p1, s1[..., None]], -1) * 0).sum(-1)  # 0 where all are finite, else NaN
+    total = (join(q1, p1, s1) * 0).sum(-1)  # 0 where all are finite, else NaN
     good = total == 0
     if regular and bool(good.all()):
         return None

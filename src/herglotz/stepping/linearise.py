@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian
+from herglotz.mechanics.contact import jacobian, join
 from herglotz.models import ContactLagrangian
 from herglotz.stepping.equation import model_equation
 from herglotz.stepping.partials_equation import PartialsEquation
@@ -45,7 +46,8 @@ def linearise(L_d: DiscreteLagrangian, state: State, h: Tensor, u: Tensor | None
     h = h.detach().expand(s.shape)
     u = None if u is None else u.detach().expand(*s.shape, u.shape[-1])
     delta = step.state.q.detach() - q
-    slopes = forward_slopes if isinstance(L_d, ContactLagrangian) else backward_slopes
+    # In reverse mode, row by row, where L_d itself may be differentiated by autograd.
+    slopes = forward_slopes if isinstance(L_d, ContactLagrangian) else lambda values, x: jacobian(values, x)[1]
     with torch.no_grad():
         J = step_jacobian(step_functions(L_d), State(q, p, s), h, delta, u, slopes)
     size = 2 * q.shape[-1] + 1
@@ -92,7 +94,7 @@ def step_jacobian(
     def values(z: Tensor) -> Tensor:
         q, p, s, h, *u, delta = z.split(sizes, -1)
         F, p1, L = functions(q, p, s[..., 0], h[..., 0], delta, u[0] if u else None)
-        return torch.cat([F, p1, L[..., None]], -1)
+        return join(F, p1, L)
 
     rows = (slopes or forward_slopes)(values, point)  # (..., 2n+1, 3n+2+m) of F, p1 and L
     by_start, by_delta = rows[..., :-n], rows[..., -n:]
@@ -109,18 +111,6 @@ def forward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
     with warnings.catch_warnings():  # torch's own use of torch.jit, when it first loads forward-mode derivatives
         warnings.filterwarnings("ignore", "`torch.jit.script` is", DeprecationWarning)
         return torch.func.vmap(along)(directions).movedim(0, -1)
-
-
-def backward_slopes(values: Callable[[Tensor], Tensor], point: Tensor) -> Tensor:
-    """The same row by row in reverse mode, which goes through derivatives that are made by autograd themselves."""
-    with torch.enable_grad():
-        point = point.detach().requires_grad_()
-        out = values(point)
-        rows = [
-            torch.autograd.grad(out[..., i].sum(), point, retain_graph=True, materialize_grads=True)[0]
-            for i in range(out.shape[-1])
-        ]
-    return torch.stack(rows, -2)
 
 
 def eliminate(A: Tensor, b: Tensor) -> Tensor:

@@ -19,6 +19,7 @@ class OneStepMethod(ABC):
     """A stepper of states (q, p, s). A concrete one implements `step`; what follows is the same for all."""
 
     throw: bool = False  # raise `StepError` at the first sample that fails
+    iterates: bool = False  # whether steps want a guess
 
     @abstractmethod
     def step(self, state: Any, h: Tensor | float, guess: Tensor | None = None) -> Step:
@@ -93,12 +94,12 @@ class OneStepMethod(ABC):
         watch: Watch | None = None,
         **plan: Any,
     ) -> Track:
-        """The rollout of any named tuple of tensors whose last entry is (...)."""
+        """The rollout of any named tuple of tensors whose last entry is (...); exported files have their own loop."""
         h_all = step_sizes(check_h(h, start[-1]), steps)
         if inputs is not None and inputs.shape[-2] != h_all.shape[-1]:
             raise InputError(f"inputs list {inputs.shape[-2]} steps, but the rollout has {h_all.shape[-1]}")
         cut = Plan(h_all.shape[-1], **plan)
-        return roll_out(start, Drive(self._single_step, h_all, cut, inputs, watch, self._iterates, self._check_step))
+        return roll_out(start, Drive(self._single_step, h_all, cut, inputs, watch, self.iterates, self._check_step))
 
     def _checked(self, state: State) -> State:
         """The state, if this stepper can start from it."""
@@ -107,11 +108,6 @@ class OneStepMethod(ABC):
     def _checked_inputs(self, inputs: Tensor, like: Tensor) -> Tensor:  # noqa: ARG002
         """The inputs (K, m) or (..., K, m) as a step takes them, beside positions `like`; refused if it takes none."""
         raise InputError(f"{type(self).__name__} takes no inputs, got {tuple(inputs.shape)}; leave them out")
-
-    @property
-    def _iterates(self) -> bool:
-        """Whether steps want a guess."""
-        return False
 
     def _single_step(self) -> OneStep:
         """The function that a rollout's steps are taken by."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from math import isfinite
-from typing import Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -16,15 +15,6 @@ from herglotz.stepping.state import State, Status
 from herglotz.stepping.stick_slip import StickSlip, at_rest, sticks
 
 ROUNDING = 1e3  # machine epsilons of the size: below that a move is rounding
-
-
-@runtime_checkable
-class Increments(Protocol):
-    """A closed form that takes Δ = q1 − q0 in place of q1, so that nothing cancels when the step is small."""
-
-    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int = 1) -> Partials:
-        """`partials` at (q0, q0 + Δ, s0)."""
-        ...
 
 
 @dataclass(frozen=True)

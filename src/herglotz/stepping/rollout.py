@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import torch
@@ -19,11 +18,12 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint as save_start_only
 
 from herglotz.errors import InputError
+from herglotz.progress import ProgressBar
 from herglotz.stepping.events import Watch
 from herglotz.stepping.guess import LENGTH, Extrapolation
 from herglotz.stepping.state import Crossings, Status, Step, StepError
 
-PROGRESS_AFTER = 2.0  # seconds
+PROGRESS_AFTER = 2.0  # seconds of a rollout before it has a bar
 
 
 class Carry(NamedTuple):
@@ -127,7 +127,9 @@ class Drive:
 
 def roll_out(start: Any, drive: Drive) -> Track:
     """Step from `start`, a named tuple of tensors, through the whole plan."""
-    plan, progress = drive.plan, _Progress(drive.plan.steps)
+    plan, progress = drive.plan, None
+    if sys.stderr.isatty():
+        progress = ProgressBar(total=plan.steps, delay=PROGRESS_AFTER, unit="step", leave=False)
     carry = Carry(start, (start[0].detach(),), torch.ones_like(start[-1]), None)
     graph = torch.is_grad_enabled()
     blocks: list[Block] = []
@@ -141,7 +143,8 @@ def roll_out(start: Any, drive: Drive) -> Track:
         else:
             blocks = blocks or [_buffers(block, plan.steps // plan.every)]
             _write(blocks[0], block, ks.start // plan.every)
-    progress.close()
+    if progress is not None:
+        progress.close()
     parts = [_flat(block) for block in blocks]
     *states, sigma, status, residual = parts[0] if len(parts) == 1 else map(torch.cat, zip(*parts, strict=True))
     axis = sigma.ndim - 1  # behind those of the batch
@@ -162,7 +165,7 @@ def without_lost_factors(track: Track) -> Track:
     return track._replace(states=states, sigma=track.sigma + nan, status=found)
 
 
-def _segment(carry: Carry, ks: range, drive: Drive, progress: _Progress | None = None) -> tuple[Carry, Block]:
+def _segment(carry: Carry, ks: range, drive: Drive, progress: ProgressBar | None = None) -> tuple[Carry, Block]:
     """Take the steps `ks`."""
     single, every, watch = drive.single_step(), drive.plan.every, drive.watch
     kept = [(*carry.state, carry.sigma)] if ks.start == 0 else []
@@ -206,26 +209,3 @@ def _write(buffers: Block, block: Block, start: int) -> None:
     for i, (buffer, values) in enumerate(zip(_flat(buffers), _flat(block), strict=True)):
         offset = start + (i < ahead and start > 0)
         buffer[offset : offset + len(values)] = values
-
-
-class _Progress:
-    """A progress bar in a terminal for a rollout of more than two seconds."""
-
-    def __init__(self, steps: int):
-        self.steps, self.count, self.bar = steps, 0, None
-        self.begin = perf_counter() if sys.stderr.isatty() else float("inf")
-
-    def update(self) -> None:
-        """Count one step."""
-        self.count += 1
-        if self.bar is not None:
-            self.bar.update()
-        elif perf_counter() - self.begin > PROGRESS_AFTER:
-            from herglotz.progress import ProgressBar
-
-            self.bar = ProgressBar(total=self.steps, initial=self.count, unit="step", leave=False)
-
-    def close(self) -> None:
-        """Remove the bar."""
-        if self.bar is not None:
-            self.bar.close()

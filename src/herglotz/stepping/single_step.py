@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -12,7 +14,7 @@ from herglotz.mechanics.regularity import regularity
 from herglotz.stepping.equation import ModelEquation, StepOfModel, model_equation
 from herglotz.stepping.explicit import Leapfrog, explicit_status, leapfrog
 from herglotz.stepping.field import Field
-from herglotz.stepping.newton import Increments, find_root, status_of
+from herglotz.stepping.newton import find_root, status_of
 from herglotz.stepping.partials_equation import End, PartialsEquation, StepEquation
 from herglotz.stepping.state import State, Status, Step
 
@@ -165,8 +167,8 @@ def _attach(
 def _evaluate(L_d: DiscreteLagrangian, q0: Tensor, x: Tensor, s0: Tensor, h: Tensor, increments: bool) -> Partials:
     """First derivatives at (q0, x) or, in increments, at (q0, q0 + x)."""
     if increments:
-        assert isinstance(L_d, Increments)
-        return L_d.partials_increment(q0, x, s0, h, 1)
+        form: Any = L_d  # whoever asks for increments has checked
+        return form.partials_increment(q0, x, s0, h, 1)
     return partials(L_d, q0, x, s0, h)
 
 

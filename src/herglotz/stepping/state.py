@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import Root
 from herglotz.mechanics.partials import check_arguments
 
@@ -50,7 +51,7 @@ class State(NamedTuple):
     @property
     def joined(self) -> Tensor:
         """All numbers side by side, (..., 2n+1)."""
-        return torch.cat([self.q, self.p, self.s[..., None]], -1)
+        return join(*self)
 
     @property
     def finite(self) -> Tensor:
@@ -60,8 +61,7 @@ class State(NamedTuple):
 
 def state_of(x: Tensor) -> State:
     """The point whose numbers stand side by side, (..., 2n+1)."""
-    n = x.shape[-1] // 2
-    return State(x[..., :n], x[..., n : 2 * n], x[..., 2 * n])
+    return State(*split(x))
 
 
 @dataclass(frozen=True)
@@ -232,13 +232,9 @@ def status_of_root(
 
 
 def throw_failure(status: Tensor, residual: Tensor) -> None:
-    """Raise `StepError` for the first sample that failed, if one did."""
-    if bool(((status != Status.CONVERGED) & (status != Status.STOPPED)).any()):
-        raise StepError(failure_message(status, residual))
-
-
-def failure_message(status: Tensor, residual: Tensor) -> str:
-    """Which sample failed first, how, and what to do."""
-    index = tuple(int(i) for i in ((status != Status.CONVERGED) & (status != Status.STOPPED)).nonzero()[0])
-    name = Status(int(status[index])).name
-    return f"step failed at sample {index}: {name}, residual {float(residual[index]):.3g}; try a smaller h"
+    """Raise `StepError` for the first sample that failed, if one did: how, and what to do."""
+    failed = (status != Status.CONVERGED) & (status != Status.STOPPED)
+    if bool(failed.any()):
+        index = tuple(int(i) for i in failed.nonzero()[0])
+        what = f"{Status(int(status[index])).name}, residual {float(residual[index]):.3g}"
+        raise StepError(f"step failed at sample {index}: {what}; try a smaller h")

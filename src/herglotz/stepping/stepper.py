@@ -54,6 +54,8 @@ class Stepper(OneStepMethod):
         self.max_iterations = max_iterations
         self.throw = throw
         self.explicit = explicit
+        made_of = capabilities(L_d)
+        self.iterates = not (explicit and made_of is not None and made_of.explicit)
 
     def __repr__(self) -> str:
         of = getattr(self.L_d, "__name__", type(self.L_d).__name__)
@@ -189,11 +191,6 @@ class Stepper(OneStepMethod):
         inputs = inputs.to(like)
         driven_by(self.L_d, inputs[..., 0, :])
         return inputs
-
-    @property
-    def _iterates(self) -> bool:
-        made_of = capabilities(self.L_d)
-        return not (self.explicit and made_of is not None and made_of.explicit)
 
     def _check_step(self, step: Step, state: State, h: Tensor, u: Tensor | None) -> None:
         """With `throw`, raise `StepError` if a sample failed, with the condition that it failed on."""

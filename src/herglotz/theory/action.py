@@ -54,7 +54,8 @@ def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | 
     """
     s = curve_action(L_d, q, s0, h)
     P = curve_partials(L_d, q, s, h)
-    residual = curve_residual(P)
+    later = P.map(lambda x: x.narrow(P.L.ndim - 1, 1, s.shape[-1] - 2))
+    residual = momentum_residual(later, P.D2[..., :-1, :])
     one = torch.ones_like(s[..., :1])
     sigma = torch.cat([one, P.c.cumprod(-1)], -1)
     # the product of the factors after k, without dividing by any: c may be 0
@@ -66,11 +67,6 @@ def herglotz_action(L_d: DiscreteLagrangian, q: Tensor, s0: Tensor, h: Tensor | 
 def curve_partials(L_d: DiscreteLagrangian, q: Tensor, s: Tensor, h: Tensor | float, order: int = 1) -> Partials:
     """Partials of all N steps of a curve at once; every entry has a step axis, (..., N, *)."""
     return unforced(partials(L_d, q[..., :-1, :], q[..., 1:, :], s[..., :-1], curve_steps(q, h), order))
-
-
-def curve_residual(P: Partials) -> Tensor:
-    """R_1 … R_{N−1} from the partials of the N steps, (..., N−1, n)."""
-    return momentum_residual(P.map(lambda x: _steps(x, P)[1]), P.D2[..., :-1, :])
 
 
 def curve_steps(q: Tensor, h: Tensor | float) -> Tensor:
@@ -91,9 +87,3 @@ def curve_steps(q: Tensor, h: Tensor | float) -> Tensor:
     if not bool((h > 0).all()):
         raise InputError(f"h must be > 0, got {float(h.min()):g}")
     return h
-
-
-def _steps(x: Tensor, P: Partials) -> tuple[Tensor, Tensor]:
-    """Steps 0 … N−2 and 1 … N−1 of an entry of P."""
-    axis = P.L.ndim - 1
-    return x.narrow(axis, 0, x.shape[axis] - 1), x.narrow(axis, 1, x.shape[axis] - 1)

@@ -14,10 +14,10 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import DiscreteLagrangian, Partials, momentum_minus, momentum_plus, partials
-from herglotz.mechanics.newton import find_root
+from herglotz.mechanics.newton import Root, find_root
 from herglotz.stepping.block_tridiagonal import Blocks, solve_blocks
 from herglotz.stepping.rollout import Drive, OneStep, Plan, roll_out
-from herglotz.stepping.state import Rollout, State, Status, Step, StepError, step_sizes
+from herglotz.stepping.state import Rollout, State, Status, Step, StepError, status_of_root, step_sizes
 from herglotz.stepping.stepper import Stepper
 from herglotz.theory.action import curve_action, curve_partials
 from herglotz.theory.caustics import Opening, opening
@@ -169,32 +169,30 @@ def _critical(
         return q, s, curve_partials(L_d, q, s, h, order=2), S
 
     with torch.no_grad():
-        x, converged, error, iterations = _solved(curve, guess, ends)
-        q, s, P, S = curve(x)
+        root = _solved(curve, guess, ends)
+        q, s, P, S = curve(root.x)
         p0 = momentum_minus(P)[..., 0, :] if S is None else S.dS
         p = torch.cat([p0[..., None, :], momentum_plus(P)], -2)
         family = opening(P, p[..., :-1, :], _parameters(q[..., 0, :], S))
         finite = torch.isfinite(s).all(-1) & torch.isfinite(q).all(-1).all(-1)
-        singular = (family.final < 1e3 * torch.finfo(q.dtype).eps) | (P.c == 0).any(-1) | ~torch.isfinite(error)
+        singular = (family.final < 1e3 * torch.finfo(q.dtype).eps) | (P.c == 0).any(-1)
         if not beyond:
             singular = singular | (family.crossed >= 0)
-        status = torch.where(converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS))
-        status = torch.where(singular, int(Status.SINGULAR), status)
-        status = torch.where(finite, status, int(Status.DIVERGED)).to(torch.uint8)
+        status = status_of_root(root, finite, singular)
         nan = torch.where(status == Status.CONVERGED, 0.0, torch.nan).to(q)
         sigma = torch.cat([torch.ones_like(s[..., :1]), P.c.cumprod(-1)], -1)
         q, p, s, sigma = q + nan[..., None, None], p + nan[..., None, None], s + nan[..., None], sigma + nan[..., None]
-        return Curve(q, p, s, sigma, status, error, family, iterations)
+        return Curve(q, p, s, sigma, status, root.error, family, root.iterations)
 
 
 def _solved(
     curve: Callable[[Tensor], tuple[Tensor, Tensor, Partials, FunctionGerm | None]], guess: Tensor, ends: list[Tensor]
-) -> tuple[Tensor, Tensor, Tensor, int]:
-    """The unknown points side by side, whether each sample converged, its last Newton step, and iterations."""
+) -> Root:
+    """The unknown points side by side."""
     x, n = guess.detach().flatten(-2), guess.shape[-1]
     size = torch.cat([e.abs() for e in ends] + [x.abs()], -1).amax(-1, keepdim=True)
     if not x.shape[-1]:
-        return x, torch.ones_like(size[..., 0], dtype=torch.bool), 0 * size[..., 0], 0
+        return Root(x, torch.ones_like(size[..., 0], dtype=torch.bool), 0 * size[..., 0], 0, None, x)
 
     def equations(x: Tensor) -> tuple[Tensor, Blocks]:
         _, _, P, S = curve(x)
@@ -206,8 +204,7 @@ def _solved(
         rhs = torch.cat([rhs, torch.zeros_like(rhs[..., :1])], -1)
         return solve_blocks(blocks, rhs)[..., :n].flatten(-2)  # type: ignore[arg-type]
 
-    root = find_root(equations, x, size.expand(x.shape), solver)
-    return root.x, root.converged, root.error, root.iterations
+    return find_root(equations, x, size.expand(x.shape), solver)
 
 
 def _system(P: Partials, S: FunctionGerm | None) -> tuple[Tensor, Blocks]:

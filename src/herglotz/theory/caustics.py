@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import Partials, momentum_jacobian, step_derivative
-from herglotz.mechanics.regularity import scaled_margin
+from herglotz.mechanics.regularity import least_singular_value, left_hessian, scaled_margin
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def opening(
     """
     n, point = p.shape[-1], not bool((tangent[..., : p.shape[-1], :] != 0).any())
     J, D = momentum_jacobian(P, p), step_derivative(P, p)
-    A, kinetic = _bent(P, p), _negative_kinetic(J)
+    A, kinetic = left_hessian(P, p), _negative_kinetic(J)
     regular = (scaled_margin(J, J, P.D11, P.D22) > 1e3 * torch.finfo(p.dtype).eps).all(-1)
     start = tangent[..., n : 2 * n, :]
     slope = P.D22[..., 0, :, :] if point else start  # a point source has S¹ = L_d
@@ -62,18 +62,12 @@ def opening(
         crossed = torch.where(passed & (crossed < 0), k, crossed)
         slope = P.D22[..., k, :, :] - J[..., k, :, :].mT @ torch.linalg.solve_ex(W, J[..., k, :, :])[0]
     largest = torch.stack([torch.linalg.matrix_norm(y, ord="fro") for y in Y], -1).amax(-1)
-    final = torch.nan_to_num(_singular_values(Y[-1])[..., -1] / largest, nan=0.0)
+    final = torch.nan_to_num(least_singular_value(Y[-1]) / largest, nan=0.0)
     carried = torch.linalg.solve_ex(current[..., :n, :].mT, current[..., n : 2 * n, :].mT)[0]
     slope = torch.where(regular[..., None, None], carried, slope)
     if margins:
         final = torch.where(regular, final, torch.stack(margins, -1).amin(-1))
     return Opening(final, crossed, 0.5 * (slope + slope.mT))
-
-
-def _bent(P: Partials, p: Tensor) -> Tensor:
-    """W without c d²S: the second derivative of L_d(x, y, s + p·(x − q_k)) in x."""
-    cross = p[..., :, None] * P.D13[..., None, :]
-    return P.D11 + cross + cross.mT + P.D33[..., None, None] * p[..., :, None] * p[..., None, :]
 
 
 def _negative_kinetic(J: Tensor) -> Tensor:
@@ -91,8 +85,3 @@ def _negative(W: Tensor) -> Tensor:
     finite = torch.isfinite(W).all(-1).all(-1)
     W = torch.where(finite[..., None, None], 0.5 * (W + W.mT), 0.0)
     return torch.where(finite, (torch.linalg.eigvalsh(W) < 0).sum(-1), -1)
-
-
-def _singular_values(Y: Tensor) -> Tensor:
-    finite = torch.isfinite(Y).all(-1).all(-1)
-    return torch.linalg.svdvals(torch.where(finite[..., None, None], Y, 0.0))

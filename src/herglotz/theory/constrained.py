@@ -23,10 +23,10 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
-from herglotz.mechanics.newton import Root, attached, find_root
+from herglotz.mechanics.contact import jacobian
+from herglotz.mechanics.newton import Root, find_root
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
-from herglotz.theory.continuous import jacobian
 
 Constraint = Callable[[Tensor], Tensor]  # q (..., n) → g (..., m)
 Velocity = Callable[[Tensor, Tensor, Tensor], Tensor]  # (q, p, s) → (..., n)
@@ -48,6 +48,8 @@ class ConstrainedStepper(OneStepMethod):
 
     Source: section 6 of `docs/mathematics.md`.
     """
+
+    iterates = True
 
     def __init__(self, L_d: DiscreteLagrangian, constraint: Constraint, velocity: Velocity):
         self.L_d, self.constraint, self.velocity = L_d, constraint, velocity
@@ -80,10 +82,6 @@ class ConstrainedStepper(OneStepMethod):
         """λ of one step, (..., m); 2λ/h tends to the constraint's force (half of each impulse acts at each end)."""
         state = check_state(state)
         return self._solve(state, check_h(h, state.q), None)[1]
-
-    @property
-    def _iterates(self) -> bool:
-        return True
 
     def _rows(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """G(q) and Dg(q), (..., m) and (..., m, n)."""
@@ -126,22 +124,18 @@ class ConstrainedStepper(OneStepMethod):
             impulse = (impulse.amax(-1, keepdim=True) / slope).expand_as(start[..., n:])
             scale = torch.cat([size.expand(q0.shape), impulse], -1)
             root = find_root(equations, start, scale)
-        x = root.x
-        if torch.is_grad_enabled():
-            x = attached(x, root.J, balance(x, 1)[0])
+        x = root.with_slope(lambda x: balance(x, 1)[0])
         return x[..., :n], x[..., n:], root
 
     def _projected(self, q: Tensor, p: Tensor, s: Tensor, Dg: Tensor) -> Tensor:
         """The momentum p + Dgᵀμ with Dg·v = 0; where v is linear in p one Newton step finds μ."""
 
-        def equations(mu: Tensor, p: Tensor) -> tuple[Tensor, Tensor]:
+        def equations(mu: Tensor) -> tuple[Tensor, Tensor]:
             v, v_p = jacobian(lambda p: self.velocity(q, p, s), p + (Dg.mT @ mu[..., None])[..., 0])
             return (Dg @ v[..., None])[..., 0], Dg @ v_p @ Dg.mT
 
         start = p.new_zeros(*p.shape[:-1], Dg.shape[-2])
         scale = (p.detach().abs().amax(-1) / Dg.detach().abs().amax((-2, -1)))[..., None].expand(start.shape)
-        root = find_root(lambda mu: equations(mu, p), start, scale, iterations=PROJECTIONS)
-        mu = root.x
-        if torch.is_grad_enabled():
-            mu = attached(mu, root.J, equations(mu, p)[0])
+        root = find_root(equations, start, scale, iterations=PROJECTIONS)
+        mu = root.with_slope(lambda mu: equations(mu)[0])
         return p + (Dg.mT @ mu[..., None])[..., 0]

@@ -39,32 +39,6 @@ def gradient(
     return P.L, P.D1, P.D11
 
 
-def jacobian(
-    f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart
-    x: Tensor,  # (..., m)
-) -> tuple[Tensor, Tensor]:
-    """f(x) and ∂f/∂x, (..., k) and (..., k, m); with a graph where x or something inside f wants a gradient."""
-    keep_graph = torch.is_grad_enabled() and (x.requires_grad or f(x).requires_grad)
-    with torch.enable_grad():
-        x = x * 1 if keep_graph and x.requires_grad else x.detach().requires_grad_()
-        y = f(x)
-        if not y.requires_grad:  # a constant map
-            return y, y.new_zeros(*y.shape, x.shape[-1])
-        rows = [
-            torch.autograd.grad(
-                y[..., i].sum(),
-                x,
-                retain_graph=True,
-                create_graph=keep_graph,
-                materialize_grads=True,
-                allow_unused=True,
-            )[0]
-            for i in range(y.shape[-1])
-        ]
-    J = torch.stack(rows, -2)
-    return (y, J) if keep_graph else (y.detach(), J)
-
-
 def square_jacobian(
     f: Callable[[Tensor], Tensor],  # (..., m) → (..., k), samples apart; takes one more leading dimension
     x: Tensor,  # (..., m)

@@ -25,13 +25,13 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.mechanics import momentum_minus, momentum_plus, partials
-from herglotz.mechanics.newton import attached, find_root
+from herglotz.mechanics.contact import jacobian, join, split
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
 from herglotz.stepping.stepper import Stepper
-from herglotz.theory.continuous import gradient, jacobian
-from herglotz.theory.jacobi import join, split
+from herglotz.theory.continuous import gradient
 
 MOST = 18  # largest m: at 31 samples a period of Hénon–Heiles 9 leave dH̃/dt + RH̃ = 4e-9 and 18 leave 1e-11
 AGREED = 1e-13  # of the move to the next iterate: two orders that differ by less differ by rounding
@@ -65,9 +65,7 @@ def inverse_step(L_d: DiscreteLagrangian, state: State, h: Tensor | float, guess
     here = torch.cat([q1, s1[..., None]], -1)
     start = here if guess is None else guess
     root = find_root(equations, start.detach(), scale=(here.abs() + (here - start).abs()).detach())
-    y = root.x
-    if torch.is_grad_enabled():
-        y = attached(y, root.J, equation(y, at(y, 1)))
+    y = root.with_slope(lambda y: equation(y, at(y, 1)))
     P = at(y, 1)
     status = torch.where(root.converged, int(Status.CONVERGED), int(Status.MAX_ITERATIONS)).to(torch.uint8)
     return Step.of(State(y[..., :n], momentum_minus(P), y[..., n]), P.c, status, root.error, root.iterations)

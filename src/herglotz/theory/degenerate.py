@@ -24,11 +24,10 @@ from herglotz.mechanics import (
     momentum_residual,
     partials,
 )
+from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.newton import SHORTEST, Point, Rules, largest, newton
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Status, Step, check_h, check_state
-from herglotz.theory.continuous import jacobian
-from herglotz.theory.jacobi import Triple
 from herglotz.theory.legendrian import contact_product_point
 
 RANK = 0.5  # power of eps: singular values below this times the largest count as zero
@@ -64,6 +63,8 @@ class LegendrianStepper(OneStepMethod):
 
     Source: section 6 of `docs/mathematics.md`; the paper treats regular L_d only.
     """
+
+    iterates = True
 
     def __init__(self, L_d: DiscreteLagrangian, *, ahead: int = 1):
         if ahead < 0:
@@ -113,10 +114,6 @@ class LegendrianStepper(OneStepMethod):
         y, status, _, _ = self._least_squares(lambda y: self._chain(moved(y), h, y[..., n:]), start)
         nan = torch.where(status == Status.CONVERGED, torch.zeros_like(s0), torch.nan)
         return State(moved(y).q + nan[..., None], p0, s0)
-
-    @property
-    def _iterates(self) -> bool:
-        return True
 
     def _chain(self, state: State, h: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
         """All c_j p_j + D1 L_d(q_j, q_{j+1}, s_j) for x = (q1, q2, …), and the size of their terms."""

@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import join, split
 from herglotz.mechanics.newton import attached, find_root
 from herglotz.stepping.method import OneStepMethod
 from herglotz.stepping.state import State, Step, check_h, check_state, status_of_root
@@ -25,7 +26,7 @@ from herglotz.theory.continuous import (
     gradient,
     square_jacobian,
 )
-from herglotz.theory.jacobi import join, sharp_bivector, split
+from herglotz.theory.jacobi import sharp_bivector
 
 FIELDS = {"evolution": evolution_vector_field, "contact": contact_vector_field}
 

@@ -13,13 +13,14 @@ Everything below takes S through the flow, never through those identities, so th
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from herglotz.mechanics.contact import Flow, flow_derivative, flow_derivatives
+from herglotz.mechanics.regularity import least_singular_value
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,12 @@ class GeneratingFunction:
     q: Tensor  # (..., n) q_k
     p: Tensor  # (..., n) p_k as the flow carries it
     s: Tensor  # (...) s_k
-    spread: Tensor  # (...) smallest singular value of ∂q_k/∂p̂0; zero at a caustic, where S^k is not defined
+    # (...) smallest singular value of ∂q_k/∂p̂0; zero at a caustic, where S^k is not defined, and after a failed step
+    spread: Tensor
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> GeneratingFunction:
+        """`change` applied to every tensor."""
+        return GeneratingFunction(**{name: change(x) for name, x in vars(self).items()})
 
     @classmethod
     def of(cls, s: Tensor, end: tuple[Tensor, Tensor, Tensor], D: Tensor) -> GeneratingFunction:
@@ -44,7 +50,7 @@ class GeneratingFunction:
         D2 = torch.linalg.solve_ex(Y_p.mT, G_p[..., None])[0][..., 0]
         D1 = G_q - (Y_q.mT @ D2[..., None])[..., 0]
         D3 = G_s - 1.0 - (D2 * Y_s).sum(-1)
-        return cls(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(Y_p))
+        return cls(s_k - s, D1, D2, D3, q_k, p_k, s_k, least_singular_value(Y_p))
 
 
 def generating_function(
@@ -84,14 +90,7 @@ def left_generating_function(flow_k: Flow, q: Tensor, p: Tensor, s: Tensor) -> G
     slopes = torch.linalg.solve_ex(ends.mT, rate[..., None])[0][..., 0]
     D2, D3 = slopes[..., :n], slopes[..., n]
     D1 = (1 - D3)[..., None] * D[..., 2 * n, :n] - (D[..., :n, :n].mT @ D2[..., None])[..., 0]
-    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, _spread(D[..., :n, n : 2 * n]))
-
-
-def _spread(Y_p: Tensor) -> Tensor:
-    """Smallest singular value of ∂q_k/∂p̂0; 0 where it is not finite."""
-    # A failed step is NaN, which svdvals refuses for the whole batch; NaN there is at a caustic here.
-    finite = torch.isfinite(Y_p).all(-1).all(-1)
-    return torch.linalg.svdvals(torch.where(finite[..., None, None], Y_p, 0.0))[..., -1]
+    return GeneratingFunction(s_k - s, D1, D2, D3, q_k, p_k, s_k, least_singular_value(D[..., :n, n : 2 * n]))
 
 
 def hamilton_jacobi_residual(

@@ -10,11 +10,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.contact import Flow
+from herglotz.mechanics.contact import Flow, join
 from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials, value
 from herglotz.theory.function_germ import Function, FunctionGerm, germ, prolongation
-from herglotz.theory.jacobi import join
 
 
 @dataclass(frozen=True)

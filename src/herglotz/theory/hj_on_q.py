@@ -11,9 +11,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from herglotz.mechanics.contact import join
 from herglotz.theory.continuous import Hamiltonian, gradient
 from herglotz.theory.function_germ import Function, prolongation
-from herglotz.theory.jacobi import Field, join
+from herglotz.theory.jacobi import Field
 
 
 def energy_on_section(H: Hamiltonian, F: Function, q: Tensor) -> tuple[Tensor, Tensor]:

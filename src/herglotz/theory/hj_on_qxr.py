@@ -14,10 +14,11 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import jacobian
 from herglotz.mechanics.legendre import momentum_minus, momentum_plus, momentum_residual
-from herglotz.mechanics.newton import attached, find_root
+from herglotz.mechanics.newton import find_root
 from herglotz.mechanics.partials import DiscreteLagrangian, partials
-from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives, jacobian
+from herglotz.theory.continuous import Hamiltonian, contact_vector_field, derivatives
 
 Section = Callable[[Tensor, Tensor], Tensor]  # p = γ(q, s), (..., n) and (...) → (..., n)
 
@@ -103,12 +104,13 @@ def transport_section(L_d: DiscreteLagrangian, gamma0: Section, h: Tensor | floa
                 f"no point of the section is carried to (q, s) = ({q1[sample].tolist()}, {float(s1[sample]):g}) at "
                 f"sample {sample}; use a smaller h, or points nearer to the image of the section"
             )
-        x = root.x
-        if torch.is_grad_enabled():
+
+        def residual(x: Tensor) -> Tensor:
             q0, s0 = x[..., :-1], x[..., -1]
             P = partials(L_d, q0, q1, s0, h)
-            E = torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
-            x = attached(x, root.J, E)
+            return torch.cat([momentum_residual(P, gamma0(q0, s0)), (s0 + P.L - s1)[..., None]], -1)
+
+        x = root.with_slope(residual)
         return momentum_plus(partials(L_d, x[..., :-1], q1, x[..., -1], h))
 
     return gamma1

@@ -15,22 +15,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from herglotz.mechanics.contact import contact_form
-from herglotz.theory.continuous import ScalarField, derivatives, jacobian
+from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
+from herglotz.theory.continuous import ScalarField, derivatives
 
-Triple = tuple[Tensor, Tensor, Tensor]
 Field = Callable[[Tensor, Tensor, Tensor], Triple]
-
-
-def join(q: Tensor, p: Tensor, s: Tensor) -> Tensor:
-    """(q, p, s) as one tensor (..., 2n+1)."""
-    return torch.cat([q, p, s[..., None]], -1)
-
-
-def split(x: Tensor) -> Triple:
-    """Inverse of `join`."""
-    n = x.shape[-1] // 2
-    return x[..., :n], x[..., n : 2 * n], x[..., 2 * n]
 
 
 def differential(f: ScalarField, q: Tensor, p: Tensor, s: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.newton import attached, find_root
+from herglotz.mechanics.newton import find_root
 from herglotz.theory.continuous import ScalarField, derivatives
 
 
@@ -48,9 +48,7 @@ def fiber_inverse(
             f"Legendre transform: no x with f_x = {y[sample].tolist()} found at sample {sample} (after "
             f"{root.iterations} Newton steps); check that there is one, and that f_xx is not singular"
         )
-    if not torch.is_grad_enabled():
-        return root.x
-    return attached(root.x, root.J, fiber_derivative(f, q, root.x, s) - y)
+    return root.with_slope(lambda x: fiber_derivative(f, q, x, s) - y)
 
 
 def legendre_dual(f: ScalarField) -> ScalarField:

@@ -18,10 +18,9 @@ import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.mechanics.contact import contact_form
-from herglotz.theory.continuous import jacobian
+from herglotz.mechanics.contact import Triple, contact_form, jacobian, join, split
 from herglotz.theory.function_germ import Function
-from herglotz.theory.jacobi import Triple, join, sharp_bivector, split
+from herglotz.theory.jacobi import sharp_bivector
 
 
 @dataclass(frozen=True)
@@ -66,16 +65,14 @@ def contact_product_point(start: Triple, end: Triple, tau: Tensor) -> Triple:
     base is (q̂, q, ŝ), the momenta are (τp̂, −p, −τ), both (..., 2n+1), and z = −s.
     """
     (q0, p0, s0), (q1, p1, s1) = start, end
-    base = torch.cat([q0, q1, s0[..., None]], -1)
-    return base, torch.cat([tau[..., None] * p0, -p1, -tau[..., None]], -1), -s1
+    return join(q0, q1, s0), torch.cat([tau[..., None] * p0, -p1, -tau[..., None]], -1), -s1
 
 
 def contact_product_states(base: Tensor, momenta: Tensor, z: Tensor) -> tuple[Triple, Triple, Tensor]:
     """Inverse of `contact_product_point`: ((q̂, p̂, ŝ), (q, p, s), τ)."""
-    n = base.shape[-1] // 2
-    tau = -momenta[..., -1]
-    start = base[..., :n], momenta[..., :n] / tau[..., None], base[..., -1]
-    return start, (base[..., n : 2 * n], -momenta[..., n : 2 * n], -z), tau
+    (q0, q1, s0), (pushed, minus_p1, minus_tau) = split(base), split(momenta)
+    tau = -minus_tau
+    return (q0, pushed / tau[..., None], s0), (q1, -minus_p1, -z), tau
 
 
 def product_potential(S: Callable[[Tensor, Tensor, Tensor], Tensor]) -> Function:

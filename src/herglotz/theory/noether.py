@@ -16,9 +16,10 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
+from herglotz.mechanics.contact import Triple, jacobian
 from herglotz.mechanics.partials import DiscreteLagrangian, value
-from herglotz.theory.continuous import Hamiltonian, ScalarField, gradient, jacobian
-from herglotz.theory.jacobi import Triple, jacobi_bracket
+from herglotz.theory.continuous import Hamiltonian, ScalarField, gradient
+from herglotz.theory.jacobi import jacobi_bracket
 
 Action = Callable[[Tensor, Tensor], Tensor]  # g(ε, q): (...) and (..., n) → (..., n), g(0, q) = q
 Shift = Callable[[Tensor, Tensor], Tensor]  # χ(ε, q): (...) and (..., n) → (...), χ(0, q) = 0

@@ -22,9 +22,9 @@ import torch
 from torch import Tensor
 
 from herglotz.mechanics import momentum_minus, momentum_plus
+from herglotz.mechanics.contact import Triple, join, split
 from herglotz.mechanics.partials import DiscreteLagrangian, Partials, partials
 from herglotz.theory.hamiltonian import LeftHamiltonian, RightHamiltonian
-from herglotz.theory.jacobi import Triple, split
 from herglotz.theory.left import unforced
 from herglotz.theory.legendrian import contact_product_point
 
@@ -47,15 +47,13 @@ class TulczyjewTriple:
 def right_leg(start: Triple, end: Triple, tau: Tensor) -> Triple:
     """A point of the contact product in the coordinates of the right Hamiltonian leg."""
     (q0, p0, s0), (q1, p1, s1) = start, end
-    base = torch.cat([q0, p1, s0[..., None]], -1)
-    return base, torch.cat([tau[..., None] * p0, q1, -tau[..., None]], -1), (p1 * q1).sum(-1) - s1
+    return join(q0, p1, s0), torch.cat([tau[..., None] * p0, q1, -tau[..., None]], -1), (p1 * q1).sum(-1) - s1
 
 
 def left_leg(start: Triple, end: Triple, tau: Tensor) -> Triple:
     """A point of the contact product, τ ≠ 0, in the coordinates of the left Hamiltonian leg."""
     (q0, p0, s0), (q1, p1, s1) = start, end
-    base = torch.cat([p0, q1, s1[..., None]], -1)
-    return base, torch.cat([-q0, -p1 / tau[..., None], 1 / tau[..., None]], -1), s0 - (p0 * q0).sum(-1)
+    return join(p0, q1, s1), torch.cat([-q0, -p1 / tau[..., None], 1 / tau[..., None]], -1), s0 - (p0 * q0).sum(-1)
 
 
 def right_leg_states(base: Tensor, momenta: Tensor, z: Tensor) -> tuple[Triple, Triple, Tensor]:

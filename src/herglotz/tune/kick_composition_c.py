@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import math
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from numpy.polynomial import chebyshev, polynomial as power
 
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
+from herglotz.export import c_numbers
 from herglotz.export.c_header import runtime
 from herglotz.export.c_wrapper import build
 from herglotz.export.lower.c import as_scalars
@@ -109,7 +111,7 @@ def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
     """The header, for numbers of this dtype; raise InputError if the dtype has no C form."""
     if dtype not in TYPES:
         raise InputError(f"dtype must be float64 or float32, got {dtype}")
-    number = _number(dtype)
+    number = partial(c_numbers.number, dtype=dtype)
     root = math.exp(-0.5 * stepper.rate * stepper.h)
     unit = math.pi if stepper.angle else 1.0
     drifts = [_drift(float(d), unit, number) for d in stepper.drifts]
@@ -158,16 +160,13 @@ class CompiledKicks:
         return lambda keep=(arrays, outputs): function(*sizes, ctypes.c_double(0.0), *pointers), outputs  # noqa: ARG005
 
 
-def _number(dtype: str) -> Any:
-    return (lambda x: f"{float(np.float32(x))!r}f") if dtype == "float32" else (lambda x: repr(float(x)))
-
-
 def _drift(d: float, unit: float, number: Any) -> str:
     return f"  s += {number(0.5 * d)} * p * p;\n  q += {number(d / unit)} * p;"
 
 
 def _kick(stepper: KickStepper, i: int, dtype: str) -> str:
-    number, a, b = _number(dtype), stepper.cosines[i].double().numpy(), stepper.sines[i].double().numpy()
+    number = partial(c_numbers.number, dtype=dtype)
+    a, b = stepper.cosines[i].double().numpy(), stepper.sines[i].double().numpy()
     n = np.arange(1, len(a) + 1)
     if stepper.angle:
         even, odd = chebyshev.cheb2poly(np.r_[0.0, a]), _second_kind(b)  # V = even(c) + sin q · odd(c)

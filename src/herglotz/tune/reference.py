@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import torch
 
+from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper
@@ -37,10 +38,7 @@ def draw_starts(run: Run, count: int, seed: int) -> State:
     A uniform draw would fill the corners of the box too, where no data hold the model.
     """
     generator = torch.Generator().manual_seed(seed)
-    trained = [
-        torch.arange(first, first + length) for first, length in zip(run.data.offsets, run.train_lengths, strict=True)
-    ]
-    rows = torch.cat(trained)
+    rows = leading_rows(run.data.lengths, run.train_lengths)
     fine = torch.stack([x.reshape(len(x), -1).isfinite().all(-1).cpu() for x in run.states]).all(0)
     rows = rows[fine[rows]]
     if not len(rows):

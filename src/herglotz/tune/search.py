@@ -126,11 +126,9 @@ class _Search:
     def _models(self) -> Iterator[tuple[int, int | None, ContactLagrangian]]:
         """Yield (multiple, width, model): the run's own model at every step, then the distilled models."""
         config, own = self.config, self.own
-        yield 1, None, own  # `Tuning.own` relies on the run as it is being the first
         multiples = sorted(config.multiples)
-        for m in multiples:
-            if m != 1:
-                yield m, None, own
+        for m in sorted({1, *multiples}):  # `Tuning.own` relies on the run as it is being the first
+            yield m, None, own
         for width in config.widths:
             for m in multiples:
                 start = widened(own, width, max(own.config.correction_depth, 2))

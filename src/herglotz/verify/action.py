@@ -84,11 +84,11 @@ def fan(subject: Subject, steps: int, seed: int) -> Fan:
     found = flow_derivatives([subject.flow(k - before) for before, k in pairwise([0, *counts])], *start)
     end, D = found[-1]
     sound = torch.isfinite(D).all(-1).all(-1) & torch.isfinite(end[2])
-    S = {k: _selected(GeneratingFunction.of(start.s, *x), sound) for k, x in zip(counts, found, strict=True)}
+    S = {k: GeneratingFunction.of(start.s, *x).map(lambda y: y[sound]) for k, x in zip(counts, found, strict=True)}
     start = State(*(x[sound] for x in start))
     with torch.no_grad():
         sigma = dict(enumerate(subject.rollout(start, steps).sigma.unbind(-1)))
-    keep = {k: _usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
+    keep = {k: usable(g, S[1], k) & torch.isfinite(sigma[k]) for k, g in S.items()}
     return Fan(start, S, sigma, keep, int((~sound).sum()))
 
 
@@ -170,7 +170,7 @@ def _on_fan(
                 regular = scaled_margin(hessian(P), mixed_hessian(P), P.D11, P.D22) > FOLD
                 folds += int((keep & ~regular).sum())
                 keep = keep & regular
-            b, a = (_selected(g, keep) for g in (before, after))
+            b, a = (g.map(lambda x, keep=keep: x[keep]) for g in (before, after))
             residual, pairing, H = side(b, a)
             residuals.append(residual.abs())
             sizes.append(a.S.abs() + b.S.abs() + pairing.abs() + H.abs())
@@ -180,10 +180,6 @@ def _on_fan(
     return (worst(torch.cat(residuals)) / size if size > 0 else float("nan")), notes
 
 
-def _selected(g: GeneratingFunction, keep: Tensor) -> GeneratingFunction:
-    return GeneratingFunction(**{name: x[keep] for name, x in vars(g).items()})
-
-
-def _usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
+def usable(g: GeneratingFunction, one: GeneratingFunction, k: int) -> Tensor:
     """Return whether S^k is away from a caustic: the fan has opened, compared with k free steps."""
     return (g.spread > CAUSTIC * k * one.spread) & torch.isfinite(g.D2).all(-1) & torch.isfinite(g.S)

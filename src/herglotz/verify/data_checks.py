@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, precisions
-from herglotz.data.spikes import spikes, without
+from herglotz.data.spikes import spikes
+from herglotz.data.splits import leading
 from herglotz.data.trajectories import GAP
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual, partials
 from herglotz.stepping import State, solve
@@ -84,12 +83,9 @@ def _without_spikes(run: Run) -> Run:
     bad = spikes(run.data.unwrapped())
     if run.config.robust == "off" or not bool(bad.any()):
         return run
-    trained = tuple(
-        k - int(bad[first : first + k].sum()) for first, k in zip(run.data.offsets, run.train_lengths, strict=True)
-    )
-    return replace(
-        run, data=without(run.data, bad), states=State(*(x[~bad] for x in run.states)), train_lengths=trained
-    )
+    kept = leading(run.data.lengths, run.train_lengths).to(bad.device) & ~bad
+    trained = tuple(int(own.sum()) for own in kept.split(list(run.data.lengths)))
+    return replace(run, data=run.data.keep(~bad), states=State(*(x[~bad] for x in run.states)), train_lengths=trained)
 
 
 def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
@@ -134,18 +130,13 @@ def _one_step(run: Run, q: Tensor, spread: Tensor) -> tuple[float, float, float]
 def _free_run(run: Run) -> tuple[float, str]:
     """Return the RMS of prediction − data over the samples after the training part, over their spread."""
     q = run.data.unwrapped().q
-    rows = [torch.arange(a + k, b) for (a, b), k in zip(_spans(run.data), run.train_lengths, strict=True) if b - a > k]
-    note = f"{sum(len(x) for x in rows)} samples the fit did not see"
-    index = torch.cat(rows)
+    index = (~leading(run.data.lengths, run.train_lengths)).nonzero()[:, 0]
+    note = f"{len(index)} samples the fit did not see"
     error = run.prediction[index].to(q.dtype) - q[index]
     turning = torch.tensor(run.data.angles, device=q.device)
     error = torch.where(turning, error - 2 * math.pi * torch.round(error / (2 * math.pi)), error)
     value = _rms(error / _spread(q[index]))
     return (value if math.isfinite(value) else math.inf), note
-
-
-def _spans(data: Trajectories) -> Iterator[tuple[int, int]]:
-    return ((a, a + length) for a, length in zip(data.offsets, data.lengths, strict=True))
 
 
 def _spread(q: Tensor) -> Tensor:

@@ -12,7 +12,7 @@ from herglotz.mechanics import flow_derivative, momentum_jacobian, momentum_plus
 from herglotz.mechanics.contact import Flow
 from herglotz.stepping import State, Status, Stepper, solve
 from herglotz.theory import TimeDependent, energies, generating_function, time_defect
-from herglotz.verify.action import CAUSTIC, Fan, derivatives, hamilton_jacobi, left_hamilton_jacobi
+from herglotz.verify.action import Fan, derivatives, hamilton_jacobi, left_hamilton_jacobi, usable
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, contact, convergence, positive_factor, volume, worst
 from herglotz.verify.subject import Subject
@@ -67,8 +67,7 @@ def _fan(family: TimeDependent, known: Subject, w: SampledRollout) -> Fan:
 
     S = {k: generating_function(stepped(k), *start) for k in sorted({1, 2, w.steps - 1, w.steps})}
     sigma = dict(enumerate(w.c[whole].cumprod(-1).unbind(-1), 1))
-    keep = {k: (g.spread > CAUSTIC * k * S[1].spread) & torch.isfinite(g.D2).all(-1) for k, g in S.items()}
-    return Fan(start, S, sigma, keep, int((~whole).sum()))
+    return Fan(start, S, sigma, {k: usable(g, S[1], k) for k, g in S.items()}, int((~whole).sum()))
 
 
 def _matching(members: list[Subject], w: SampledRollout, bound: float) -> Check:

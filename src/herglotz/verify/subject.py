@@ -83,21 +83,11 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
     make = torch.Generator().manual_seed(seed)
     target = named(target)
     if isinstance(target, Scene):
-        L_d = target.L_d
-        states = _scene_states(target, samples, make)
-        return Subject(f"scene {target.name}", "scene", _stepper(L_d), states, _step_size(h, target.h), L_d, target)
+        states, size, step = _scene_states(target, samples, make), _step_size(h, target.h), Stepper(target.L_d).step
+        return Subject(f"scene {target.name}", "scene", step, states, size, target.L_d, target)
     if isinstance(target, Run):
-        states = _run_states(target, samples, make)
-        size = _step_size(h, target.h)
-        return Subject(
-            f"run on {target.data.source or 'data'}",
-            "run",
-            _stepper(target.model),
-            states,
-            size,
-            target.model,
-            run=target,
-        )
+        states, size, step = _run_states(target, samples, make), _step_size(h, target.h), Stepper(target.model).step
+        return Subject(f"run on {target.data.source or 'data'}", "run", step, states, size, target.model, run=target)
     if isinstance(target, ExportedStepper):
         closed = not target.differentiable
         smooth = DifferencedStepper(target) if closed else target
@@ -120,12 +110,9 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
 
 
 def named(target: Any) -> Any:
-    """Return what a name or a path stands for, a scene, a run or a file; anything else comes back."""
-    return _open(target) if isinstance(target, str | os.PathLike) else target
-
-
-def _open(target: str | os.PathLike[str]) -> Scene | Run | ExportedStepper:
-    """Return a scene by its name, a run by its folder, or an exported file."""
+    """Return a scene by its name, a run by its folder, an exported file by its path; anything else comes back."""
+    if not isinstance(target, str | os.PathLike):
+        return target
     if target in scene_names():
         return scene(str(target))
     path = Path(target)
@@ -145,11 +132,7 @@ def _pair(source: Any, states: Any, h: float | None) -> Subject:
     state, size = State(*(x.detach() for x in check_batch(states))), _step_size(h, h)
     if hasattr(source, "step"):
         return Subject(type(source).__name__, "stepper", source.step, state, size, getattr(source, "L_d", None))
-    return Subject(getattr(source, "__name__", type(source).__name__), "L_d", _stepper(source), state, size, source)
-
-
-def _stepper(L_d: DiscreteLagrangian) -> Callable[[State, float], Step]:
-    return Stepper(L_d).step
+    return Subject(getattr(source, "__name__", type(source).__name__), "L_d", Stepper(source).step, state, size, source)
 
 
 def _step_size(h: float | None, default: float) -> float:

@@ -133,7 +133,7 @@ def test_beyond_a_conjugate_point_is_nan_with_a_reason():
     shot = L_d.shoot(q, q + 0.3, torch.zeros(4).double(), h)
     assert shot.reason.tolist() == [Reason.NONE, Reason.CONJUGATE, Reason.CONJUGATE, Reason.CONJUGATE]
     assert shot.P.L.isnan().tolist() == shot.P.D12.isnan()[:, 0, 0].tolist() == [False, True, True, True]
-    assert shot.p0.isnan()[:, 0].tolist() == [False, True, True, True]
+    assert shot.P.D1.isnan()[:, 0].tolist() == [False, True, True, True]
     torch.testing.assert_close(shot.P.L[0], system.L_d(q, q + 0.3, f64(0.0), h)[0])
 
 

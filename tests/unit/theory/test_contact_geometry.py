@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from herglotz.mechanics import contact_form, flow_derivative
+from herglotz.mechanics.contact import join, split
 from herglotz.theory import (
     bivector,
     contact_curvature,
@@ -20,7 +21,6 @@ from herglotz.theory import (
     sharp,
     sharp_bivector,
 )
-from herglotz.theory.jacobi import join, split
 
 
 def H(q, p, s):

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import join
 from herglotz.scenes import reference_flow, scene
 from herglotz.stepping import State, Status
 from herglotz.theory import (
@@ -17,7 +18,6 @@ from herglotz.theory import (
     legendrian_defect,
     prolongation,
 )
-from herglotz.theory.jacobi import join
 
 PENDULUM = scene("damped_pendulum").hamiltonian
 

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from herglotz.errors import InputError
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 from herglotz.theory import (
@@ -14,8 +15,6 @@ from herglotz.theory import (
     product_potential,
     prolongation,
 )
-from herglotz.theory.continuous import jacobian
-from herglotz.theory.jacobi import join, split
 
 H = torch.tensor(0.1, dtype=torch.float64)
 

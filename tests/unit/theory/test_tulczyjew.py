@@ -5,6 +5,7 @@ import torch
 
 from herglotz.errors import InputError
 from herglotz.mechanics import contact_form
+from herglotz.mechanics.contact import jacobian, join, split
 from herglotz.scenes import scene
 from herglotz.stepping import Status
 from herglotz.theory import (
@@ -18,8 +19,6 @@ from herglotz.theory import (
     right_leg_states,
     tulczyjew_triple,
 )
-from herglotz.theory.continuous import jacobian
-from herglotz.theory.jacobi import join, split
 
 
 def nonlinear(q0, q1, s0, h):
