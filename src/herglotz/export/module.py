@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from itertools import chain, islice
 from typing import Any
 
 import torch
@@ -11,24 +12,27 @@ from torch._higher_order_ops.scan import scan_op
 from torch._higher_order_ops.while_loop import while_loop_op
 
 from herglotz.export.equation import Equations, dense
-from herglotz.export.step import CARRIED, CONVERGED, STATE, StepGraphs, Values, unfinished
+from herglotz.export.parts import parted
+from herglotz.export.step import CARRIED, CONVERGED, STATE, Layout, StepGraphs, Values, unfinished
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.stepping.linearise import eliminate
 
+Call = Callable[..., Any]
+
 
 def solved(
-    graphs: StepGraphs, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor], constants: Sequence[Values]
-) -> Values:
-    """Newton's last carry: begin, then iterate to the end; `constants` are those of `begin` and of `iterate`."""
-    state, here, trail, _ = graphs.layout.split(carry)
-    given = (*state, h, *u) if graphs.layout.sticks else (h, *trail)
-    begun = tuple(dense(x) for x in graphs.begin.call(*given, *constants[0]))
+    begin: Call, iterate: Call, more: Values,
+    layout: Layout, iterations: int, h: Tensor, u: Values, carry: Sequence[Tensor],
+) -> Values:  # fmt: skip
+    """Newton's last carry: begin, then iterate to the end; `more` is what `iterate` takes last."""
+    state, here, trail, _ = layout.split(carry)
+    begun = tuple(dense(x) for x in begin(*((*state, h, *u) if layout.sticks else (h, *trail))))
     first, held = begun[:CARRIED], begun[CARRIED:]
-    fixed: Any = (*state, h, *here, *u, *held, *constants[1])
+    fixed: Any = (*state, h, *here, *u, *held, *more)
     ends = len(first), len(first) + STATE + 1
 
     def turn(*x: Tensor) -> Values:
-        return graphs.iterate.call(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
+        return iterate(*x[ends[0] : ends[1]], *x[: ends[0]], *x[ends[1] :])
 
     # The operator itself: its wrapper would have dynamo trace the loop, which takes longer than all else.
     carried: Any = first
@@ -38,11 +42,20 @@ def solved(
 
 
 class RolloutModule(nn.Module):
-    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`."""
+    """(q, p, s, h[, u]) → K steps, h of shape (K, B): both loops are inside, Newton's of at most `iterations`.
 
-    def __init__(self, graphs: StepGraphs, iterations: int):
+    With `hoists`, what h and u alone decide is evaluated before the loop, for all steps at once, and what a step
+    reports behind it: an ONNX file then takes half the time for a step without iteration at B = 1. Compiled code does
+    not gain from it, and nothing may follow the loop there: inductor of torch 2.13 gives the names of buffers twice.
+    """
+
+    def __init__(self, graphs: StepGraphs, iterations: int, hoists: bool = True):
         super().__init__()
-        self.graphs, self.iterations = graphs, iterations
+        self.graphs, self.iterations, self.hoists = graphs, iterations, hoists
+        parts = list(graphs.parts())
+        cut = [parted(*part) for part in parts] if hoists else []
+        self.rows = nn.ModuleList(first for first, _ in cut)
+        self.steps: Any = nn.ModuleList([rest for _, rest in cut] if hoists else [whole for whole, _ in parts])
 
     def forward(
         self,
@@ -56,25 +69,40 @@ class RolloutModule(nn.Module):
 
         Entry k is what step k = 1 … K gives, and NaN from a failed step on.
         """
-        graphs = self.graphs
+        graphs, layout, sizes = self.graphs, self.graphs.layout, h.shape
+        flat = [x.reshape(-1, *x.shape[2:]) for x in (h, *u)]
+        rows = [[y.reshape(*sizes, *y.shape[1:]) for y in graph(*flat)] for graph in self.rows] or [[]] * len(
+            self.steps
+        )
         carry = [dense(x) for x in graphs.start(q, p, s)]
-        used = (*((graphs.begin, graphs.iterate) if graphs.layout.iterates else ()), graphs.finish, graphs.report)
-        counts = [len(graph.constants) for graph in used]
-        ends = len(carry), len(carry) + 1 + len(u)
+        given = [[h, *u], *rows], [[s.shape[0]], *(graph.constants for graph in (*self.steps, graphs.report))]
+        xs, fixed = (list(chain(*x)) for x in given)
 
         def step(*x: Any) -> list[Tensor]:
-            carry, (h, *u), (size, *fixed) = x[: ends[0]], x[ends[0] : ends[1]], x[ends[1] :]
+            places = iter(x)
+            carry = tuple(islice(places, layout.size))
+            (h, *u), *made = (list(islice(places, len(y))) for y in given[0])
+            (size,), *constants = (tuple(islice(places, len(y))) for y in given[1])
             # The sum keeps the batch size a symbol of this graph, which inductor needs to allocate the outputs.
             h = h + torch.zeros(size, dtype=h.dtype, device=h.device)
-            constants = [tuple(fixed[sum(counts[:i]) : sum(counts[: i + 1])]) for i in range(len(counts))]
-            found = solved(graphs, self.iterations, h, tuple(u), carry, constants) if graphs.layout.iterates else ()
-            new = graphs.finish.call(h, *u, *carry, *found, *constants[-2])
-            said = graphs.report.call(h, *carry[:STATE], *new[:STATE], *new[len(carry) :], *constants[-1])
-            return [dense(y) for y in (*new[: len(carry)], *said)]
+            more = [(*x, *y) for x, y in zip(made, constants, strict=False)]
+            found: Values = ()
+            if layout.iterates:
+                begin, iterate, _ = self.steps
+                steps = (lambda *x: begin.call(*x, *more[0])), iterate.call, more[1]
+                found = solved(*steps, layout, self.iterations, h, tuple(u), carry)
+            new = self.steps[-1].call(h, *u, *carry, *found, *more[-1])
+            rows = (*new[:STATE], *new[layout.size :])
+            if not self.hoists:
+                rows = graphs.report.call(h, *carry[:STATE], *rows, *constants[-1])
+            return [dense(y) for y in (*new[: layout.size], *rows)]
 
-        fixed = (s.shape[0], *(x for graph in used for x in graph.constants))
-        # Nothing may follow the scan: inductor of torch 2.13 gives the names of its buffers twice then.
-        return tuple(scan_op(step, carry, [h, *u], fixed)[len(carry) :])
+        new = scan_op(step, carry, xs, fixed)[layout.size :]
+        if not self.hoists:
+            return tuple(new)
+        before = (torch.cat([x[None], y[:-1]]) for x, y in zip((q, p, s), new, strict=False))
+        said = graphs.report(flat[0], *(x.reshape(-1, *x.shape[2:]) for x in (*before, *new)))
+        return tuple(x.reshape(*sizes, *x.shape[1:]) for x in said)
 
 
 class StepModule(nn.Module):
@@ -110,9 +138,9 @@ class StepModule(nn.Module):
         carry, found = graphs.start(q, p, s), ()
         if graphs.layout.iterates:
             fixed = [x.detach() for x in (h, *u, *carry)]
-            constants = graphs.begin.constants, graphs.iterate.constants
             split = 1 + len(u)
-            found = solved(graphs, self.iterations, fixed[0], tuple(fixed[1:split]), fixed[split:], constants)
+            steps = graphs.begin, graphs.iterate.call, graphs.iterate.constants
+            found = solved(*steps, graphs.layout, self.iterations, fixed[0], tuple(fixed[1:split]), fixed[split:])
             if self.jacobian is None:
                 found = self._attached((q, p, s, h), (*graphs.layout.split(carry)[1], *u), found)
         new = graphs.finish(h, *u, *carry, *found)

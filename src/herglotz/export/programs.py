@@ -26,11 +26,11 @@ EXAMPLE_STEPS = 13  # of the traced rollout; the number of steps stays free
 
 
 def programs_of(
-    model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str]
+    model: ContactLagrangian, entries: Mapping[str, Any], names: Sequence[str], hoists: bool = True
 ) -> dict[str, ExportedProgram]:
     """Those programs of `model` (a differentiable step), `rollout`, `linearise` and `init` that are named.
 
-    Each holds for any batch size; `entries` is the file's metadata.
+    Each holds for any batch size; `entries` is the file's metadata, `hoists` that of `RolloutModule`.
     """
     equations = Equations.of(model)
     graphs = StepGraphs(equations.model, entries["box"], entries.get("h_range"))
@@ -40,7 +40,7 @@ def programs_of(
     make = {
         "model": lambda: _program(StepModule(equations, graphs, iterations), (q, p, s, *more)),
         "linearise": lambda: _program(StepModule(equations, graphs, iterations, linearised=True), (q, p, s, *more)),
-        "rollout": lambda: _program(RolloutModule(graphs, iterations), (q, p, s, *stacked), stacked=3),
+        "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=3),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
     }
     return {name: make[name]() for name in names}

@@ -15,7 +15,7 @@ round a small step away; where dry friction can hold a coordinate it is the z of
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 
 import torch
@@ -24,7 +24,7 @@ from torch import Tensor, nn
 from herglotz.export.box import Box, report
 from herglotz.export.equation import Terms, dense, example, inverse, length, step_equation
 from herglotz.export.metadata import TOLERANCE
-from herglotz.export.trace import traced
+from herglotz.export.trace import Graph, traced
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
 from herglotz.stepping.explicit import Leapfrog
@@ -225,6 +225,7 @@ class StepGraphs(nn.Module):
         super().__init__()
         layout = self.layout = Layout(model)
         q, p, s, h, *u = example(model, 0.1)
+        self.inputs = len(u)
         self.start = traced(partial(start, model), (q, p, s))
         carry = [y + 0.1 * i for i, y in enumerate(self.start(q, p, s))]
         here = carry[STATE : STATE + layout.field]
@@ -242,3 +243,12 @@ class StepGraphs(nn.Module):
         rows = [y + 1 for y in (q, p, s, s + 1)]
         solved = (s + 3, (s > 0).to(torch.uint8)) if layout.iterates else ()
         self.report = traced(partial(report, Box.of(box, model, h_range)), (h, q, p, s, *rows, *solved))
+
+    def parts(self) -> Iterator[tuple[Graph, list[bool]]]:
+        """Begin and iterate where a step has them, and finish, each with whether an input is h or u."""
+        layout, u = self.layout, [True] * self.inputs
+        state, found, here = ([False] * size for size in (STATE, CARRIED * layout.iterates, layout.field))
+        if layout.iterates:
+            yield self.begin, [*state, True, *u] if layout.sticks else [True, False]
+            yield self.iterate, [*state, True, *found, *here, *u, *[False] * 2 * layout.sticks]
+        yield self.finish, [True, *u, *[False] * layout.size, *found]

@@ -19,7 +19,7 @@ LARGEST = 4096  # multiples of the batch looked for in shapes: (rows · B, …)
 SAME = (  # what leaves its first argument as it is, wherever shape and dtype stay
     aten.alias.default, aten.to.device, aten.to.dtype, aten.to.dtype_layout, aten.expand.default, aten.reshape.default,
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
-    aten.broadcast_to.default, aten.movedim.intlist,
+    aten.broadcast_to.default, aten._unsafe_view.default,
 )  # fmt: skip
 # A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value;
 # the sign of a complex number, which is what derivatives of |x| ask for, is that of a real one.
@@ -139,9 +139,10 @@ class Recorder(TorchDispatchMode):
         self.alive += [args, result]
         if self._is_fixed((args, kwargs)):
             return result
-        if _changes_nothing(func, args, result):
+        same = self._same(func, args, kwargs, result)
+        if same is not None:
             self.unchanged[id(result)] = (func, args, kwargs)
-            self._name(result, self._moved(args[0]))
+            self._name(result, self._moved(same))
         elif func == aten.copy_.default:  # into zeros that nothing else reads
             shape = self._with_batch(list(result.shape))
             self._name(result, self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape)))
@@ -169,6 +170,26 @@ class Recorder(TorchDispatchMode):
         arguments, options = (self._with_batch(_map(self._moved, x)) for x in (args, kwargs))
         new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
         return new or self.graph.call_function(INSTEAD.get(func, func), arguments, options)
+
+    def _same(self, func: Any, args: Any, kwargs: Any, result: Any) -> Tensor | None:
+        """The argument that the result equals: views of the same shape, x + 0 and 1 x."""
+        if func == aten.add.Tensor:
+            others = [x for x, y in (args, args[::-1]) if not kwargs and self._is_number(y, 0)]
+        elif func == aten.mul.Tensor:
+            others = [x for x, y in (args, args[::-1]) if self._is_number(y, 1)]
+        elif func == aten.movedim.intlist:
+            others = [args[0]] if args[1] == args[2] else []
+        else:
+            others = [args[0]] if func in SAME else []
+        return next((x for x in others if (x.shape, x.dtype) == (result.shape, result.dtype)), None)
+
+    def _is_number(self, x: Any, number: int) -> bool:
+        """Whether no input decides this, and every entry is that number."""
+        if not isinstance(x, Tensor):
+            return x == number
+        if id(x) in self.nodes or x.is_meta:
+            return False
+        return number == 0 if x._is_zerotensor() else bool((x == number).all())
 
     def _is_fixed(self, arguments: Any) -> bool:
         """Whether neither an input nor the batch size decides the arguments."""
@@ -227,14 +248,6 @@ def _mentions(x: Any, batch: int) -> bool:
     if isinstance(x, dict):
         return any(_mentions(y, batch) for y in x.values())
     return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * batch and x % batch == 0
-
-
-def _changes_nothing(func: Any, args: Any, result: Any) -> bool:
-    if func not in SAME:
-        return False
-    if func == aten.movedim.intlist:
-        return bool(args[1] == args[2])
-    return args[0].shape == result.shape and args[0].dtype == result.dtype
 
 
 def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:

@@ -13,7 +13,7 @@ from torch.export.graph_signature import InputKind
 from herglotz.data.seal import sealed_onnx
 from herglotz.errors import InputError
 from herglotz.export.lower.onnx_table import write
-from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of
+from herglotz.export.lower.onnx_writer import Constants, Writer, described, kind_of, needed, reads
 from herglotz.export.metadata import KEY, to_json
 from herglotz.export.programs import programs_of, quiet, writes
 from herglotz.models import ContactLagrangian
@@ -60,18 +60,20 @@ def graph_of(
     from onnx import helper
 
     values, shapes = _placeholders(program, inputs)
-    dtype = next(x.dtype for x in values if isinstance(x, Tensor) and x.is_floating_point())
-    writer = Writer(Constants(), dtype)
+    writer = Writer(Constants(), described(shapes[inputs[0]]).dtype)
+    values = [writer.stored(x, described(shapes[x]).shape) if isinstance(x, str) else x for x in values]
     found = write(writer, program.graph_module, values)
     places: Any = next(x for x in program.graph.nodes if x.op == "output").args[0]
-    for name, x in zip(outputs, found, strict=True):
-        writer.emit("Identity", x, to=name)
+    for name, x, place in zip(outputs, found, places, strict=True):
+        writer.emit("Identity", writer.plain(x, described(place).shape), to=name)
     described_outputs = dict(zip(outputs, places, strict=True))
+    nodes = needed(writer.nodes, outputs)
+    read = set().union(*map(reads, nodes))
     graph = helper.make_graph(
-        writer.nodes, "herglotz",
+        nodes, "herglotz",
         [_info(name, described(x)) for name, x in shapes.items()],
         [_info(name, described(x)) for name, x in described_outputs.items()],
-        writer.constants.tensors,
+        [x for x in writer.constants.tensors if x.name in read],
     )  # fmt: skip
     proto = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], producer_name="herglotz")
     proto.ir_version = min(proto.ir_version, 10)

@@ -5,6 +5,7 @@ A function `write_*` writes the nodes for one operation of the program and gives
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,13 +13,10 @@ import numpy as np
 import torch
 from torch import fx
 
-from herglotz.errors import InputError
-from herglotz.export.lower.onnx_writer import NUMPY, Writer, described
+from herglotz.export.lower import onnx_functions
+from herglotz.export.lower.onnx_writer import NUMPY, Writer, axis_of, described, order_of, require
 
 aten = torch.ops.aten
-# Coordinates up to which a column is repeated by a product with ones before it meets a matrix: onnxruntime 1.24 takes
-# 12 µs for (1024, 1) + (1024, 2), whose rows it adds one by one, 2 µs for two (1024, 2) and 2 to 3 µs for the product.
-NARROW = 8
 
 
 def common_dtype(node: Any) -> torch.dtype | None:
@@ -30,48 +28,15 @@ def common_dtype(node: Any) -> torch.dtype | None:
     return described(node).dtype if described(node).dtype != torch.bool else None
 
 
-def axis_of(axis: int, x: Any) -> int:
-    """An axis counted from the front."""
-    return axis % len(described(x).shape)
-
-
 def is_within_sum(node: Any) -> bool:
     """Whether this is |x| on its way into sums, which ONNX has as one operation."""
     return node.target == aten.abs.default and all(x.target == aten.sum.dim_IntList for x in node.users)
 
 
-def write_beside(w: Writer, node: Any, dtype: torch.dtype | None) -> list[str]:
-    """The operands of an operation, with a column beside a narrow matrix as a matrix of equal columns."""
-    shape = described(node).shape
-    n = shape[-1] if len(shape) > 1 else 1
-    names = [w.name(x, dtype) for x in node.args]
-    for i, x in enumerate(node.args):
-        if 1 < n <= NARROW and isinstance(x, fx.Node) and described(x).shape[1:] == (1,):
-            names[i] = w.widened(names[i], described(x).dtype, n)
-    return names
-
-
-def write_scaled(w: Writer, node: Any) -> str | None:
-    """A narrow matrix whose columns are multiplied by known numbers, as a product for the same reason; else None."""
-    for x, row in (node.args, node.args[::-1]):
-        known = w.known(row)
-        if known is None or known.ndim != 1 or not 1 < len(known) <= NARROW or len(described(node).shape) != 2:
-            continue
-        if isinstance(x, fx.Node) and described(x).shape[-1] == len(known):
-            return w.emit("Gemm", w.name(x), w.constant(torch.diag(known.detach()).numpy(), NUMPY[known.dtype]))
-    return None
-
-
-def require(holds: bool, node: Any) -> None:
-    """Raise InputError where somebody's own term has an operation in a form that is not written."""
-    if not holds:
-        raise InputError(f"ONNX export does not know this form of {node.target}; export to --format pt2 or c")
-
-
 def write_slice(w: Writer, node: Any) -> str:
     """x[start:end:step] along one axis."""
     x, axis, start, end, *step = node.args
-    limits = [w.integers(k) for k in (start or 0, end, axis, *step)]
+    limits = [w.integers(k) for k in (start or 0, end, axis_of(axis, x), *step)]
     return w.emit("Slice", w.name(x), *limits)
 
 
@@ -98,66 +63,175 @@ def write_item(w: Writer, node: Any) -> str:
         require(index == 0, source)
         return write_inverse(w, source.args[0])
     require(source.target == aten.log_sigmoid_forward.default and index == 0, source)
-    return write_log_sigmoid(w, source.args[0])
+    return onnx_functions.write_log_sigmoid(w, source.args[0])
 
 
 def write_inverse(w: Writer, x: Any) -> str:
     """The inverse of a mass matrix by Gauss and Jordan: ONNX has none, and such a matrix needs no row exchanges."""
     n, real = described(x).shape[-1], NUMPY[described(x).dtype]
-    eye, last = np.eye(n), w.integers(-1)
+    eye = np.eye(n)
+    rows, columns = w.integers(axis_of(-2, x)), w.integers(axis_of(-1, x))
+    # Constants (n, n) meet (..., n, n), held as (..., n, n, batch).
+    meeting = (lambda y: y[..., None]) if axis_of(-1, x) + 1 < len(described(x).shape) else (lambda y: y)
     J = w.name(x)
     for k in range(n):
-        column = w.emit("Slice", J, w.integers(k), w.integers(k + 1), last)  # (..., n, 1)
-        pivot = w.emit("Slice", column, w.integers(k), w.integers(k + 1), w.integers(-2))
-        held = w.emit("Mul", J, w.constant(1 - eye[k], real))
-        cleared = w.emit("Add", held, w.constant(np.outer(eye[k], eye[k]), real))
-        row = w.emit("Div", w.emit("Slice", cleared, w.integers(k), w.integers(k + 1), w.integers(-2)), pivot)
-        J = w.emit("Sub", cleared, w.emit("Mul", w.emit("Sub", column, w.constant(eye[k][:, None], real)), row))
+        ends = w.integers(k), w.integers(k + 1)
+        column = w.emit("Slice", J, *ends, columns)
+        pivot = w.emit("Slice", column, *ends, rows)
+        held = w.emit("Mul", J, w.constant(meeting(1 - eye[k : k + 1]), real))
+        cleared = w.emit("Add", held, w.constant(meeting(np.outer(eye[k], eye[k])), real))
+        row = w.emit("Div", w.emit("Slice", cleared, *ends, rows), pivot)
+        J = w.emit(
+            "Sub", cleared, w.emit("Mul", w.emit("Sub", column, w.constant(meeting(eye[k][:, None]), real)), row)
+        )
     return J
 
 
 def write_transposed(w: Writer, node: Any) -> str:
     """Two axes exchanged."""
     x, first, second = node.args
-    perm = list(range(len(described(x).shape)))
-    perm[first], perm[second] = perm[second], perm[first]
-    return w.emit("Transpose", w.name(x), perm=perm)
+    axes = list(range(len(described(x).shape)))
+    axes[first], axes[second] = axes[second], axes[first]
+    return permuted(w, node, axes)
+
+
+def write_permuted(w: Writer, node: Any) -> str:
+    """The axes in another order."""
+    return permuted(w, node, [i % len(node.args[1]) for i in node.args[1]])
+
+
+def permuted(w: Writer, node: Any, axes: list[int]) -> str:
+    """Axis i of the result is axis axes[i] of the first argument."""
+    x: Any = node.args[0]
+    own = order_of(described(x).shape)
+    return w.permuted(w.name(x), [own.index(axes[i]) for i in order_of(described(node).shape)])
+
+
+def write_reshaped(w: Writer, node: Any) -> str:
+    """The same numbers in another shape."""
+    x, shape = node.args
+    if x in w.folded:  # a product of more axes
+        return w.name(x)
+    before, after = (described(y).shape for y in (x, node))
+    name, tail, batch = w.name(x), list(after[1:]), (order_of(before)[-1:], order_of(after)[-1:])
+    if batch == ([1], [0]) and list(before[2:]) == tail:  # all steps as one batch
+        return w.emit("Reshape", w.permuted(name, [*range(1, len(after)), 0, len(after)]), w.integers(*tail, -1))
+    if batch == ([0], [1]) and list(before[1:]) == tail[1:]:  # and back
+        whole = w.emit("Reshape", name, w.sizes([*tail[1:], *shape[:2]]))
+        return w.permuted(whole, [len(before) - 1, *range(len(before) - 1), len(before)])
+    return w.stored(w.emit("Reshape", w.plain(name, before), w.sizes(shape)), after)
+
+
+def write_expanded(w: Writer, node: Any) -> str:
+    """Entries repeated along axes of one entry."""
+    x, shape = node.args
+    order = order_of(described(node).shape)
+    return w.emit("Expand", w.beside(x, node), w.sizes([1 if shape[i] == -1 else shape[i] for i in order]))
+
+
+def write_zeros(w: Writer, node: Any) -> str:
+    """Zeros of a shape that the graph computes."""
+    order, shape = order_of(described(node).shape), node.args[1]
+    return w.emit("Expand", w.name(0.0, described(node).dtype), w.sizes([shape[i] for i in order]))
+
+
+def write_repeated(w: Writer, node: Any) -> str:
+    """The whole, several times along its axes."""
+    x, times = node.args
+    require(len(times) == len(described(x).shape), node)
+    return w.emit("Tile", w.name(x), w.integers(*(times[i] for i in order_of(described(node).shape))))
+
+
+def write_unsqueezed(w: Writer, node: Any) -> str:
+    """Another axis of one entry."""
+    return w.emit("Unsqueeze", w.name(node.args[0]), w.integers(axis_of(node.args[1], node)))
+
+
+def write_selected(w: Writer, node: Any) -> str:
+    """Entries of one axis, by their numbers."""
+    x, axis, index = node.args
+    return w.emit("Gather", w.name(x), w.name(index), axis=axis_of(axis, x))
+
+
+def write_size(w: Writer, node: Any) -> str:
+    """The size of an axis."""
+    x, axis = node.args
+    place = axis_of(axis, x)
+    return w.emit("Shape", w.name(x), start=place, end=place + 1)
 
 
 def write_unflatten(w: Writer, node: Any) -> str:
     """The first axis as several."""
     x, axis, shape = node.args
-    axis = axis_of(axis, x)
-    require(axis == 0, node)
+    require(axis == 0 and isinstance(described(x).shape[0], int), node)
     tail = w.emit("Shape", w.name(x), start=1)
     return w.emit("Reshape", w.name(x), w.emit("Concat", w.sizes(shape), tail, axis=0))
 
 
-def write_product(w: Writer, a: str, b: str, rank: int) -> str:
-    """A B. Not MatMul where it can be helped: onnxruntime makes a number beside one an attribute of it, of 32 bits."""
-    return w.emit("Gemm" if rank == 2 else "MatMul", a, b)
-
-
 def write_matmul(w: Writer, node: Any) -> str:
-    """A B; a vector B as a column, for which onnxruntime is ten times faster."""
+    """A B. Of a batch A and one B, with the batch last, that is Bᵀ A, of as many axes as A had before it was flattened.
+
+    Gemm where it can be: for a number beside a MatMul see `Writer.beside`.
+    """
     a, b = node.args
-    ranks = len(described(a).shape), len(described(b).shape)
-    if ranks == (2, 1):
-        last = w.integers(1)
-        return w.emit("Squeeze", w.emit("Gemm", w.name(a), w.emit("Unsqueeze", w.name(b), last)), last)
-    return write_product(w, w.name(a), w.name(b), 2 if ranks == (2, 2) else 0)
+    whole = unfolded(node)
+    if whole is not None:
+        w.folded.add(node)
+        return w.emit("MatMul", transposed(w, b), w.name(whole))
+    free = [not isinstance(size, int) for size in described(a).shape]
+    fixed = all(isinstance(size, int) for size in described(b).shape)
+    if len(described(b).shape) == 1:
+        require(fixed and free == [True, False], node)
+        known = w.known(b)
+        row = w.emit("Unsqueeze", w.name(b), w.integers(0)) if known is None else w.held(known[None])
+        return w.emit("Squeeze", w.emit("Gemm", row, w.name(a)), w.integers(0))
+    if fixed and free == [True, False]:
+        return w.emit("Gemm", transposed(w, b), w.name(a))
+    if fixed and free == [False, True, False] and described(a).shape[0] > 1:
+        return w.emit("MatMul", transposed(w, b), w.name(a))
+    plain = (w.plain(w.name(x), described(x).shape) for x in (a, b))
+    return w.stored(w.emit("Gemm" if len(free) == 2 else "MatMul", *plain), described(node).shape)
+
+
+def transposed(w: Writer, x: Any) -> str:
+    """A matrix without a batch, its last two axes exchanged."""
+    known = w.known(x)
+    if known is not None:
+        return w.held(known.mT)
+    axes = list(range(len(described(x).shape)))
+    return w.permuted(w.name(x), [*axes[:-2], axes[-1], axes[-2]])
+
+
+def unfolded(node: Any) -> Any:
+    """A, where A B of (..., k) was flattened to two axes for a product and is (..., m) again after it; else None."""
+    flat, b = node.args
+    if node.target != aten.mm.default or flat.target != aten.reshape.default:
+        return None
+    whole, wide = flat.args[0], described(b).shape
+    shape = described(whole).shape
+    if (
+        len(shape) < 3
+        or math.prod(x for x in shape[:-1] if isinstance(x, int)) == 1
+        or shape[-1] != wide[0]
+        or isinstance(shape[-2], int)
+        or not isinstance(wide[0], int)
+    ):
+        return None
+    after = [*shape[:-1], wide[1]]
+    same = (x.target == aten.reshape.default and list(described(x).shape) == after for x in node.users)
+    return whole if all(same) else None
 
 
 def write_addcmul(w: Writer, node: Any) -> str:
     """A + value · b · c; the number goes into a constant factor where there is one."""
     value = node.kwargs.get("value", 1)
     known = w.known(node.args[2])
-    a, b, c = write_beside(w, node, None)
+    a, b, c = (w.beside(x, node) for x in node.args)
     if value not in (1, -1):
         if known is None:
-            c = w.emit("Mul", c, w.name(value, described(node).dtype))
+            c = w.emit("Mul", c, w.beside(value, node, described(node).dtype))
         else:
-            c = w.constant((known.detach() * value).numpy(), NUMPY[known.dtype])
+            c = w.beside(node.args[2], node, scale=value)
     return w.emit("Sub" if value == -1 else "Add", a, w.emit("Mul", b, c))
 
 
@@ -165,14 +239,14 @@ def write_stack(w: Writer, node: Any) -> str:
     """Tensors along a new axis."""
     parts: Any = node.args[0]
     axis: Any = node.args[1] if len(node.args) > 1 else 0
-    axis = axis % (len(described(parts[0]).shape) + 1)
+    axis = axis_of(axis, node)
     return w.emit("Concat", *(w.emit("Unsqueeze", w.name(x), w.integers(axis)) for x in parts), axis=axis)
 
 
 def write_cat(w: Writer, node: Any) -> str:
     """Tensors along an axis they have."""
     parts: Any = node.args[0]
-    return w.emit("Concat", *map(w.name, parts), axis=node.args[1] if len(node.args) > 1 else 0)
+    return w.emit("Concat", *map(w.name, parts), axis=axis_of(node.args[1] if len(node.args) > 1 else 0, node))
 
 
 def write_reduced(kind: str) -> Callable[[Writer, Any], str]:
@@ -182,7 +256,7 @@ def write_reduced(kind: str) -> Callable[[Writer, Any], str]:
         x: Any = node.args[0]
         axes: Any = node.args[1]
         keep = int(bool(node.args[2])) if len(node.args) > 2 else 0
-        axes = [axes] if isinstance(axes, int) else axes
+        axes = [axis_of(axis, x) for axis in ([axes] if isinstance(axes, int) else axes)]
         if is_within_sum(x):
             return w.emit("ReduceL1", w.name(x.args[0]), w.integers(*axes), keepdims=keep)
         return w.emit(kind, w.name(x), w.integers(*axes), keepdims=keep)
@@ -194,7 +268,7 @@ def write_truth(kind: str) -> Callable[[Writer, Any], str]:
     """Whether all (ReduceMin) or any (ReduceMax) entries are true."""
 
     def write(w: Writer, node: Any) -> str:
-        axes = [w.integers(node.args[1])] if len(node.args) > 1 else []
+        axes = [w.integers(axis_of(node.args[1], node.args[0]))] if len(node.args) > 1 else []
         return w.emit(kind, w.name(node.args[0]), *axes, keepdims=0)
 
     return write
@@ -203,86 +277,33 @@ def write_truth(kind: str) -> Callable[[Writer, Any], str]:
 def write_addmm(w: Writer, node: Any) -> str:
     """C + A B."""
     c, a, b = node.args
-    require(not node.kwargs, node)
-    return w.emit("Gemm", w.name(a), w.name(b), w.name(c))
+    free = [not isinstance(size, int) for x in (a, b) for size in described(x).shape]
+    require(not node.kwargs and free == [True, False, False, False], node)
+    return w.emit("Gemm", transposed(w, b), w.name(a), w.beside(c, node))
 
 
 def write_index(w: Writer, node: Any) -> str:
     """Entries of one axis."""
     x, places = node.args
-    ((axis, place),) = [(i, y) for i, y in enumerate(places) if y is not None]
-    return w.emit("Gather", w.name(x), w.name(place), axis=axis)
-
-
-def write_expm1(w: Writer, node: Any) -> str:
-    """e^x − 1 = 2t/(1 − t), t = tanh(x/2), where x is small: ONNX has no expm1."""
-    x, dtype = w.name(node.args[0]), described(node).dtype
-    one, two = w.name(1.0, dtype), w.name(2.0, dtype)
-    t = w.emit("Tanh", w.emit("Div", x, two))
-    small = w.emit("Div", w.emit("Mul", two, t), w.emit("Sub", one, t))
-    near = w.emit("Less", w.emit("Abs", x), w.name(0.5, dtype))
-    return w.emit("Where", near, small, w.emit("Sub", w.emit("Exp", x), one))
-
-
-def write_log1p(w: Writer, x: str, dtype: torch.dtype) -> str:
-    """log(1 + x) = x log(u)/(u − 1) with u = 1 + x rounded (Kahan), x where u = 1."""
-    one = w.name(1.0, dtype)
-    u = w.emit("Add", one, x)
-    same = w.emit("Equal", u, one)
-    below = w.emit("Where", same, one, w.emit("Sub", u, one))
-    return w.emit("Where", same, x, w.emit("Div", w.emit("Mul", x, w.emit("Log", u)), below))
-
-
-def write_atanh(w: Writer, node: Any) -> str:
-    """Artanh x = log(1 + 2x/(1 − x))/2: onnxruntime has it in float32 only."""
-    x, dtype = w.name(node.args[0]), described(node).dtype
-    ratio = w.emit("Div", w.emit("Mul", w.name(2.0, dtype), x), w.emit("Sub", w.name(1.0, dtype), x))
-    return w.emit("Mul", w.name(0.5, dtype), write_log1p(w, ratio, dtype))
-
-
-def write_log_sigmoid(w: Writer, node: Any) -> str:
-    """Log σ(x) = min(x, 0) − log(1 + e^{−|x|})."""
-    x, dtype = w.name(node), described(node).dtype
-    decay = w.emit("Exp", w.emit("Neg", w.emit("Abs", x)))
-    return w.emit("Sub", w.emit("Min", x, w.name(0.0, dtype)), write_log1p(w, decay, dtype))
-
-
-def write_log_sigmoid_backward(w: Writer, node: Any) -> str:
-    """G σ(−x)."""
-    g, x, _ = node.args
-    return w.emit("Mul", w.name(g), w.emit("Sigmoid", w.emit("Neg", w.name(x))))
-
-
-def write_sigmoid_backward(w: Writer, node: Any) -> str:
-    """G σ (1 − σ)."""
-    g, value = (w.name(x) for x in node.args)
-    slope = w.emit("Mul", value, w.emit("Sub", w.name(1.0, described(node).dtype), value))
-    return w.emit("Mul", g, slope)
-
-
-def write_nan_to_num(w: Writer, node: Any) -> str:
-    """x, and a number where it is not finite."""
-    x, nan, large = node.args
-    require(nan == large, node)
-    return w.emit("Where", w.finite(x), w.name(x), w.name(nan, described(node).dtype))
-
-
-def write_tanh_backward(w: Writer, node: Any) -> str:
-    """G (1 − t²)."""
-    g, t = (w.name(x) for x in node.args)
-    return w.emit("Mul", g, w.emit("Sub", w.name(1.0, described(node).dtype), w.emit("Mul", t, t)))
+    chosen = [(i, y) for i, y in enumerate(places) if y is not None]
+    require(len(chosen) == 1, node)
+    ((axis, place),) = chosen
+    return w.emit("Gather", w.name(x), w.name(place), axis=axis_of(axis, x))
 
 
 def write_diagonal(w: Writer, node: Any) -> str:
     """The matrix with that diagonal."""
     x: Any = node.args[0]
-    eye = w.constant(np.eye(described(x).shape[-1]), NUMPY[described(x).dtype])
-    return w.emit("Mul", w.emit("Unsqueeze", w.name(x), w.integers(-1)), eye)
+    require(len(node.args) == 1, node)
+    eye = torch.eye(described(x).shape[-1], dtype=described(x).dtype)
+    whole = w.emit("Unsqueeze", w.name(x), w.integers(axis_of(-1, node)))
+    return w.emit("Mul", whole, w.held(eye[..., None] if axis_of(-1, node) + 1 < len(described(node).shape) else eye))
 
 
 def write_diagonal_of(w: Writer, node: Any) -> str:
     """The diagonal of the matrices (B, n, n)."""
     x: Any = node.args[0]
     n = described(x).shape[-1]
-    rows = w.emit("Reshape", w.name(x), w.integers(-1, n * n))
-    return w.emit("Gather", rows, w.integers(*range(0, n * n, n + 1)), axis=1)
+    require(order_of(described(x).shape) == [1, 2, 0] and node.args[1:] in ((0, -2, -1), (0, 1, 2)), node)
+    rows = w.emit("Reshape", w.name(x), w.integers(n * n, -1))
+    return w.emit("Gather", rows, w.integers(*range(0, n * n, n + 1)), axis=0)

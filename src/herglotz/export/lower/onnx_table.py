@@ -10,16 +10,16 @@ import torch
 from torch import fx
 
 from herglotz.errors import InputError
-from herglotz.export.lower import onnx_ops as ops
-from herglotz.export.lower.onnx_writer import Writer, described, kind_of
+from herglotz.export.lower import onnx_functions as functions, onnx_ops as ops
+from herglotz.export.lower.onnx_writer import Writer, described, kind_of, needed, order_of
 
 aten = torch.ops.aten
 SIMPLE = {
     aten.abs.default: "Abs", aten.neg.default: "Neg", aten.sin.default: "Sin", aten.cos.default: "Cos",
     aten.exp.default: "Exp", aten.tanh.default: "Tanh", aten.sqrt.default: "Sqrt", aten.sigmoid.default: "Sigmoid",
-    aten.sign.default: "Sign",
+    aten.sign.default: "Sign", aten.relu.default: "Relu",
     aten.reciprocal.default: "Reciprocal", aten.round.default: "Round", aten.bitwise_not.default: "Not",
-    aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul", aten.bmm.default: "MatMul",
+    aten.isnan.default: "IsNaN", aten.add.Scalar: "Add", aten.mul.Scalar: "Mul",
     aten.add.Tensor: "Add", aten.sub.Tensor: "Sub", aten.mul.Tensor: "Mul", aten.div.Tensor: "Div",
     aten.maximum.default: "Max", aten.minimum.default: "Min",
     aten.bitwise_and.Tensor: "And", aten.bitwise_or.Tensor: "Or",
@@ -62,11 +62,9 @@ def _translate(w: Writer, node: Any) -> Any:
         if target == aten.add.Tensor and _is_zero(node.args[1]):
             return w.values[node.args[0]]
         dtype = ops.common_dtype(node)
-        if target == aten.mul.Tensor and (scaled := ops.write_scaled(w, node)):
-            return scaled
-        names = ops.write_beside(w, node, dtype)
+        names = [w.beside(x, node, dtype) for x in node.args]
         if (scale := node.kwargs.get("alpha", 1)) != 1:
-            names[1] = w.emit("Mul", names[1], w.name(scale, dtype))
+            names[1] = w.emit("Mul", names[1], w.beside(scale, node, dtype))
         return w.emit(SIMPLE[target], *names)
     if target not in TABLE:
         raise InputError(f"ONNX export does not know the operation {target}; export to --format pt2 or c")
@@ -82,11 +80,11 @@ def _while(w: Writer, node: Any) -> list[str]:
     start, fixed = [w.name(x) for x in carry], [w.values[x] for x in fixed]
     (on,) = write(w, condition, [*start, *fixed])
     inner, value, empty = w.inner(), helper.make_tensor_value_info, helper.make_empty_tensor_value_info
-    inside = [w.fresh() for _ in start]
-    turned = inner.own(write(inner, body, [*inside, *fixed]), inside)
-    (more,) = write(inner, condition, [*turned, *fixed])
+    inside = [inner.fresh() for _ in start]
+    turned = inner.results(write(inner, body, [*inside, *fixed]), inside)
+    (more,) = inner.results(write(inner, condition, [*turned, *fixed]), turned)
     graph = helper.make_graph(
-        inner.nodes, "turn",
+        needed(inner.nodes, (more, *turned)), "turn",
         [value(w.fresh(), TensorProto.INT64, []), value(w.fresh(), TensorProto.BOOL, []), *map(empty, inside)],
         [value(more, TensorProto.BOOL, []), *map(empty, turned)],
     )  # fmt: skip
@@ -101,20 +99,20 @@ def _scan(w: Writer, node: Any) -> list[str]:
     body = w.values[body]
     start, table, fixed = [w.name(x) for x in carry], [w.name(x) for x in rows], [w.values[x] for x in fixed]
     inner, value = w.inner(), helper.make_tensor_value_info
-    inside = [w.fresh() for _ in (*start, *table)]
-    out = inner.own(write(inner, body, [*inside, *fixed]), inside)
+    inside = [inner.fresh() for _ in (*start, *table)]
+    out = inner.results(write(inner, body, [*inside, *fixed]), inside)
     given, (results,) = (body.graph.find_nodes(op=x) for x in ("placeholder", "output"))
     inputs, outputs = (
         [value(x, kind_of(described(y).dtype), _free(described(y).shape)) for x, y in zip(names, nodes, strict=False)]
         for names, nodes in ((inside, given), (out, results.args[0]))
     )
-    graph = helper.make_graph(inner.nodes, "step", inputs, outputs)
+    graph = helper.make_graph(needed(inner.nodes, out), "step", inputs, outputs)
     return w.several("Scan", [*start, *table], len(out), body=graph, num_scan_inputs=len(table))
 
 
 def _free(shape: Sequence[Any]) -> list[int | None]:
-    """The sizes that are fixed."""
-    return [x if isinstance(x, int) else None for x in shape]
+    """The sizes that are fixed, in the file's order."""
+    return [x if isinstance(x, int) else None for x in (shape[i] for i in order_of(shape))]
 
 
 def _is_zero(x: Any) -> bool:
@@ -129,25 +127,24 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.slice.Tensor: ops.write_slice,
     aten.select.int: ops.write_select,
     operator.getitem: ops.write_item,
-    aten.unsqueeze.default: lambda w, n: w.emit("Unsqueeze", w.name(n.args[0]), w.integers(n.args[1])),
-    aten.index_select.default: lambda w, n: w.emit("Gather", w.name(n.args[0]), w.name(n.args[2]), axis=n.args[1]),
+    aten.unsqueeze.default: ops.write_unsqueezed,
+    aten.index_select.default: ops.write_selected,
     aten.index.Tensor: ops.write_index,
     aten.cat.default: ops.write_cat,
     aten.stack.default: ops.write_stack,
     aten.mm.default: ops.write_matmul,
     aten.mv.default: ops.write_matmul,
-    aten.tanh_backward.default: ops.write_tanh_backward,
-    aten.permute.default: lambda w, n: w.emit("Transpose", w.name(n.args[0]), perm=n.args[1]),
+    aten.bmm.default: ops.write_matmul,
+    aten.tanh_backward.default: functions.write_tanh_backward,
+    aten.permute.default: ops.write_permuted,
     aten._to_copy.default: lambda w, n: w.emit("Cast", w.name(n.args[0]), to_=kind_of(described(n).dtype)),
     aten.empty_like.default: lambda w, n: w.like(n, 0),
     aten.unflatten.int: ops.write_unflatten,
     aten.transpose.int: ops.write_transposed,
-    aten.reshape.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
-    aten.view.default: lambda w, n: w.emit("Reshape", w.name(n.args[0]), w.sizes(n.args[1])),
-    aten.expand.default: lambda w, n: w.emit(
-        "Expand", w.name(n.args[0]), w.sizes([1 if x == -1 else x for x in n.args[1]])
-    ),
-    aten.sym_size.int: lambda w, n: w.emit("Shape", w.name(n.args[0]), start=n.args[1], end=n.args[1] + 1),
+    aten.reshape.default: ops.write_reshaped,
+    aten.view.default: ops.write_reshaped,
+    aten.expand.default: ops.write_expanded,
+    aten.sym_size.int: ops.write_size,
     operator.mul: lambda w, n: w.emit("Mul", *(w.integers(x) if isinstance(x, int) else w.name(x) for x in n.args)),
     aten.rsub.Scalar: lambda w, n: w.emit("Sub", w.name(n.args[1], described(n).dtype), w.name(n.args[0])),
     aten.ne.Scalar: lambda w, n: w.emit(
@@ -162,17 +159,18 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.addcmul.default: ops.write_addcmul,
     aten.to.dtype: lambda w, n: w.emit("Cast", w.name(n.args[0]), to_=kind_of(n.args[1])),
     aten.addmm.default: ops.write_addmm,
-    aten.repeat.default: lambda w, n: w.emit("Tile", w.name(n.args[0]), w.integers(*n.args[1])),
+    aten.repeat.default: ops.write_repeated,
     aten.zeros_like.default: lambda w, n: w.like(n, 0),
     aten.ones_like.default: lambda w, n: w.like(n, 1),
     aten.full_like.default: lambda w, n: w.like(n, n.args[1]),
-    aten.new_zeros.default: lambda w, n: w.emit("Expand", w.name(0.0, described(n).dtype), w.sizes(n.args[1])),
+    aten.new_zeros.default: ops.write_zeros,
     aten.isfinite.default: lambda w, n: w.finite(n.args[0]),
-    aten.nan_to_num.default: ops.write_nan_to_num,
-    aten.expm1.default: ops.write_expm1,
-    aten.atanh.default: ops.write_atanh,
-    aten.log_sigmoid_backward.default: ops.write_log_sigmoid_backward,
-    aten.sigmoid_backward.default: ops.write_sigmoid_backward,
+    aten.nan_to_num.default: functions.write_nan_to_num,
+    aten.expm1.default: functions.write_expm1,
+    aten.atanh.default: functions.write_atanh,
+    aten.log_sigmoid_backward.default: functions.write_log_sigmoid_backward,
+    aten.sigmoid_backward.default: functions.write_sigmoid_backward,
+    aten.threshold_backward.default: functions.write_threshold_backward,
     aten.diag_embed.default: ops.write_diagonal,
     aten.diagonal.default: ops.write_diagonal_of,
 }
