@@ -69,11 +69,7 @@ class RolloutModule(nn.Module):
 
         Entry k is what step k = 1 … K gives, and NaN from a failed step on.
         """
-        graphs, layout, sizes = self.graphs, self.graphs.layout, h.shape
-        flat = [x.reshape(-1, *x.shape[2:]) for x in (h, *u)]
-        rows = [[y.reshape(*sizes, *y.shape[1:]) for y in graph(*flat)] for graph in self.rows] or [[]] * len(
-            self.steps
-        )
+        graphs, layout, rows = self.graphs, self.graphs.layout, self._rows(h, *u)
         carry = [dense(x) for x in graphs.start(q, p, s)]
         given = [[h, *u], *rows], [[s.shape[0]], *(graph.constants for graph in (*self.steps, graphs.report))]
         xs, fixed = (list(chain(*x)) for x in given)
@@ -97,12 +93,26 @@ class RolloutModule(nn.Module):
                 rows = graphs.report.call(h, *carry[:STATE], *rows, *constants[-1])
             return [dense(y) for y in (*new[: layout.size], *rows)]
 
-        new = scan_op(step, carry, xs, fixed)[layout.size :]
+        new = tuple(scan_op(step, carry, xs, fixed)[layout.size :])
+        return self._reported(q, p, s, h, new) if self.hoists else new
+
+    def _rows(self, h: Tensor, *u: Tensor) -> list[list[Tensor]]:
+        """What h and u alone decide in each part of a step, (K, B, ...)."""
         if not self.hoists:
-            return tuple(new)
+            return [[]] * len(self.steps)
+        flat = _flat(h, *u)
+        return [[y.reshape(*h.shape, *y.shape[1:]) for y in graph(*flat)] for graph in self.rows]
+
+    def _reported(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, new: Values) -> Values:
+        """What all steps report, from the first state and what the loop gave."""
         before = (torch.cat([x[None], y[:-1]]) for x, y in zip((q, p, s), new, strict=False))
-        said = graphs.report(flat[0], *(x.reshape(-1, *x.shape[2:]) for x in (*before, *new)))
-        return tuple(x.reshape(*sizes, *x.shape[1:]) for x in said)
+        said = self.graphs.report(*_flat(h, *before, *new))
+        return tuple(x.reshape(*h.shape, *x.shape[1:]) for x in said)
+
+
+def _flat(*stacked: Tensor) -> Values:
+    """Steps and samples (K, B, ...) as samples of one batch."""
+    return tuple(x.reshape(-1, *x.shape[2:]) for x in stacked)
 
 
 class StepModule(nn.Module):

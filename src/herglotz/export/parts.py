@@ -16,25 +16,36 @@ def parted(graph: Graph, early: Sequence[bool]) -> tuple[Graph, Graph]:
 
     The first part has only values of one number a sample, which are cheap to keep for every step.
     """
-    nodes = list(graph.code.graph.nodes)
-    places = [x for x in nodes if x.op == "placeholder"]
+    own = graph.code.graph
+    calls, places = [x for x in own.nodes if x.op == "call_function"], own.find_nodes(op="placeholder")
     inputs = places[: len(early)]
     constants = dict(zip(places[len(early) :], graph.constants, strict=True))
     given = [x for x, is_early in zip(inputs, early, strict=True) if is_early]
-    first, both = set(given), set(constants)  # sizes and constants are in both parts
-    calls = [x for x in nodes if x.op == "call_function"]
-    for node in calls:
-        if isinstance(node.meta["example"], int):
-            both.add(node)
-        elif all(x in first or x in both for x in node.all_input_nodes) and _may_move(node, graph.batch):
-            first.add(node)
-    again = {x for x in first if x.target == aten.unsqueeze.default and not first.issuperset(x.users)}  # costs nothing
-    cut = [x for x in calls if x in first - again and not (first - again).issuperset(x.users)]
-    (output,) = (x for x in nodes if x.op == "output")
-    results: Any = output.args[0]
+    first, both = _decided(calls, given, list(constants), graph.batch)
+    again = {x for x in _read_outside(first) if x.target == aten.unsqueeze.default}  # costs nothing
+    cut = [x for x in _read_outside(first - again) if x.op == "call_function"]
+    results: Any = own.output_node().args[0]
     before = _graph(graph.batch, given, [x for x in calls if x in first or x in both], cut, constants)
     after = _graph(graph.batch, [*inputs, *cut], [x for x in calls if x not in first or x in again], results, constants)
     return before, after
+
+
+def _read_outside(own: set[fx.Node]) -> list[fx.Node]:
+    """Those that other nodes read, in the order of the graph."""
+    return sorted(x for x in own if not own.issuperset(x.users))
+
+
+def _decided(
+    calls: Sequence[fx.Node], given: Sequence[fx.Node], constants: Sequence[fx.Node], batch: int
+) -> tuple[set[fx.Node], set[fx.Node]]:
+    """What the given inputs alone decide, them included, and what both parts have: constants and sizes."""
+    first, both = set(given), set(constants)
+    for node in calls:
+        if isinstance(node.meta["example"], int):
+            both.add(node)
+        elif (first | both).issuperset(node.all_input_nodes) and _may_move(node, batch):
+            first.add(node)
+    return first, both
 
 
 def _may_move(node: fx.Node, batch: int) -> bool:

@@ -56,8 +56,9 @@ def write_item(w: Writer, node: Any) -> str:
         x, axis = source.args[0], (source.args[1] if len(source.args) > 1 else 0)
         return w.emit("Gather", w.name(x), w.constant(index, np.int64), axis=axis_of(axis, x))
     if source.target == aten.split_with_sizes.default:
-        x, sizes, axis = (*source.args, 0)[:3]
-        w.values[source] = w.several("Split", (w.name(x), w.integers(*sizes)), len(sizes), axis=axis_of(axis, x))
+        x, sizes = source.args[:2]
+        axis = axis_of(source.args[2] if len(source.args) > 2 else 0, x)
+        w.values[source] = w.several("Split", (w.name(x), w.integers(*sizes)), len(sizes), axis=axis)
         return w.values[source][index]
     if source.target == aten.linalg_inv_ex.default:
         require(index == 0, source)

@@ -140,13 +140,7 @@ class Writer:
         shape, known = described(node).shape, self.known(x)
         behind = len(shape) - 1 - order_of(shape)[-1] if shape else 0  # axes of the result behind the batch
         if known is not None:
-            known = known if scale == 1 else known * scale
-            place = known.ndim - 1 - behind  # of the axis that meets the batch
-            if known.numel() == 1 and len(shape) > 2:
-                return self.rows(known.item(), shape, known.dtype)
-            if behind and known.ndim:
-                known = known[..., None] if place < 0 else known.movedim(place, -1)
-            return self.held(known)
+            return self._known_beside(known if scale == 1 else known * scale, shape, behind)
         if not isinstance(x, fx.Node):
             dtype = dtype or self.real
             return self.rows(x, shape, dtype) if len(shape) > 2 else self.name(x, dtype)
@@ -155,6 +149,15 @@ class Writer:
         while x.target == aten.unsqueeze.default and axis_of(x.args[1], x) == 0 and described(x).shape != shape:
             x = x.args[0]  # another operand has the axis in front
         return self.name(x)
+
+    def _known_beside(self, known: Tensor, shape: Sequence[Any], behind: int) -> str:
+        """A known operand beside a result of this shape, which has so many axes behind the batch."""
+        if known.numel() == 1 and len(shape) > 2:
+            return self.rows(known.item(), shape, known.dtype)
+        if behind and known.ndim:
+            place = known.ndim - 1 - behind  # of the axis that meets the batch
+            known = known[..., None] if place < 0 else known.movedim(place, -1)
+        return self.held(known)
 
     def rows(self, number: float, shape: Sequence[Any], dtype: torch.dtype) -> str:
         """A number in the axes of a shape that are fixed."""
