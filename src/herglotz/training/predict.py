@@ -24,6 +24,7 @@ from herglotz.training.free_run import near_data
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
+from herglotz.training.sensor_zeros import zeros_of_one
 from herglotz.training.smoother import smoothed_states
 
 WARMUP = 20  # samples from which the state is estimated
@@ -140,7 +141,8 @@ def predict(
         `horizon`, instead of one free run to the end of each trajectory.
     same_zeros
         The sensors read what those of the run's reference read. False: where the recordings of the fit differ in it,
-        the zeros of the one whose zeros suit the warm-up best are taken off, the same for all of these trajectories.
+        the zeros that suit the warm-up best are taken off, the same for all of these trajectories: those of one of
+        them, or what the warm-ups tell of the sensors by the model.
 
     Returns
     -------
@@ -171,6 +173,10 @@ def predict(
     zeros = [()] if same_zeros else zeros_of(run)
     ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
     best = min(range(len(ways)), key=lambda i: ways[i][1])
+    if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):
+        zeros.append(tuple(a + b for a, b in zip(zeros[best] or (0.0,) * data.dof, own, strict=True)))
+        ways.append(_warmed_up(run, measured(data, zeros[-1]), warmup))
+        best = min(best, len(ways) - 1, key=lambda i: ways[i][1])
     states, data = ways[best][0], measured(data, zeros[best])
     grid = _free_run(run.stepper, data, states, warmup, high)
     inside = torch.arange(grid.longest) < grid.end[:, None]
@@ -255,7 +261,7 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
 def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
     """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
-    sigma, cost = run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6, 0.0
+    sigma, cost = _sigma(run), 0.0
     every = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
     together = _smoothed(run.model, data.rows(every.flatten(), (warmup,) * len(data)), sigma, run.h_range[1])
     if together is not None:
@@ -268,6 +274,16 @@ def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor,
         else:
             states[rows], cost = alone[0], cost + alone[1]
     return states, cost
+
+
+def _sigma(run: FittedRun) -> float:
+    return run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
+
+
+def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, ...]:
+    """What the warm-ups tell of zeros of the sensors that no recording of the fit had, (n,)."""
+    rows = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
+    return zeros_of_one(run.model, data.rows(rows.flatten(), (warmup,) * len(data)), _sigma(run), run.h_range[1])
 
 
 def _smoothed(

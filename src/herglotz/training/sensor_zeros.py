@@ -143,6 +143,27 @@ def clearly(found: FoundZeros) -> FoundZeros:
     return found._replace(z=torch.where(found.z.abs() > CLEARLY * found.deviations, found.z, 0.0))
 
 
+def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...]:
+    """The zeros (n,) of the sensors of one recording, of which these are parts, by a model that is held.
+
+    By multiple shooting, with the states where the parts start; 0 for zeros that are not clearly there, and where the
+    model cannot follow the parts.
+    """
+    problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
+    theta, n = problem.parameters.get(), data.dof
+    problem.guess_from_states(states_of_pairs(model, data))
+    x = torch.cat([problem.pack(theta, first_states(problem, theta, data)), theta.new_zeros(n)])
+    target = WithZeros(problem, torch.arange(problem.P), shared=True)
+    result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
+    if not math.isfinite(result.cost):
+        return (0.0,) * n
+    _, A, _ = target.normal_equations(result.x)
+    assert problem.path is not None
+    variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-n:] * (_rms(problem.misfit(problem.path)) / sigma) ** 2
+    found = clearly(FoundZeros(result.x[None, -n:], variance.clamp_min(0).sqrt()[None], 0.0))
+    return tuple(found.z[0].tolist())
+
+
 class ZerosOf:
     """The zeros of the recordings that a look at them kept, by the named terms that it found."""
 

@@ -208,6 +208,16 @@ def test_a_prediction_takes_off_the_zeros_that_suit_its_warm_up():
     assert rms(PLANTED, sensor_zeros=(0.0,)) > (5 * NOISE, ())
 
 
+@pytest.mark.parametrize(("planted", "found"), [(-0.06, True), (0.002, False)])
+def test_a_prediction_finds_zeros_that_no_recording_of_the_fit_had(planted, found):
+    # fails if the nearest of the fit's zeros is all there is, which leaves 0.06 rad; if a zero is taken from the noise
+    # of the warm-up; or if it is given with the wrong sign
+    other = replace(pendulums(0.0, seed=7, recordings=1), source="other")
+    prediction = run().predict(replace(other, q=other.q + planted), warmup=60)
+    assert prediction.rms < 2 * NOISE
+    assert prediction.zeros == (pytest.approx((planted,), abs=2 * NOISE) if found else ())
+
+
 def test_zeros_are_not_looked_for_where_the_user_says_so():
     first = {"windows": 1.0, "rms": 1.0}
     # fails if the search for zeros begins against the user's word

@@ -22,19 +22,24 @@ class WithZeros:
     """A shooting problem with zeros of sensors as further unknowns: (unknowns of the problem, then (B − 1) · n).
 
     Each recording but the reference has zeros of its own, (B · n) with the reference's where parameters are `held`.
+    Where zeros are `shared` there are n, those of all recordings.
     """
 
     def __init__(
         self,
         problem: ShootingProblem,
         held: Tensor | None = None,  # places of the parameters of odd terms, which stay as they are
+        *,
+        shared: bool = False,
     ):
         data, reference = problem.data, reference_of(problem.data)
         own = torch.arange(len(data), device=data.t.device)
-        if held is None:
+        if shared:
+            own = torch.zeros_like(own)
+        elif held is None:
             own = torch.where(own < reference, own, own - 1).where(own != reference, -1)
         self.problem, self.which, self.held = problem, own[data.trajectory], held
-        self.count = (len(data) - (held is None)) * problem.n
+        self.count = (int(own.max()) + 1) * problem.n
 
     def cost(self, x: Tensor) -> Tensor:
         """½|r|² with q + z − y as the residuals of the data."""
