@@ -86,7 +86,7 @@ MUTANTS = [
     # models
     ("models/model.py", "(c - 1.0) * (s0 - h / 2 * t.V0)", "(c - 1.0) * s0"),
     ("models/model.py", "(t.g / 2).exp() * t.K", "t.K"),
-    ("models/jet.py", "second = a * other._second + b * self._second", "second = a * other._second - b * self._second"),
+    ("models/jet.py", "second = a * other.second + b * self.second", "second = a * other.second - b * self.second"),
     ("models/action.py", "for j in reversed(order) if backward else order", "for j in order"),
     ("models/friction.py", "before, after = (c * h / 2)[..., None]", "before, after = (h / 2)[..., None]"),
     ("models/mass.py", "self.network(x) - at_zero", "self.network(x)"),

@@ -58,6 +58,7 @@ NUDGE = 1e-3  # of the spread: differences for the derivatives by the zeros
 FLAT = 1e-3  # of the largest singular value: directions of the zeros that no force depends on
 ROUNDS = 10  # of Gauss–Newton
 CLEARLY = 5.0  # standard deviations by which a zero differs from 0
+THINNED = (1, 2, 4, 8)  # parts of a recording that tell its zeros: all, or every m-th where some cannot be followed
 SETTLED = 0.1  # of the misfit: zeros that move by less have no say in the terms
 
 
@@ -146,9 +147,17 @@ def clearly(found: FoundZeros) -> FoundZeros:
 def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...]:
     """The zeros (n,) of the sensors of one recording, of which these are parts, by a model that is held.
 
-    By multiple shooting, with the states where the parts start; 0 for zeros that are not clearly there, and where the
-    model cannot follow the parts.
+    By multiple shooting, with the states where the parts start; 0 for zeros that are not clearly there. Where the model
+    cannot follow some part, every second one is taken, or fewer; zeros are 0 where it follows none of these either.
     """
+    found = (
+        _of_parts(model, data.select(range(0, len(data), by)), sigma, max_step) for by in THINNED if by <= len(data)
+    )
+    return next((zeros for zeros in found if zeros is not None), (0.0,) * data.dof)
+
+
+def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
+    """By all of these parts; None where the model cannot follow one."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
     theta, n = problem.parameters.get(), data.dof
     problem.guess_from_states(states_of_pairs(model, data))
@@ -156,7 +165,7 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
-        return (0.0,) * n
+        return None
     _, A, _ = target.normal_equations(result.x)
     assert problem.path is not None
     variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-n:] * (_rms(problem.misfit(problem.path)) / sigma) ** 2
