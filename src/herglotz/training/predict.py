@@ -171,7 +171,7 @@ def predict(
                 f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
                 f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
             )
-    zeros = [()] if same_zeros else zeros_of(run)
+    zeros: list[tuple[float, ...]] = [()] if same_zeros else zeros_of(run)
     ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
     best = min(range(len(ways)), key=lambda i: ways[i][1])
     if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):

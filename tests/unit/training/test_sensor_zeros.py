@@ -214,6 +214,7 @@ def test_a_prediction_finds_zeros_that_no_recording_of_the_fit_had(planted, foun
     # of the warm-up; or if it is given with the wrong sign
     other = replace(pendulums(0.0, seed=7, recordings=1), source="other")
     prediction = run().predict(replace(other, q=other.q + planted), warmup=60)
+    assert prediction.rms is not None
     assert prediction.rms < 2 * NOISE
     assert prediction.zeros == (pytest.approx((planted,), abs=2 * NOISE) if found else ())
 
