@@ -5,7 +5,7 @@ Writes results/measured.json and .md, and coverage.png. Settings are the default
 (`--data FOLDER` says where they are). Rows that were run before are kept, each with its commit, so that parts can be
 run alone. Seconds of one core for each seed: noise 1, one_trajectory 1, outliers 2, disturbed 25, real_pendulum 4,
 real_pendulum_network 4, air_track 2, driven_pendulum 65, coverage_simulated 27, coverage_real about 90, motor_axis 55
-(two fits), duffing_circuit 28, two_joints 120, two_motors 330. `cpu_seconds` in the table says what it took.
+(two fits), duffing_circuit 28, two_joints 120, two_motors 800. `cpu_seconds` in the table says what it took.
 """
 
 from __future__ import annotations
