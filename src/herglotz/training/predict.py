@@ -171,21 +171,14 @@ def predict(
                 f"{data.source or 'data'}: trajectory {b} has {length} samples{thinned}; a warm-up of {warmup} needs "
                 f"at least {warmup + 2}: use --warmup {max(3, length // 2)} or a longer recording"
             )
-    zeros: list[tuple[float, ...]] = [()] if same_zeros else zeros_of(run)
-    ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
-    best = min(range(len(ways)), key=lambda i: ways[i][1])
-    if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):
-        zeros.append(tuple(a + b for a, b in zip(zeros[best] or (0.0,) * data.dof, own, strict=True)))
-        ways.append(_warmed_up(run, measured(data, zeros[-1]), warmup))
-        if ways[-1][1] <= MARGIN**2 * ways[best][1]:  # the noise of steps hides much of what zeros do within a warm-up
-            best = len(ways) - 1
-    states, data = ways[best][0], measured(data, zeros[best])
+    states, zeros = _started(run, data, warmup, [()] if same_zeros else zeros_of(run))
+    data = measured(data, zeros)
     grid = _free_run(run.stepper, data, states, warmup, high)
     inside = torch.arange(grid.longest) < grid.end[:, None]
     h = grid.h[inside]
     outside = float(((h < low) | (h > high)).double().mean())
     most = int(torch.unique(grid.row[inside], return_counts=True)[1].max())
-    found = Prediction(data, state_of(states), warmup, every, most, outside, zeros[best])
+    found = Prediction(data, state_of(states), warmup, every, most, outside, zeros)
     return replace(found, beyond=_beyond(run.box, found))
 
 
@@ -258,6 +251,20 @@ def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float 
     spans = [found[k] for k in chosen]
     rows = torch.cat([torch.arange(a, b) for a, b in spans])
     return data.rows(rows, tuple(b - a for a, b in spans))
+
+
+def _started(
+    run: FittedRun, data: Trajectories, warmup: int, zeros: list[tuple[float, ...]]
+) -> tuple[Tensor, tuple[float, ...]]:
+    """States over the warm-ups, and the zeros that suit them best: one of these, or one with more of their own."""
+    ways = [_warmed_up(run, measured(data, zero), warmup) for zero in zeros]
+    best = min(range(len(ways)), key=lambda i: ways[i][1])
+    if len(zeros) > 1 and any(own := _own_zeros(run, measured(data, zeros[best]), warmup)):
+        both = tuple(a + b for a, b in zip(zeros[best] or (0.0,) * data.dof, own, strict=True))
+        states, cost = _warmed_up(run, measured(data, both), warmup)
+        if cost <= MARGIN**2 * ways[best][1]:  # the noise of steps hides much of what zeros do within a warm-up
+            return states, both
+    return ways[best][0], zeros[best]
 
 
 def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
