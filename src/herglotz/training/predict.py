@@ -270,9 +270,8 @@ def _started(
 def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor, float]:
     """States (N, 2n+1), NaN beyond the warm-up of each trajectory, and how badly they suit it."""
     states = torch.full((data.samples, 2 * data.dof + 1), torch.nan, dtype=data.q.dtype)
-    sigma = _sigma(run)
-    every = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
-    together = _smoothed(run.model, data.rows(every.flatten(), (warmup,) * len(data)), sigma, run.h_range[1])
+    sigma, (every, parts) = _sigma(run), _warm_ups(data, warmup)
+    together = _smoothed(run.model, parts, sigma, run.h_range[1])
     if together is not None:
         states[every.flatten()], cost = together
         return states, cost
@@ -286,14 +285,19 @@ def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor,
     return states, sum(costs) + lost * max(costs, default=math.inf)
 
 
+def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
+    """The rows of the first samples of every trajectory, (B, K), and these samples as recordings."""
+    rows = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
+    return rows, data.rows(rows.flatten(), (warmup,) * len(data))
+
+
 def _sigma(run: FittedRun) -> float:
     return run.metrics.get("sigma") or max(run.model.config.scale) * 1e-6
 
 
 def _own_zeros(run: FittedRun, data: Trajectories, warmup: int) -> tuple[float, ...]:
     """What the warm-ups tell of zeros of the sensors that no recording of the fit had, (n,)."""
-    rows = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
-    return zeros_of_one(run.model, data.rows(rows.flatten(), (warmup,) * len(data)), _sigma(run), run.h_range[1])
+    return zeros_of_one(run.model, _warm_ups(data, warmup)[1], _sigma(run), run.h_range[1])
 
 
 def _smoothed(

@@ -134,8 +134,8 @@ def refined(apart: Apart, seen: Look) -> Apart | None:
 class FoundZeros(NamedTuple):
     """Zeros of the sensors, their standard deviations, and the misfit with them."""
 
-    z: Tensor  # (B, n)
-    deviations: Tensor  # (B, n)
+    z: Tensor  # (B, n), or as many as there are unknowns
+    deviations: Tensor  # as z
     rms: float
 
 
@@ -163,14 +163,21 @@ def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_st
     problem.guess_from_states(states_of_pairs(model, data))
     x = torch.cat([problem.pack(theta, first_states(problem, theta, data)), theta.new_zeros(n)])
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
+    found = _fitted(target, x)
+    return None if found is None else tuple(clearly(found).z.tolist())
+
+
+def _fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
+    """The zeros as a vector, from these unknowns; None where the model cannot follow the recordings."""
+    problem = target.problem
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
         return None
     _, A, _ = target.normal_equations(result.x)
     assert problem.path is not None
-    variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-n:] * (_rms(problem.misfit(problem.path)) / sigma) ** 2
-    found = clearly(FoundZeros(result.x[None, -n:], variance.clamp_min(0).sqrt()[None], 0.0))
-    return tuple(found.z[0].tolist())
+    rms = _rms(problem.misfit(problem.path))
+    variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-target.count :] * (rms / problem.sigma) ** 2
+    return FoundZeros(result.x[-target.count :], variance.clamp_min(0).sqrt(), rms)
 
 
 class ZerosOf:
@@ -236,18 +243,13 @@ class ZerosOf:
         theta[[] if held is None else held] = 0.0
         problem.guess_from_states(states_of_pairs(model, smooth))
         x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
-        target = WithZeros(problem, held)
-        result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
-        if not math.isfinite(result.cost):
+        found = _fitted(WithZeros(problem, held), x)
+        if found is None:
             return FoundZeros(start, torch.zeros_like(start), math.inf)
-        _, A, _ = target.normal_equations(result.x)
-        assert problem.path is not None
-        rms = _rms(problem.misfit(problem.path))
-        variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-count * n :] * (rms / self.sigma) ** 2
         z, deviations = start.clone(), torch.zeros_like(start)
-        z[rows] += result.x[-count * n :].reshape(count, n)
-        deviations[rows] = variance.clamp_min(0).sqrt().reshape(count, n)
-        return FoundZeros(z, deviations, rms)
+        z[rows] += found.z.reshape(count, n)
+        deviations[rows] = found.deviations.reshape(count, n)
+        return FoundZeros(z, deviations, found.rms)
 
 
 def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:

@@ -145,7 +145,7 @@ class Writer:
             dtype = dtype or self.real
             return self.rows(x, shape, dtype) if len(shape) > 2 else self.name(x, dtype)
         own = described(x).shape
-        assert not own or not behind or any(not isinstance(size, int) for size in own), x  # no batch: it is known
+        require(not own or not behind or any(not isinstance(size, int) for size in own), node)  # no batch: it is known
         while x.target == aten.unsqueeze.default and axis_of(x.args[1], x) == 0 and described(x).shape != shape:
             x = x.args[0]  # another operand has the axis in front
         return self.name(x)
