@@ -127,6 +127,14 @@ def test_what_leaves_the_box_is_flagged(stepper):
     out = stepper.rollout(*far, h=0.1, steps=4, every=2)
     assert out.outside.tolist() == [[0, 0], [1, 1], [0, 0]]
     assert stepper.step(far, 0.1).outside.tolist() == [0, 1, 0]
+    # a step that starts outside and ends inside is flagged too, and no other
+    high = torch.tensor(stepper.metadata["box"]["q_high"], dtype=torch.float64)
+    back = State(0 * q + 0.999 * high, 0 * p - 0.3, 0 * s)
+    back = back._replace(q=back.q.clone().index_fill_(0, torch.tensor(2), 1.04 * float(high[0])))
+    out = stepper.rollout(*back, h=0.1, steps=3)
+    there = stepper.outside_box(out.states)
+    assert there.tolist() == [[False] * 4, [False] * 4, [True, True, False, False]]
+    assert out.outside.tolist() == [[0, 0, 0], [0, 0, 0], [1, 1, 0]]
 
 
 def test_a_file_by_itself_has_a_status_for_what_is_no_number(stepper):

@@ -13,6 +13,7 @@ from herglotz.export.exported import check_range
 from herglotz.export.load import read_header
 from herglotz.export.lower.interpret import MATHEMATICS
 from herglotz.export.step import FLOOR, _added, first_carry, newton_iteration
+from herglotz.export.trace import example_batch, traced
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import fit
@@ -38,6 +39,22 @@ def test_steps_at_the_ends_of_the_range_are_taken(dtype):
             with pytest.raises(InputError, match="where the model was fitted; got"):
                 check_range(torch.tensor([span[0], wrong, span[1]], dtype=dtype), span)
     check_range(torch.tensor(9.0), None)
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_what_a_trace_leaves_out_changes_nothing(kept):
+    # fails if another sum or product than x + 0 and 1 x is taken for x; or if these are written down
+    a, b = (2.0, -1.0) if kept else (1.0, 0.0)
+    x = torch.rand(example_batch(set()), dtype=torch.float64)
+
+    def function(x):
+        scale, more = (torch.full((1,), number, dtype=torch.float64) for number in (a, b))
+        return torch.sin(a * (scale * x + b) + more)
+
+    graph = traced(function, (x,))
+    assert torch.equal(graph(x)[0], function(x))
+    written = {str(node.target) for node in graph.code.graph.nodes if node.op == "call_function"}
+    assert bool(written & {"aten.add.Tensor", "aten.mul.Tensor"}) == kept
 
 
 @pytest.mark.parametrize("boxed", [True, False])

@@ -1,5 +1,6 @@
 """Zeros of sensors that differ between recordings: as unknowns, found, kept where they help, and met by predictions."""
 
+import sys
 from dataclasses import replace
 from functools import cache
 
@@ -13,13 +14,25 @@ from herglotz.training import FitConfig, Plan, fit, rivals
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import look
 from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.predict import predict
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.problems.zeros import WithZeros
-from herglotz.training.sensor_zeros import Apart, FoundZeros, ZerosOf, _by_steps, odd, refined, sensor_zeros
+from herglotz.training.sensor_zeros import (
+    Apart,
+    FoundZeros,
+    ZerosOf,
+    _by_steps,
+    odd,
+    refined,
+    sensor_zeros,
+    zeros_of_one,
+)
 from herglotz.training.stages import Stages
 from herglotz.training.task import build_model
 from herglotz.training.verdict import Errors, in_words
+
+predict_module, sensor_zeros_module = (sys.modules[f.__module__] for f in (predict, sensor_zeros))
 
 NOISE, PLANTED, SAMPLES = 0.003, 0.1, 150
 
@@ -217,6 +230,21 @@ def test_a_prediction_finds_zeros_that_no_recording_of_the_fit_had(planted, foun
     assert prediction.rms is not None
     assert prediction.rms < 2 * NOISE
     assert prediction.zeros == (pytest.approx((planted,), abs=2 * NOISE) if found else ())
+
+
+def test_zeros_of_its_own_are_taken_only_where_the_warm_up_suits_no_worse(monkeypatch):
+    # fails if zeros that the states over the warm-up speak against are taken off
+    monkeypatch.setattr(predict_module, "_own_zeros", lambda *_: (1.0,))
+    assert run().predict(pendulums(0.0, seed=7, recordings=1), warmup=60).zeros == ()
+
+
+@pytest.mark.parametrize(("most", "found"), [(16, 15.0), (9, 14.0), (2, 8.0), (1, 0.0)])
+def test_parts_that_are_not_followed_are_left_out(monkeypatch, most, found):
+    # fails if one of sixteen parts that the model cannot follow hides the zeros of all, or if parts are not thinned
+    parts = Trajectories.of(np.tile(np.arange(3.0), 16), np.repeat(np.arange(16.0), 3), (3,) * 16)
+    last = lambda _, data, *__: None if len(data) > most else (float(data.q[-1]),)  # noqa: E731
+    monkeypatch.setattr(sensor_zeros_module, "_of_parts", last)
+    assert zeros_of_one(None, parts, 1.0, 1.0) == (found,)  # pyright: ignore
 
 
 def test_zeros_are_not_looked_for_where_the_user_says_so():
