@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-import inspect
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from herglotz.export.trace import Graph, example_batch, traced
 from herglotz.mechanics.newton import Point
@@ -156,10 +155,3 @@ def example(model: ContactLagrangian, h: float) -> tuple[Tensor, ...]:
     s, steps = torch.zeros(batch, **options), torch.full((batch,), float(h), **options)
     m = model.inputs
     return q, p, s, steps, *((torch.zeros(batch, m, **options),) if m else ())
-
-
-def batched(module: nn.Module, shapes: tuple[Any, ...]) -> tuple[Any, ...]:
-    """One entry an argument, as torch.export wants them: what arrives through *u is a tuple of its own."""
-    kinds = [parameter.kind for parameter in inspect.signature(module.forward).parameters.values()]
-    fixed = len(kinds) - (kinds[-1] == inspect.Parameter.VAR_POSITIONAL)
-    return (*shapes[:fixed], shapes[fixed:]) if len(shapes) > fixed else shapes

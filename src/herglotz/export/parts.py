@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from torch import Tensor, fx, nn
+from torch import fx
 
-from herglotz.export.trace import Example, Graph, aten
+from herglotz.export.trace import Example, Graph, assembled, aten
 
 
 def parted(graph: Graph, early: Sequence[bool]) -> tuple[Graph, Graph]:
@@ -25,9 +25,9 @@ def parted(graph: Graph, early: Sequence[bool]) -> tuple[Graph, Graph]:
     again = {x for x in _read_outside(first) if x.target == aten.unsqueeze.default}  # costs nothing
     cut = [x for x in _read_outside(first - again) if x.op == "call_function"]
     results: Any = own.output_node().args[0]
-    before = _graph(graph.batch, given, [x for x in calls if x in first or x in both], cut, constants)
-    after = _graph(graph.batch, [*inputs, *cut], [x for x in calls if x not in first or x in again], results, constants)
-    return before, after
+    soon, later = [x for x in calls if x in first or x in both], [x for x in calls if x not in first - again]
+    before = assembled(graph.batch, given, soon, cut, constants)
+    return before, assembled(graph.batch, [*inputs, *cut], later, results, constants)
 
 
 def _read_outside(own: set[fx.Node]) -> list[fx.Node]:
@@ -52,26 +52,3 @@ def _may_move(node: fx.Node, batch: int) -> bool:
     """Whether a value may be made before the loop; a copy stays, for results must be tensors of their own."""
     shape = node.meta["example"].shape if isinstance(node.meta["example"], Example) else ()
     return node.target != aten.clone.default and shape[:1] == (batch,) and math.prod(shape) == batch
-
-
-def _graph(
-    batch: int,
-    inputs: Sequence[fx.Node],
-    calls: Sequence[fx.Node],
-    results: Sequence[fx.Node],
-    constants: Mapping[fx.Node, Tensor],
-) -> Graph:
-    """These calls as a graph of these inputs."""
-    graph, new = fx.Graph(), {}
-    read = {*results, *(y for x in calls for y in x.all_input_nodes)}
-    used = [x for x in constants if x in read]
-    for x in (*inputs, *used):
-        new[x] = graph.placeholder(f"x{len(new)}")
-        new[x].meta = dict(x.meta)
-    axis = next((new[x] for x in inputs if x.meta["example"].shape), None)
-    for x in calls:
-        # The batch is that of this part: the first one may have the samples of all steps.
-        new[x] = graph.node_copy(x, lambda y, own=x.target == aten.sym_size.int: axis if own else new[y])
-    graph.output(tuple(new[x] for x in results))
-    graph.eliminate_dead_code()
-    return Graph(fx.GraphModule(nn.Module(), graph), [constants[x] for x in used], batch)

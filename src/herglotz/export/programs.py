@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from torch.export import Dim, ExportedProgram
 
 from herglotz.data.files import PathLike, write_atomically
-from herglotz.export.equation import Equations, batched, example
+from herglotz.export.equation import Equations, example
 from herglotz.export.inline import inlined, opaque
 from herglotz.export.metadata import describe
 from herglotz.export.module import InitModule, RolloutModule, StepModule
@@ -40,20 +40,19 @@ def programs_of(
     make = {
         "model": lambda: _program(StepModule(equations, graphs, iterations), (q, p, s, *more)),
         "linearise": lambda: _program(StepModule(equations, graphs, iterations, linearised=True), (q, p, s, *more)),
-        "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=3),
+        "rollout": lambda: _program(RolloutModule(graphs, iterations, hoists), (q, p, s, *stacked), stacked=True),
         "init": lambda: _program(InitModule(equations), (q, p, s, *more)),
     }
     return {name: make[name]() for name in names}
 
 
-def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: int | None = None) -> ExportedProgram:
-    """Export for any batch size; arguments from `stacked` on have a leading axis of steps, free as well."""
+def _program(module: nn.Module, arguments: tuple[Tensor, ...], stacked: bool = False) -> ExportedProgram:
+    """Export a module of (q, p, s, h, *u) for any batch size; if `stacked`, h and u have a free axis of steps first."""
     one = {0: Dim.DYNAMIC}
-    count = len(arguments)
-    split = count if stacked is None else stacked
-    shapes = tuple(one if i < split else {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} for i in range(count))
+    late = {0: Dim.DYNAMIC, 1: Dim.DYNAMIC} if stacked else one
+    inputs = ((late,),) if len(arguments) > 4 else ()  # what arrives through *u is a tuple of its own
     with torch.no_grad(), opaque(module):
-        program = torch.export.export(module, arguments, dynamic_shapes=batched(module, shapes))
+        program = torch.export.export(module, arguments, dynamic_shapes=(one, one, one, late, *inputs))
     return _slim(inlined(program))
 
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, fx, nn
 from torch.fx.node import map_aggregate
 from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_any
 
 from herglotz.errors import InputError
 
@@ -128,6 +129,7 @@ class Recorder(TorchDispatchMode):
         self.size: fx.Node | None = None
         self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
         for x, place in zip(inputs, self.places, strict=True):
+            place.meta["example"] = _described(x)
             self._name(x, place)
         axis = next(i for i, x in enumerate(inputs) if x.ndim)
         self.batch, self.axis = len(inputs[axis]), self.places[axis]
@@ -144,7 +146,7 @@ class Recorder(TorchDispatchMode):
             self.unchanged[id(result)] = (func, args, kwargs)
             self._name(result, self._moved(same))
         elif func == aten.copy_.default:  # into zeros that nothing else reads
-            shape = self._with_batch(list(result.shape))
+            shape = [self._argument(size) for size in result.shape]
             self._name(result, self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape)))
         else:
             self._name(result, self._written(func, args, kwargs))
@@ -159,15 +161,16 @@ class Recorder(TorchDispatchMode):
         self.graph.output(tuple(self._moved(x) if how is None else self._written(*how) for x, how in ends))
         graph = fx_graph_cse(self.graph)
         graph.eliminate_dead_code()
-        order = [node for node in graph.nodes if node.op == "placeholder"]
-        kept = {place.name: value for place, value in self.constants.values()}
-        _inputs_first(graph, [x for x in order if x.name not in kept], [x for x in order if x.name in kept])
-        return Graph(*_without_unused(graph, [kept[x.name] for x in order if x.name in kept]), self.batch)
+        numbers = {place.name: value for place, value in self.constants.values()}
+        places = graph.find_nodes(op="placeholder")
+        constants = {x: numbers[x.name] for x in places if x.name in numbers}
+        inputs, calls = [x for x in places if x not in constants], [x for x in graph.nodes if x.op == "call_function"]
+        return assembled(self.batch, inputs, calls, graph.output_node().args[0], constants)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
         if func._schema.is_mutable and func not in INSTEAD:
             raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
-        arguments, options = (self._with_batch(_map(self._moved, x)) for x in (args, kwargs))
+        arguments, options = (map_aggregate(x, self._argument) for x in (args, kwargs))
         new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
         return new or self.graph.call_function(INSTEAD.get(func, func), arguments, options)
 
@@ -193,9 +196,7 @@ class Recorder(TorchDispatchMode):
 
     def _is_fixed(self, arguments: Any) -> bool:
         """Whether neither an input nor the batch size decides the arguments."""
-        found: list[Any] = []
-        _map(lambda x: found.append(x) if id(x) in self.nodes else None, arguments)
-        return not found and not _mentions(arguments, self.batch)
+        return not tree_any(lambda x: id(x) in self.nodes or self._is_size(x), arguments)
 
     def _name(self, result: Any, node: Any) -> None:
         """The node of a result; results in a tuple are its items."""
@@ -219,35 +220,19 @@ class Recorder(TorchDispatchMode):
             self.constants[key] = (place, value.detach().clone(memory_format=torch.contiguous_format))
         return self.constants[key][0]
 
-    def _with_batch(self, x: Any) -> Any:
-        """The arguments with every multiple of the example's batch replaced by the size that the graph computes."""
-        if isinstance(x, (list, tuple)):
-            return [self._with_batch(y) for y in x] if isinstance(x, list) else tuple(self._with_batch(y) for y in x)
-        if isinstance(x, dict):
-            return {key: self._with_batch(y) for key, y in x.items()}
-        if not _mentions(x, self.batch):
+    def _argument(self, x: Any) -> Any:
+        """An argument as the graph has it: the node of a tensor, and of every multiple of the example's batch."""
+        if isinstance(x, Tensor):
+            return self._moved(x)
+        if not self._is_size(x):
             return x
         if self.size is None:
             self.size = self.graph.call_function(aten.sym_size.int, (self.axis, 0))
         return self.size if x == self.batch else self.graph.call_function(operator.mul, (self.size, x // self.batch))
 
-
-def _map(change: Callable[[Tensor], Any], x: Any) -> Any:
-    """The arguments with every tensor changed."""
-    if isinstance(x, Tensor):
-        return change(x)
-    if isinstance(x, (list, tuple)):
-        return [_map(change, y) for y in x] if isinstance(x, list) else tuple(_map(change, y) for y in x)
-    return {key: _map(change, y) for key, y in x.items()} if isinstance(x, dict) else x
-
-
-def _mentions(x: Any, batch: int) -> bool:
-    """Whether a multiple of the batch is among the arguments."""
-    if isinstance(x, (list, tuple)):
-        return any(_mentions(y, batch) for y in x)
-    if isinstance(x, dict):
-        return any(_mentions(y, batch) for y in x.values())
-    return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * batch and x % batch == 0
+    def _is_size(self, x: Any) -> bool:
+        """Whether this is a multiple of the example's batch."""
+        return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
 
 
 def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:
@@ -271,21 +256,24 @@ def _gathered(graph: fx.Graph, func: Any, values: Any, arguments: Any) -> fx.Nod
     return new if len(shape) == 1 else graph.call_function(aten.unflatten.int, (new, 0, shape))
 
 
-def _inputs_first(graph: fx.Graph, inputs: list[fx.Node], constants: list[fx.Node]) -> None:
-    """Placeholders in the order of the arguments."""
-    first = next(iter(graph.nodes))
-    for node in reversed(inputs + constants):
-        if node is not first:
-            first.prepend(node)
-            first = node
-
-
-def _without_unused(graph: fx.Graph, constants: Sequence[Tensor]) -> tuple[fx.GraphModule, list[Tensor]]:
-    """Constants that nobody reads are dropped; they are the last placeholders."""
-    places = [node for node in graph.nodes if node.op == "placeholder"]
-    places = places[len(places) - len(constants) :]
-    kept = [value for node, value in zip(places, constants, strict=True) if node.users]
-    for node in places:
-        if not node.users:
-            graph.erase_node(node)
-    return fx.GraphModule(nn.Module(), graph), kept
+def assembled(
+    batch: int,
+    inputs: Sequence[fx.Node],
+    calls: Sequence[fx.Node],
+    results: Any,  # nodes
+    constants: Mapping[fx.Node, Tensor],
+) -> Graph:
+    """These calls as a graph of these inputs, with those of the constants that it reads."""
+    graph, new = fx.Graph(), {}
+    read = {*results, *(y for x in calls for y in x.all_input_nodes)}
+    used = [x for x in constants if x in read]
+    for x in (*inputs, *used):
+        new[x] = graph.placeholder(f"x{len(new)}")
+        new[x].meta = dict(x.meta)
+    axis = next((new[x] for x in inputs if x.meta["example"].shape), None)
+    for x in calls:
+        # The batch is that of these inputs: where a graph is cut, those of the first part may be of all steps.
+        new[x] = graph.node_copy(x, lambda y, own=x.target == aten.sym_size.int: axis if own else new[y])
+    graph.output(tuple(new[x] for x in results))
+    graph.eliminate_dead_code()
+    return Graph(fx.GraphModule(nn.Module(), graph), [constants[x] for x in used], batch)

@@ -156,11 +156,8 @@ class ContactLagrangian(nn.Module):
             inputs=self.inputs,
         )
 
-    def terms(self, q0: Tensor, q1: Tensor, h: Tensor, order: int) -> Terms:
+    def terms(self, phase: Phase) -> Terms:
         """Evaluate every term once."""
-        return self._terms(Phase(q0, q1, h, order, self.config))
-
-    def _terms(self, phase: Phase) -> Terms:
         order, n = phase.order, phase.q0.shape[-1]
         g = None if self.damping is None else self.damping(phase)
         N = None if self.correction is None else self.correction(phase)
@@ -225,7 +222,7 @@ class ContactLagrangian(nn.Module):
         """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
         if not order:
             return self.partials(q0, q1, s0, h, 1).L
-        return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
+        return self.partials(q0, q1, s0, h, order, u)
 
     def _phase(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, delta: Tensor | None = None
@@ -234,7 +231,7 @@ class ContactLagrangian(nn.Module):
         return Phase(q0, q1, h, order, self.config, delta)
 
     def _evaluate(self, phase: Phase, s0: Tensor, u: Tensor | None) -> Partials:
-        t, h = self._terms(phase), phase.h
+        t, h = self.terms(phase), phase.h
         if self.action is not None:
             return action_partials(self._through_action(self.action, t, s0, h, phase.order))
         c = None if t.g is None else t.g.exp()

@@ -11,6 +11,8 @@ this is the force-gradient action of M. Takahashi and M. Imada, J. Phys. Soc. Jp
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
@@ -54,8 +56,7 @@ class Slope:
 
     def along(self, b: Tensor, y: Tensor, order: int) -> Jet:
         """The scalar bᵀ(e − M y) as a jet over (q0, q1), for constant b and y, (..., n)."""
-        p = self.phase
-        return self._along(Phase(p.q0, p.q1, p.h, order, p.sizes, p.delta), b, y)
+        return self._along(replace(self.phase, order=order), b, y)
 
     def _along(self, phase: Phase, b: Tensor, y: Tensor) -> Jet:
         push = b @ self.constant

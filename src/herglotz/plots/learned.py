@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from torch import Tensor
 
+from herglotz.models.phase import Phase
 from herglotz.models.terms import LinearDamping
 from herglotz.plots.fan import momentum_unit
 from herglotz.plots.motion import trained_mask
@@ -138,7 +139,7 @@ def _mass(run: Run, i: int, x: Tensor, entry: tuple[int, int]) -> Callable[[], T
 def _masses(run: Run, q: Tensor) -> Tensor:
     """m(q) = −h ∂²K/∂q₀∂q₁ at rest, (n, n, POINTS), q (POINTS, n)."""
     n, h = run.data.dof, torch.full(q.shape[:1], run.h, dtype=q.dtype)
-    K = run.model.terms(q, q, h, 2).K
+    K = run.model.terms(Phase(q, q, h, 2, run.model.config)).K
     return q.new_zeros(n, n, len(q)) if K is None else -run.h * K.hessian()[:n, n:].movedim(-1, 2)
 
 

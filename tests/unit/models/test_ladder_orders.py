@@ -10,6 +10,7 @@ from herglotz.mechanics import autograd_partials
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.action import unit_increment
 from herglotz.models.jet import Jet
+from herglotz.models.phase import Phase
 from herglotz.scenes import scene
 from herglotz.stepping import State, Stepper
 
@@ -168,7 +169,7 @@ def test_mass_is_positive_definite_bounded_and_fixed_at_the_origin():
         assert torch.linalg.eigvalsh(m).min() > 0
         assert float((m[:, 0, 0] - 1).abs().max()) > 0.1
         h = torch.tensor(0.1, dtype=torch.float64)
-        K = model.terms(q - h / 2 * v, q + h / 2 * v, h.expand(50), 1).K
+        K = model.terms(Phase(q - h / 2 * v, q + h / 2 * v, h.expand(50), 1, config)).K
         torch.testing.assert_close(K.value, h / 2 * (v * (m @ v[..., None])[..., 0]).sum(-1), rtol=1e-12, atol=1e-13)
         for parameter in model.kinetic.network.parameters():
             parameter *= 1e3

@@ -43,7 +43,7 @@ NAME = re.compile(r"@(\d+)")
 
 @dataclass
 class Statement:
-    """One line or loop; `@7` in the text stands for the result of statement 7."""
+    """One line or loop; `@7` in the text stands for the result of statement 7, which it reads unless 7 is its own."""
 
     text: str
     size: int  # 0: a scalar
@@ -61,8 +61,8 @@ class Program:
 
     def given(self, name: str, size: int) -> list[Ref]:
         """An input of the function: a row of `size`, or a scalar where that is 0."""
-        number = self._append(Statement("", size, set(), name))
-        return [Ref(number, i) for i in range(max(size, 1))]
+        self.statements.append(Statement("", size, set(), name))
+        return [Ref(len(self.statements) - 1, i) for i in range(max(size, 1))]
 
     def table(self, values: Iterable[float]) -> str:
         """The name of a row of constants."""
@@ -73,8 +73,7 @@ class Program:
         """The result of a formula such as `{0} + {1}`; the same formula of the same numbers is computed once."""
         key = (form, *atoms)
         if key not in self.known:
-            text = f"const REAL @{len(self.statements)} = {form.format(*map(self.read, atoms))};"
-            self.known[key] = Ref(self._append(Statement(text, 0, _reads(atoms))))
+            self.known[key] = self._append(f"const REAL @@ = {form.format(*map(self.read, atoms))};", 0)
         return self.known[key]
 
     def elementwise(
@@ -113,29 +112,21 @@ class Program:
         count = len(entries)
         if count < LOOP:
             return [self.scalar(form, atoms) for atoms in entries]
-        columns = list(zip(*entries, strict=True))
-        number = len(self.statements)
+        columns, forms = list(zip(*entries, strict=True)), (form,)
         if form in SINE_AND_COSINE:
-            lines = [f"@{number}[k{at}] = {f.format(self._in_loop(columns[0]))};" for f, at in
-                     zip(SINE_AND_COSINE, ("", f" + {count}"), strict=True)]  # fmt: skip
+            forms = SINE_AND_COSINE
+            lines = [f"@@[k{at}] = {f.format(self._in_loop(columns[0]))};" for f, at in
+                     zip(forms, ("", f" + {count}"), strict=True)]  # fmt: skip
             text = f"for (k = 0; k < {count}; k++) {{ {' '.join(lines)} }}"
-            self._append(Statement(text, 2 * count, _mentioned(text) - {number}))
-            for i, atoms in enumerate(entries):
-                for j, f in enumerate(SINE_AND_COSINE):
-                    self.known[(f, *atoms)] = Ref(number, j * count + i)
-            return [self.known[(form, *atoms)] for atoms in entries]
-        if kernel is not None:
-            where = self.pointer(columns[0])
-            number = len(self.statements)
-            text = f"{kernel}({count}, {where}, @{number});"
+        elif kernel is not None:
+            text = f"{kernel}({count}, {self.pointer(columns[0])}, @@);"
         else:
-            right = form.format(*(self._in_loop(column) for column in columns))
-            text = f"for (k = 0; k < {count}; k++) @{number}[k] = {right};"
-        self._append(Statement(text, count, _mentioned(text) - {number}))
-        results = [Ref(number, i) for i in range(count)]
-        for atoms, result in zip(entries, results, strict=True):
-            self.known[(form, *atoms)] = result
-        return results
+            text = f"for (k = 0; k < {count}; k++) @@[k] = {form.format(*map(self._in_loop, columns))};"
+        number = self._append(text, len(forms) * count).statement
+        for j, f in enumerate(forms):
+            for i, atoms in enumerate(entries):
+                self.known[(f, *atoms)] = Ref(number, j * count + i)
+        return [self.known[(form, *atoms)] for atoms in entries]
 
     def _in_loop(self, column: Sequence[Atom]) -> str:
         """How a loop over k reads a column whose entries `_run` has found regular."""
@@ -163,19 +154,18 @@ class Program:
                 return f"@{first.statement}" + (f" + {first.index}" if first.index else "")
         key = ("packed", *atoms)
         if key not in self.known:
-            number, lines, start = len(self.statements), [], 0
+            lines, start = [], 0
             while start < len(atoms):
                 count = _run([(x,) for x in atoms], start)
                 if count < LOOP:
-                    lines += [f"@{number}[{i}] = {self._spread(atoms[i])};" for i in range(start, start + count)]
+                    lines += [f"@@[{i}] = {self._spread(atoms[i])};" for i in range(start, start + count)]
                 else:
                     right = self._in_loop(atoms[start : start + count])
                     right = right if isinstance(atoms[start], Ref) else f"SPREAD({right})"
                     at = f"k + {start}" if start else "k"
-                    lines.append(f"for (k = 0; k < {count}; k++) @{number}[{at}] = {right};")
+                    lines.append(f"for (k = 0; k < {count}; k++) @@[{at}] = {right};")
                 start += count
-            self._append(Statement("\n".join(lines), len(atoms), _reads(atoms)))
-            self.known[key] = Ref(number)
+            self.known[key] = self._append("\n".join(lines), len(atoms))
         return f"@{self.known[key].statement}"
 
     def _spread(self, atom: Atom) -> str:
@@ -200,22 +190,19 @@ class Program:
     def _few_inputs(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
         key = ("few", tuple(x), tuple(weight.flat), tuple(start))
         if key not in self.known:
-            number, size = len(self.statements), len(start)
             terms = [f"{self.read(v)} * {self._in_loop(list(row))}" for v, row in zip(x, weight, strict=True)]
             terms = [self._in_loop(list(start)), *terms] if any(start) else terms
-            text = f"for (k = 0; k < {size}; k++) @{number}[k] = {' + '.join(terms)};"
-            self.known[key] = Ref(self._append(Statement(text, size, _reads(x))))
+            text = f"for (k = 0; k < {len(start)}; k++) @@[k] = {' + '.join(terms)};"
+            self.known[key] = self._append(text, len(start))
         return [Ref(self.known[key].statement, i) for i in range(len(start))]
 
     def _call_product(self, x: Sequence[Atom], weight: np.ndarray, start: Sequence[float]) -> list[Atom]:
         key = ("product", tuple(x), tuple(weight.flat), tuple(start))
         if key not in self.known:
-            where = self.pointer(x)
-            number, size = len(self.statements), len(start)
+            where, size = self.pointer(x), len(start)
             tables = f"{self.table(weight.flat)}, {self.table(weight.T.flat)}"
-            text = f"for (k = 0; k < {size}; k++) @{number}[k] = SPREAD({self._in_loop(list(start))});\n"
-            text += f"FN_product({len(x)}, {size}, {tables}, {where}, @{number});"
-            self.known[key] = Ref(self._append(Statement(text, size, _mentioned(text) - {number})))
+            text = f"for (k = 0; k < {size}; k++) @@[k] = SPREAD({self._in_loop(list(start))});\n"
+            self.known[key] = self._append(f"{text}FN_product({len(x)}, {size}, {tables}, {where}, @@);", size)
         return [Ref(self.known[key].statement, i) for i in range(len(start))]
 
     def sum(self, atoms: Iterable[Atom]) -> Atom:
@@ -225,8 +212,7 @@ class Program:
             where = self.pointer(terms)
             key = ("sum", where, len(terms))
             if key not in self.known:
-                text = f"const REAL @{len(self.statements)} = FN_sum({len(terms)}, {where});"
-                self.known[key] = Ref(self._append(Statement(text, 0, _mentioned(where))))
+                self.known[key] = self._append(f"const REAL @@ = FN_sum({len(terms)}, {where});", 0)
             return self.known[key]
         total: Atom = 0.0
         for x in terms:
@@ -236,14 +222,15 @@ class Program:
     def inverse(self, matrix: np.ndarray) -> np.ndarray:
         """The inverse of a matrix (n, n) of atoms."""
         where, n = self.pointer(list(matrix.flat)), len(matrix)
-        number = len(self.statements)
-        text = f"FN_inverse({n}, {where}, @{number});"
-        self._append(Statement(text, n * n, _mentioned(where)))
+        number = self._append(f"FN_inverse({n}, {where}, @@);", n * n).statement
         return np.array([Ref(number, i) for i in range(n * n)] + [None], object)[:-1].reshape(n, n)
 
-    def _append(self, statement: Statement) -> int:
-        self.statements.append(statement)
-        return len(self.statements) - 1
+    def _append(self, text: str, size: int) -> Ref:
+        """The result of another statement, which stands as `@@` in its own text."""
+        number = len(self.statements)
+        reads = {int(x) for x in NAME.findall(text)}
+        self.statements.append(Statement(text.replace("@@", f"@{number}"), size, reads))
+        return Ref(number)
 
 
 def add(program: Program, a: Atom, b: Atom) -> Atom:
@@ -296,14 +283,6 @@ def literal(value: float) -> str:
 def _varies(atoms: Iterable[Atom]) -> bool:
     """Whether any of these numbers is a result of a statement."""
     return any(isinstance(x, Ref) for x in atoms)
-
-
-def _reads(atoms: Iterable[Atom]) -> set[int]:
-    return {x.statement for x in atoms if isinstance(x, Ref)}
-
-
-def _mentioned(text: str) -> set[int]:
-    return {int(x) for x in NAME.findall(text)}
 
 
 def _run(entries: Sequence[tuple[Atom, ...]], start: int) -> int:
