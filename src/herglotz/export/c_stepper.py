@@ -37,7 +37,7 @@ class CLibrary:
     def init(self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """(p1, s1) at q1; NaN where there is none."""
         p, s, status = self._empty(len(s0), self.dof), self._empty(len(s0)), self._failed(len(s0))
-        self._call("herglotz_inits", len(s0), q0, q1, s0, h, 1, u, self.inputs, p, s, status)
+        self.library.herglotz_inits(*_arguments(len(s0), q0, q1, s0, h, u, p, s, status))
         return p, s
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
@@ -53,7 +53,7 @@ class CLibrary:
         status, residual = self._failed(count), self._empty(count)
         slopes = [self._empty(count, size, width) for width in (size, self.inputs, 1)]
         outputs = (*new, sigma, status, residual, *slopes)
-        self._call("herglotz_jacobians", count, q, p, s, h, u, *outputs, library=self.differentiates)
+        self.differentiates.herglotz_jacobians(*_arguments(count, q, p, s, h, u, *outputs))
         by_state, by_input, by_h = slopes
         return *new, sigma, residual, status, torch.cat([by_state, by_h, by_input], -1)
 
@@ -85,9 +85,6 @@ class CLibrary:
 
     def _failed(self, *shape: int) -> Tensor:
         return torch.full(shape, int(Status.DIVERGED), dtype=torch.uint8)
-
-    def _call(self, function: str, *arguments: Tensor | int | None, library: ctypes.CDLL | None = None) -> None:
-        getattr(library or self.library, function)(*_arguments(*arguments))
 
 
 def _arguments(*values: Tensor | int | None) -> list[Any]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from herglotz.errors import InputError
 from herglotz.export.metadata import weights_digest
-from herglotz.stepping import Rollout, State, Stepper
+from herglotz.stepping import Rollout, State, Stepper, state_of
 
 DISTINCT = 64  # starts that the eager stepper is run on; a larger batch of the file holds each of them many times
 
@@ -88,13 +88,12 @@ def draw(exported: Any, size: int, generator: torch.Generator) -> State:
     if box is not None:
         low = torch.tensor(box["q_low"] + box["p_low"] + box["s_low"], dtype=torch.float64)
         high = torch.tensor(box["q_high"] + box["p_high"] + box["s_high"], dtype=torch.float64)
-    x = (low + (high - low) * unit).to(exported.dtype)
-    return State(x[:, : exported.dof], x[:, exported.dof : 2 * exported.dof], x[:, -1])
+    return state_of((low + (high - low) * unit).to(exported.dtype))
 
 
 def _pick(states: State, size: int, generator: torch.Generator) -> State:
     index = torch.randint(len(states.s), (size,), generator=generator)
-    return State(states.q[index], states.p[index], states.s[index])
+    return State(*(x[index] for x in states))
 
 
 def _difference(ours: Rollout, eager: Rollout, order: Tensor) -> dict[str, Any]:

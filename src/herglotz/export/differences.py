@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.stepping import State, Step
+from herglotz.stepping import State, Step, state_of
 
 # Central differences of order 8 at offsets 1 … 4.
 WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
@@ -33,18 +33,17 @@ class DifferencedStepper:
 
     def step(self, state: State, h: float) -> Step:
         """One step; differentiable in the state, not in h."""
-        x = torch.cat([state.q, state.p, state.s[..., None]], -1)
-        found = self.stepper.step(_split(x.detach()), h)
+        x = state.joined
+        found = self.stepper.step(state_of(x.detach()), h)
         if not (torch.is_grad_enabled() and x.requires_grad):
             return found
         y = _Differenced.apply(x, self.stepper, h)
-        return Step(_split(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
+        return Step(state_of(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
 
 
 def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor:
     """A step map on points (q, p, s) in one row, (..., 2n+1); NaN where a step fails."""
-    q1, p1, s1 = step(_split(x), h).state
-    return torch.cat([q1, p1, s1[..., None]], -1)
+    return step(state_of(x), h).state.joined
 
 
 def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor) -> Tensor:
@@ -67,8 +66,3 @@ class _Differenced(torch.autograd.Function):
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:
         (D,) = ctx.saved_tensors
         return (gradients[0][..., None, :] @ D)[..., 0, :], None, None
-
-
-def _split(x: Tensor) -> State:
-    n = (x.shape[-1] - 1) // 2
-    return State(x[..., :n].contiguous(), x[..., n : 2 * n].contiguous(), x[..., 2 * n].contiguous())

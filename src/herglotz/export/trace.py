@@ -78,9 +78,7 @@ def traced(function: Callable[..., Any], arguments: tuple[Tensor, ...]) -> Graph
         with recorder:
             outputs = function(*arguments)
         graph = recorder.graph_of(outputs if isinstance(outputs, tuple) else (outputs,))
-        values = _values(graph.code, (*arguments, *graph.constants))
-    for node in graph.code.graph.nodes:
-        node.meta["example"] = map_aggregate(values[node.name], _described)
+        _Examples(graph.code).run(*arguments, *graph.constants)
     return graph
 
 
@@ -96,17 +94,13 @@ def _described(value: Any) -> Any:
     return Example(tuple(value.shape), value.stride(), value.dtype) if isinstance(value, Tensor) else value
 
 
-def _values(graph_module: fx.GraphModule, arguments: tuple[Tensor, ...]) -> dict[str, Any]:
-    """What every node gives for the examples."""
-    values: dict[str, Any] = {}
+class _Examples(fx.Interpreter):
+    """Evaluates a graph and notes what every node gives."""
 
-    class Values(fx.Interpreter):
-        def run_node(self, n: fx.Node) -> Any:
-            values[n.name] = super().run_node(n)
-            return values[n.name]
-
-    Values(graph_module).run(*arguments)
-    return values
+    def run_node(self, n: fx.Node) -> Any:
+        value = super().run_node(n)
+        n.meta["example"] = map_aggregate(value, _described)
+        return value
 
 
 class Recorder(TorchDispatchMode):

@@ -19,11 +19,9 @@ class Capabilities:
     known_damping: bool  # the damping, if any, is one rate γ or the affine level's g(q̄, v)
     correction: bool  # a network N of (q̄, v)
     action_flow: bool  # the full level: the map of s is nonlinear
-    friction: bool  # forces F⁻, F⁺ of friction and inputs
     nonlinear_force: bool  # dry friction, or another force that is not linear in v
     sticking: bool  # dry friction is set-valued
     coupling: bool  # a force that depends on the velocities of other joints, or on the position
-    inputs: int  # m
 
     @property
     def carries_s(self) -> bool:

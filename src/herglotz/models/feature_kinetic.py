@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from herglotz.models.config import ModelConfig
 from herglotz.models.feature_potential import Combination, sorted_features
 from herglotz.models.features import Feature
-from herglotz.models.jet import Jet, affine, of_mean_and_velocity
+from herglotz.models.jet import Jet, coordinates, of_mean_and_velocity
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.phase import Phase
 from herglotz.models.terms import Kinetic
@@ -37,7 +37,7 @@ class FeatureKinetic(nn.Module):
 
     def forward(self, phase: Phase) -> Jet:
         """Return K as a jet over (q0, q1)."""
-        K, v = self.base(phase), self._velocity(phase)
+        K, v = self.base(phase), coordinates(phase.velocity.value, phase.order)
         return K + self._summed(phase, {0: self._each([_times(v, of) for of in self.monomials])}) * phase.h
 
     def mass(self, q: Tensor) -> Tensor:
@@ -56,23 +56,18 @@ class FeatureKinetic(nn.Module):
 
     def straight(self, phase: Phase, rate: Tensor) -> Jet:
         """Return K_qq[v, v] + 2γ K_q v + γ² K of the features: the change of K along the straight line."""
-        v = self._velocity(phase)
+        v = coordinates(phase.velocity.value, phase.order)
         P, w = self._each([_times(v, of) for of in self.monomials]), v.linear(self.sum.form)
         Pw = P * w
         return self._summed(phase, {0: P * (rate * rate), 1: Pw * (2 * rate), 2: Pw * w})
 
     def along(self, phase: Phase, b: Tensor, y: Tensor, rate: Tensor) -> Jet:
         """Return bᵀ(K_q − K_qv v − γ K_v − K_vv y) of the features, b and y (..., n) constant; up to two velocities."""
-        v, form = self._velocity(phase), self.sum.form
+        v, form = coordinates(phase.velocity.value, phase.order), self.sum.form
         P = self._each([_times(v, of) for of in self.monomials])
         by_b = self._each([_derivative(v, of, b) for of in self.monomials])
         twice = torch.stack([_second(of, b, y) for of in self.monomials], -1) @ self.of.T
         return self._summed(phase, {1: P * (b @ form.T) - by_b * v.linear(form), 0: by_b * -rate - twice})
-
-    def _velocity(self, phase: Phase) -> Jet:
-        """Return v as a jet over its own components."""
-        v = phase.velocity.value
-        return affine(v, torch.eye(v.shape[-1], dtype=v.dtype, device=v.device), phase.order)
 
     def _each(self, monomials: list[Jet]) -> Jet:
         """Return for each product what belongs to its monomial, (..., A), of scalar jets."""

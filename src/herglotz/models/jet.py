@@ -226,14 +226,6 @@ def coordinates(q: Tensor, order: int) -> Jet:
     return affine(q, torch.eye(n, dtype=q.dtype, device=q.device), order)
 
 
-def variable(x: Tensor, index: int, size: int, order: int) -> Jet:
-    """The scalar x, shape (...), as number `index` of `size` variables."""
-    rows = 1 + size + (size * (size + 1) // 2 if order == 2 else 0)
-    zero = torch.zeros_like(x)[None]
-    before, after = zero.expand(index, *x.shape), zero.expand(rows - index - 2, *x.shape)
-    return Jet(torch.cat([x[None], before, torch.ones_like(zero), after]), size, order)
-
-
 def affine(value: Tensor, slope: Tensor, order: int) -> Jet:
     """A vector-valued jet (..., m) with constant gradient: slope (d, m) or (d, ..., m) is ∂_i of each component."""
     slope = slope if order else slope[:0]

@@ -18,7 +18,7 @@ from herglotz.models.drag import Drag, parse_drag
 from herglotz.models.feature_kinetic import kinetic_term
 from herglotz.models.feature_potential import baseline_is_named
 from herglotz.models.friction import CoupledFriction, Friction
-from herglotz.models.jet import Jet, variable
+from herglotz.models.jet import Jet, affine
 from herglotz.models.mass import PositionKinetic
 from herglotz.models.order4 import Slope, missing
 from herglotz.models.phase import Phase
@@ -147,13 +147,11 @@ class ContactLagrangian(nn.Module):
             known_damping=type(self.damping) in (LinearDamping, AffineDamping, type(None)),
             correction=self.correction is not None,
             action_flow=self.action is not None,
-            friction=self.friction is not None,
             nonlinear_force=(self.friction is not None and not self.friction.linear)
             or self.drag is not None
             or not all(term.linear for term in self.forces_between),
             sticking=self.friction is not None and self.friction.sticking,
             coupling=bool(self.forces_between) or self.drag is not None,
-            inputs=self.inputs,
         )
 
     def terms(self, phase: Phase) -> Terms:
@@ -248,7 +246,8 @@ class ContactLagrangian(nn.Module):
         """L = s1 − s0 at the full level, over the 2n + 1 variables (q0, q1, s0), as a sum of increments."""
         size = 2 * self.dof + 1
         wide = lambda jet: None if jet is None else jet.embed(size, 0)  # noqa: E731
-        s, K, V0, V1, N, b = variable(s0, size - 1, size, order), *map(wide, (t.K, t.V0, t.V1, t.N, t.b))
+        s = affine(s0, torch.eye(size, dtype=s0.dtype, device=s0.device)[-1], order)  # the last variable
+        K, V0, V1, N, b = map(wide, (t.K, t.V0, t.V1, t.N, t.b))
         assert isinstance(t.g, Jet)
         assert b is not None
         half_c = (t.g / 2).expm1().embed(size, 0)  # √c − 1

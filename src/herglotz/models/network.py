@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from herglotz.models.jet import Jet, affine, concatenate
 
-ACTIVATIONS = ("tanh", "softplus", "silu")
+ACTIVATIONS = ("tanh", "softplus", "silu")  # methods of `Jet`
 
 
 class Network(nn.Module):
@@ -54,15 +54,9 @@ class Network(nn.Module):
         """Apply the network to a jet of features (..., m); the result is a scalar jet, or (..., k)."""
         hidden = self.layers[:-1]
         for weight, bias in zip(hidden, self.biases, strict=True):
-            x = _activate(x.linear(weight, bias), self.activation)
+            x = getattr(x.linear(weight, bias), self.activation)()
         last = self.weights[len(hidden)]
         return x.linear(last).select(0) if self.scalar else x.linear(last)
-
-
-def _activate(x: Jet, activation: str) -> Jet:
-    if activation == "tanh":
-        return x.tanh()
-    return x.softplus() if activation == "softplus" else x.silu()
 
 
 def position_features(q: Jet, angles: tuple[bool, ...], scale: tuple[float, ...]) -> Jet:

@@ -79,9 +79,6 @@ def with_force(own: Forces, f: Tensor, slope: Tensor, c: Tensor, h: Tensor, by_q
     minus, plus = own.minus + (c * h / 2)[..., None] * f, own.plus + (h / 2)[..., None] * f
     if own.minus_2 is None:
         return replace(own, minus=minus, plus=plus)
-    assert own.minus_1 is not None
-    assert own.plus_1 is not None
-    assert own.plus_2 is not None
     along, across, c_ = slope / 2, by_q * (h / 4)[..., None, None], c[..., None, None]
     return replace(
         own, minus=minus, plus=plus, minus_1=own.minus_1 + c_ * (across - along),

@@ -248,7 +248,7 @@ class _Numbers:
     def inverse(self, x: np.ndarray) -> np.ndarray:
         out = np.empty(x.shape, object)
         for i in np.ndindex(x.shape[:-2]):
-            out[i] = self.program.inverse(x[i])
+            out[i] = _array(self.program.inverse(x[i])).reshape(x.shape[-2:])
         return out
 
 

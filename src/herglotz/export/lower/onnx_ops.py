@@ -28,11 +28,6 @@ def common_dtype(node: Any) -> torch.dtype | None:
     return described(node).dtype if described(node).dtype != torch.bool else None
 
 
-def is_within_sum(node: Any) -> bool:
-    """Whether this is |x| on its way into sums, which ONNX has as one operation."""
-    return node.target == aten.abs.default and all(x.target == aten.sum.dim_IntList for x in node.users)
-
-
 def write_slice(w: Writer, node: Any) -> str:
     """x[start:end:step] along one axis."""
     x, axis, start, end, *step = node.args
@@ -94,11 +89,6 @@ def write_transposed(w: Writer, node: Any) -> str:
     axes = list(range(len(described(x).shape)))
     axes[first], axes[second] = axes[second], axes[first]
     return permuted(w, node, axes)
-
-
-def write_permuted(w: Writer, node: Any) -> str:
-    """The axes in another order."""
-    return permuted(w, node, [i % len(node.args[1]) for i in node.args[1]])
 
 
 def permuted(w: Writer, node: Any, axes: list[int]) -> str:
@@ -184,7 +174,7 @@ def write_matmul(w: Writer, node: Any) -> str:
     if len(described(b).shape) == 1:
         require(fixed and free == [True, False], node)
         known = w.known(b)
-        row = w.emit("Unsqueeze", w.name(b), w.integers(0)) if known is None else w.held(known[None])
+        row = w.emit("Unsqueeze", w.name(b), w.integers(0)) if known is None else w.name(known[None])
         return w.emit("Squeeze", w.emit("Gemm", row, w.name(a)), w.integers(0))
     if fixed and free == [True, False]:
         return w.emit("Gemm", transposed(w, b), w.name(a))
@@ -198,7 +188,7 @@ def transposed(w: Writer, x: Any) -> str:
     """A matrix without a batch, its last two axes exchanged."""
     known = w.known(x)
     if known is not None:
-        return w.held(known.mT)
+        return w.name(known.mT)
     axes = list(range(len(described(x).shape)))
     return w.permuted(w.name(x), [*axes[:-2], axes[-1], axes[-2]])
 
@@ -258,8 +248,6 @@ def write_reduced(kind: str) -> Callable[[Writer, Any], str]:
         axes: Any = node.args[1]
         keep = int(bool(node.args[2])) if len(node.args) > 2 else 0
         axes = [axis_of(axis, x) for axis in ([axes] if isinstance(axes, int) else axes)]
-        if is_within_sum(x):
-            return w.emit("ReduceL1", w.name(x.args[0]), w.integers(*axes), keepdims=keep)
         return w.emit(kind, w.name(x), w.integers(*axes), keepdims=keep)
 
     return write
@@ -298,7 +286,7 @@ def write_diagonal(w: Writer, node: Any) -> str:
     require(len(node.args) == 1, node)
     eye = torch.eye(described(x).shape[-1], dtype=described(x).dtype)
     whole = w.emit("Unsqueeze", w.name(x), w.integers(axis_of(-1, node)))
-    return w.emit("Mul", whole, w.held(eye[..., None] if axis_of(-1, node) + 1 < len(described(node).shape) else eye))
+    return w.emit("Mul", whole, w.name(eye[..., None] if axis_of(-1, node) + 1 < len(described(node).shape) else eye))
 
 
 def write_diagonal_of(w: Writer, node: Any) -> str:

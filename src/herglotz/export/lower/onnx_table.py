@@ -46,7 +46,7 @@ def write(w: Writer, program: fx.GraphModule, values: Sequence[Any]) -> list[str
     for node in nodes:
         if node.op == "get_attr":
             w.values[node] = getattr(program, node.target)
-        elif node.op == "call_function" and node.users and node.target not in LATER and not ops.is_within_sum(node):
+        elif node.op == "call_function" and node.users and node.target not in LATER:
             w.values[node] = _translate(w, node)
         elif node.op == "output":
             found: Any = node.args[0]
@@ -136,7 +136,7 @@ TABLE: dict[Any, Callable[[Writer, Any], Any]] = {
     aten.mv.default: ops.write_matmul,
     aten.bmm.default: ops.write_matmul,
     aten.tanh_backward.default: functions.write_tanh_backward,
-    aten.permute.default: ops.write_permuted,
+    aten.permute.default: lambda w, n: ops.permuted(w, n, [i % len(n.args[1]) for i in n.args[1]]),
     aten._to_copy.default: lambda w, n: w.emit("Cast", w.name(n.args[0]), to_=kind_of(described(n).dtype)),
     aten.empty_like.default: lambda w, n: w.like(n, 0),
     aten.unflatten.int: ops.write_unflatten,

@@ -15,8 +15,8 @@ from herglotz.errors import InputError
 
 aten = torch.ops.aten
 NUMPY = {
-    torch.float64: np.float64, torch.float32: np.float32, torch.int64: np.int64, torch.uint8: np.uint8,
-    torch.bool: np.bool_,
+    torch.float64: np.float64, torch.float32: np.float32, torch.int64: np.int64, torch.int32: np.int32,
+    torch.uint8: np.uint8, torch.bool: np.bool_,
 }  # fmt: skip
 
 
@@ -157,16 +157,12 @@ class Writer:
         if behind and known.ndim:
             place = known.ndim - 1 - behind  # of the axis that meets the batch
             known = known[..., None] if place < 0 else known.movedim(place, -1)
-        return self.held(known)
+        return self.name(known)
 
     def rows(self, number: float, shape: Sequence[Any], dtype: torch.dtype) -> str:
         """A number in the axes of a shape that are fixed."""
         fixed = [shape[i] if isinstance(shape[i], int) else 1 for i in order_of(shape)]
         return self.constant(np.full(fixed, number), NUMPY[dtype])
-
-    def held(self, value: Tensor) -> str:
-        """A known tensor as it stands."""
-        return self.constant(value.detach().numpy(), NUMPY[value.dtype])
 
     def stored(self, name: str, shape: Sequence[Any]) -> str:
         """A value whose axes are in the program's order."""
@@ -247,9 +243,6 @@ def described(x: Any) -> Any:
 
 def kind_of(dtype: torch.dtype) -> int:
     """ONNX's number of a dtype."""
-    from onnx import TensorProto
+    from onnx import helper
 
-    return {
-        torch.float64: TensorProto.DOUBLE, torch.float32: TensorProto.FLOAT, torch.int64: TensorProto.INT64,
-        torch.int32: TensorProto.INT32, torch.bool: TensorProto.BOOL, torch.uint8: TensorProto.UINT8,
-    }[dtype]  # fmt: skip
+    return int(helper.np_dtype_to_tensor_dtype(np.dtype(NUMPY[dtype])))

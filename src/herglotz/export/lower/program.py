@@ -219,11 +219,11 @@ class Program:
             total = add(self, total, x)
         return total
 
-    def inverse(self, matrix: np.ndarray) -> np.ndarray:
-        """The inverse of a matrix (n, n) of atoms."""
+    def inverse(self, matrix: np.ndarray) -> list[Ref]:
+        """The inverse of a matrix (n, n) of atoms, row by row."""
         where, n = self.pointer(list(matrix.flat)), len(matrix)
         number = self._append(f"FN_inverse({n}, {where}, @@);", n * n).statement
-        return np.array([Ref(number, i) for i in range(n * n)] + [None], object)[:-1].reshape(n, n)
+        return [Ref(number, i) for i in range(n * n)]
 
     def _append(self, text: str, size: int) -> Ref:
         """The result of another statement, which stands as `@@` in its own text."""

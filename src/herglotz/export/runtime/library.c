@@ -64,16 +64,16 @@ void herglotz_jacobians(long batch, const hz_real *q, const hz_real *p, const hz
 }
 #endif
 
+/* States from two positions; h and u are one a sample. */
 void herglotz_inits(long batch, const hz_real *q0, const hz_real *q1, const hz_real *s0, const hz_real *h,
-    long h_sample, const hz_real *u, long u_sample, hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
+    const hz_real *u, hz_real *p_out, hz_real *s_out, unsigned char *status_out) {
   long b;
   int i;
   (void)u;
-  (void)u_sample;
   for (b = 0; b < batch; b++) {
     hz_state x;
     const int status =
-        15 & hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b * h_sample], hz_WITH_U(u ? u + b * u_sample : 0) &x);
+        15 & hz_init(q0 + b * hz_N, q1 + b * hz_N, s0[b], h[b], hz_WITH_U(u ? u + b * hz_M : 0) &x);
     status_out[b] = (unsigned char)status;
     if (status) continue;
     for (i = 0; i < hz_N; i++) p_out[b * hz_N + i] = x.p[i];
