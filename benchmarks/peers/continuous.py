@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from .networks import Network, Scales, count, fit_rates, gradient, scales_of, split, train
-from .rollouts import Flow, rk4
+from .rollouts import Flow
 from .samples import Samples
 
 WINDOW = 9  # samples of a window of the neural ODE
@@ -144,11 +144,9 @@ def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
 
 
 def integrator(field: Callable[[Tensor], Tensor], h: float, parts: int) -> Callable[[Tensor], Tensor]:
-    """One step of length h: torchdiffeq's fixed-step rk4 where it is installed, else the classical one."""
-    try:
-        from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return lambda y: rk4(field, y, h, parts)
+    """One step of length h, by torchdiffeq's fixed-step rk4."""
+    from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
+
     times = torch.linspace(0.0, h, parts + 1, dtype=torch.float64)
 
     def step(y: Tensor) -> Tensor:
