@@ -62,12 +62,6 @@ def offsets_of(lengths: Sequence[int]) -> tuple[int, ...]:
     return (0, *accumulate(lengths[:-1]))
 
 
-def check_fraction(fraction: float) -> None:
-    """Raise unless 0 < fraction < 1."""
-    if not 0.0 < fraction < 1.0:
-        raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
-
-
 def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
     """Return (trajectory, sample) of a row of the concatenation, both counted from 0."""
     trajectory = bisect_right(offsets, row) - 1

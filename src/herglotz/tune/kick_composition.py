@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -72,11 +71,6 @@ class KickStepper(OneStepMethod):
         """Return how many numbers were fitted."""
         return self.drifts.numel() + self.cosines.numel() + self.sines.numel()
 
-    def to(self, dtype: torch.dtype) -> KickStepper:
-        """Return the stepper in another dtype."""
-        numbers = {name: getattr(self, name).to(dtype) for name in ("drifts", "cosines", "sines")}
-        return replace(self, **numbers)
-
     def kick(self, i: int, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return V_i(q) and V_i′(q), of the shape of q."""
         a, b = self.cosines[i], self.sines[i]
@@ -115,10 +109,6 @@ class KickStepper(OneStepMethod):
         c = torch.exp(-self.rate * self.h + nan)
         status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
         return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(self).items()}
 
 
 def can_kick(model: ContactLagrangian) -> bool:
