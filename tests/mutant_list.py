@@ -78,7 +78,6 @@ MUTANTS = [
     ("scenes/collocation.py", "np.sqrt(weights)", "weights"),
     ("scenes/collocation.py", "2 * lobatto(2 * count - 1)[0].numpy() - 1", "lobatto(2 * count - 1)[0].numpy()"),
     ("scenes/motion.py", "L.D1 + L.D3[..., None] * L.D2, L.L", "L.D1, L.L"),
-    ("scenes/rules.py", "L_d(q1, q0, s0 + x, -h)", "L_d(q1, q0, s0, -h)"),
     ("scenes/rules.py", "h * L(q1, v, s0 + x)", "h * L(q1, v, s0)"),
     ("scenes/parachute.py", "B**2 - 4 * (B - a) * p", "B**2 - 4 * (B + a) * p"),
     ("scenes/linear_drag.py", "h * expm1w(-gamma * h) / (2 * m)", "h * expm1w(gamma * h) / (2 * m)"),

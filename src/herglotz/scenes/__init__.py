@@ -31,7 +31,6 @@ from herglotz.scenes.registry import scene as scene, scene_names as scene_names
 from herglotz.scenes.rigid_body import rigid_body as rigid_body
 from herglotz.scenes.rules import (
     ORDERS as ORDERS,
-    adjoint as adjoint,
     left as left,
     midpoint as midpoint,
     midpoint_heun as midpoint_heun,

@@ -56,10 +56,6 @@ class PrintedParachute:
         s1 = s + (p1 * p1)[..., 0] / (2 * m) - 2 * lam**2 * s_term / m - self.potential(q)
         return q1, p1, s1
 
-    def conformal_factor(self, q1: Tensor) -> Tensor:
-        """The conformal factor 1 − D3H⁺ = 1 − 2λq_{k+1}, shape (...)."""
-        return 1.0 - 2 * self.lam * q1[..., 0]
-
     def orbit(self, q: Tensor, p: Tensor, s: Tensor, steps: int) -> tuple[State, int]:
         """(q, p, s) with the K + 1 points in front, and how many of the steps gave finite numbers in every sample."""
         points = [(q, p, s)]
