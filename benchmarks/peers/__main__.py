@@ -73,15 +73,8 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
 
 def settings(budget: float) -> dict[str, Any]:
     """What every network peer shares."""
-    return {
-        "budget_s": budget,
-        "width": networks.WIDTH,
-        "batch": networks.BATCH,
-        "learning_rate": networks.LEARNING_RATE,
-        "adam_part": networks.ADAM_PART,
-        "patience": networks.PATIENCE,
-        "dtype": "float64",
-    }
+    names = ("WIDTH", "BATCH", "LEARNING_RATE", "ADAM_PART", "PATIENCE")
+    return {"budget_s": budget, **{name.lower(): getattr(networks, name) for name in names}, "dtype": "float64"}
 
 
 def opened(path: Path, budget: float | None) -> dict[str, Any]:
