@@ -74,21 +74,6 @@ def acceleration(L: Tensor, q: Tensor, v: Tensor) -> Tensor:
     return torch.linalg.solve_ex(mass, L_q - (mixed @ v[..., None])[..., 0])[0]
 
 
-class FreeLagrangian:
-    """L(q, v) = E [½|v/σ|² + net(q, v)]."""
-
-    def __init__(self, scales: Scales, generator: torch.Generator):
-        self.scales = scales
-        self.net = Network(scales.q_inputs + len(scales.angles), 1, generator, nn.Softplus())
-        self.parameters = list(self.net.parameters())
-
-    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(v, v̇) at (q, v)."""
-        q, v = q.requires_grad_(), v.requires_grad_()
-        L = (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
-        return v, acceleration(L, q, v)
-
-
 class DeepLagrangian:
     """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate.
 
@@ -129,11 +114,17 @@ class DeepLagrangian:
 
 
 def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
-    """Fit one network L(q, v) to accelerations."""
+    """Fit one network in L(q, v) = E [½|v/σ|² + net(q, v)] to accelerations."""
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of(samples, samples.motion())
-    model = FreeLagrangian(scales, generator)
-    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False)
+    net = Network(scales.q_inputs + samples.dof, 1, generator, nn.Softplus())
+
+    def rates(q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        q, v = q.requires_grad_(), v.requires_grad_()
+        L = (v / scales.v).square().sum(-1) / 2 + net(scales.of_state(q, v))[:, 0]
+        return v, acceleration(L, q, v)
+
+    return fit_rates(rates, net.parameters(), samples, generator, budget, momentum=False)
 
 
 def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
