@@ -43,7 +43,7 @@ class Table:
 
 
 def read_packed(path: PathLike, **columns: Any) -> Trajectories:
-    """Read a table of a suffix of `ARRAYS` like a csv file with the same header; `columns` are those of `read_csv`.
+    """Read a table of a suffix of `ARRAYS` like a csv file with the same header; `columns` are those of `Wanted`.
 
     Raise InputError if the package that reads it is missing, the file is damaged, columns differ in length, or as
     `read_csv`.

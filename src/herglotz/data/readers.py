@@ -10,7 +10,7 @@ from typing import Any
 
 from herglotz.data.checks import check_alike
 from herglotz.data.csv_columns import Names, Wanted
-from herglotz.data.csv_format import read_table, write_csv
+from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
@@ -45,7 +45,7 @@ FORMATS = (
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
         lambda line: line.startswith("%"),
     ),
-    *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_table(path, Wanted(**columns)), True)
+    *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_csv(path, Wanted(**columns)), True)
       for end in (".csv", ".txt", ".tsv", ".dat")),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
@@ -65,7 +65,7 @@ def load(
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
     sensor_scales: Sequence[float] | None = (),  # what one unit of each reading is worth
     like: Trajectories | None = None,  # another recording: columns of the same names mean the same
-    **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
+    **columns: Any,  # of a table: time, coordinates, inputs, drop and group
 ) -> Trajectories:
     """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
 
@@ -87,8 +87,8 @@ def load(
         Another recording, such as `run.data`: columns of a table that have the names of its columns are taken for the
         same, in the same order, and its angles are angles, where nothing else is said.
     **columns
-        Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`; motion=False
-        where inputs alone are needed.
+        Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
+        motion=False where inputs alone are needed.
 
     Returns
     -------
