@@ -45,8 +45,7 @@ FORMATS = (
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
         lambda line: line.startswith("%"),
     ),
-    *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_csv(path, Wanted(**columns)), True)
-      for end in (".csv", ".txt", ".tsv", ".dat")),
+    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat")),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_packed, True),
@@ -186,7 +185,7 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
         if one.first_line(line):
             if wanted and not one.is_table:
                 raise InputError(f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}")
-            return one.read(path, **vars(wanted)) if one.is_table else one.read(path)
+            return one.read(path, wanted) if one.is_table else one.read(path)
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
     known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
     raise InputError(f"{path}: cannot read {what}; known formats: {known}")
