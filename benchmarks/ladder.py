@@ -13,49 +13,34 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
-from torch import Tensor
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from herglotz.data import Trajectories, simulate
-from herglotz.scenes import scene
+from herglotz.scenes import Scene, scene
+from herglotz.scenes.natural import natural_scene
 from herglotz.training import select
 from herglotz.training.selection import CANDIDATES
 
 NOISE = 1e-3  # of the motion's size
 
 
-@dataclass(frozen=True)
-class CoupledMasses:
-    """Two unit masses, three springs, a damper on the second one only: q̈ = −K q − D q̇, exactly by exp(hA).
+SPRINGS = torch.tensor([[1.6, -0.6], [-0.6, 2.0]], dtype=torch.float64)  # wall 1.0 mass 0.6 mass 1.4 wall
+
+
+def coupled_masses(*friction: float) -> Scene:
+    """Two unit masses, three springs and a damper on each mass: q̈ = −K q − D q̇.
 
     No single rate γ describes it, nor a damping of the whole by position: each joint has its own friction.
     """
-
-    friction: tuple[float, float]
-    springs: tuple[float, float, float] = (1.0, 0.6, 1.4)
-    name = "coupled_masses"
-    dof = 2
-    coordinates = ("x", "y")
-    units = ("m", "m")
-    angles = (False, False)
-    q_range = (-1.0, 1.0)
-    v_range = (-1.0, 1.0)
-
-    def flow(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(q, p) a time h later; the action is not needed for positions and is left as it is."""
-        a, b, c = self.springs
-        K = torch.tensor([[a + b, -b], [-b, b + c]], dtype=q.dtype)
-        D = torch.diag(torch.tensor(self.friction, dtype=q.dtype))
-        A = torch.cat([torch.cat([torch.zeros_like(K), torch.eye(2, dtype=q.dtype)], 1), torch.cat([-K, -D], 1)])
-        y = torch.cat([q, p], -1) @ torch.linalg.matrix_exp(h * A).mT
-        return y[..., :2], y[..., 2:], s
-
-    def momentum(self, q: Tensor, v: Tensor, s: Tensor) -> Tensor:
-        """Unit masses: p = v."""
-        del q, s
-        return v
+    dampers = SPRINGS.new_tensor(friction)
+    return natural_scene(
+        lambda q: 0.5 * (q @ SPRINGS * q).sum(-1), lambda q: q @ SPRINGS, 0.0,
+        external=lambda q, v: -dampers * v,  # noqa: ARG005
+        name="coupled_masses", description="", coordinates=("x", "y"), units=("m", "m"), parameters={},
+        q_range=(-1.0, 1.0), v_range=(-1.0, 1.0), h=0.3,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -63,28 +48,28 @@ class Case:
     """A scene, the level that it needs, and the step at which it is sampled."""
 
     level: str
-    what: object
+    what: Scene
     h: float
 
 
 # With the step of each: thirteen to thirty-one samples a period, where there is one.
 CASES = {
     "undamped pendulum": Case("conservative", scene("damped_pendulum", gamma=0.0), 0.2),
-    "undamped masses": Case("conservative", CoupledMasses((0.0, 0.0)), 0.3),
+    "undamped masses": Case("conservative", coupled_masses(0.0, 0.0), 0.3),
     "oscillator": Case("linear", scene("damped_oscillator"), 0.2),
     "pendulum": Case("linear", scene("damped_pendulum"), 0.2),
     "parachute": Case("affine", scene("parachute"), 0.2),
     "quadratic drag": Case("affine", scene("quadratic_drag", lam=0.1), 0.2),
-    "one damper": Case("forced", CoupledMasses((0.0, 0.4)), 0.3),
-    "two dampers": Case("forced", CoupledMasses((0.5, 0.1)), 0.3),
+    "one damper": Case("forced", coupled_masses(0.0, 0.4), 0.3),
+    "two dampers": Case("forced", coupled_masses(0.5, 0.1), 0.3),
 }
 
 
 def sampled(case: Case) -> Trajectories:
     """8 trajectories of 61 positions with noise of a thousandth of the motion's size."""
-    clean = simulate(case.what, trajectories=8, steps=60, h=case.h)  # pyright: ignore[reportArgumentType]
+    clean = simulate(case.what, trajectories=8, steps=60, h=case.h)
     noise = NOISE * float((clean.q - clean.q.mean(0)).square().mean().sqrt())
-    return simulate(case.what, trajectories=8, steps=60, h=case.h, noise=noise)  # pyright: ignore[reportArgumentType]
+    return simulate(case.what, trajectories=8, steps=60, h=case.h, noise=noise)
 
 
 def table(rows: list[dict]) -> str:

@@ -23,6 +23,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks import harness
 from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian
+from herglotz.plots.parachute import landing
 from herglotz.scenes import scene
 from herglotz.scenes.reference import reference_flow
 from herglotz.scenes.scene import Scene
@@ -149,12 +150,8 @@ def falling(seed: int) -> dict:
     with torch.no_grad():
         speed = stepper.rollout(*start, h=h, steps=800).q.diff(dim=1)[0, -1, 0] / h
         landed = float(stepper.rollout(*start, h=h, steps=400, events=(Event(lambda x: x.q[..., 0]),)).events[0].t) + h
-    low, high = 1.0, 30.0
-    for _ in range(60):
-        middle = (low + high) / 2
-        low, high = (middle, high) if float(of.flow(q, p, s, middle)[0]) > 0 else (low, middle)
-    exact = -((of.parameters["g"] / of.parameters["lam"]) ** 0.5)
-    return {"terminal": abs(float(speed) / exact - 1), "landing": abs(landed / low - 1), **cost}
+    exact, lands = -((of.parameters["g"] / of.parameters["lam"]) ** 0.5), landing(float(q), float(v))[0]
+    return {"terminal": abs(float(speed) / exact - 1), "landing": abs(landed / lands - 1), **cost}
 
 
 def braking(seed: int) -> dict:

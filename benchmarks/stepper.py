@@ -116,7 +116,7 @@ def against_jax(quick: bool) -> list[Row]:
         what = f"JAX scan / C, n=2, {width}x2, {_short(dtype)}, B={batch}"
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            jax = jax_rollout(model, 2)
+            jax = jax_rollout(model)
         if jax is None:
             rows.append(row(what, least=least, note="jax is not installed"))
             continue

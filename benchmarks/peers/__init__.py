@@ -41,7 +41,7 @@ PEERS = {
                  "hold several; both double pendulums were measured before named terms were tried; stops by itself"),
     "neural_ode": Peer("neural ODE", train_neural_ode, "either",
                        "Chen et al. 2018: v̇ = net(q, v) by torchdiffeq (rk4), error over windows of 9 samples; without "
-                       "velocities the one at the start of each window is trained"),
+                       "velocities the one at the start of each window is trained", "torchdiffeq"),
     "mlp": Peer("MLP step map", train_mlp, "positions",
                 "net of (q1, (q1 − q0)/h) for the second difference, one step"),
     "hnn": Peer("HNN", train_hnn, "velocities", "Greydanus et al. 2019: net H(q, p), rates; cannot dissipate"),

@@ -38,12 +38,8 @@ BUDGET = 10.0  # seconds of processor time of a network peer's fit
 LIMIT = 900  # seconds of processor time after which a cell is given up
 
 
-class _OutOfTimeError(Exception):
-    """A cell took longer than `LIMIT`."""
-
-
 def _out_of_time(*_: Any) -> None:
-    raise _OutOfTimeError
+    raise TimeoutError
 
 
 def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> dict[str, Any]:
@@ -65,7 +61,7 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
             model = peer.train(samples, seed, budget)
         out |= {"seconds": time.process_time() - began, "parameters": model.parameters}
         return out | problem.judge(model, exact)
-    except _OutOfTimeError:
+    except TimeoutError:
         error = f"not done in {LIMIT} s"
     except (RuntimeError, ValueError, ArithmeticError, InputError) as problem_met:
         error = f"{type(problem_met).__name__}: {str(problem_met).splitlines()[0][:80]}"
@@ -77,15 +73,8 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
 
 def settings(budget: float) -> dict[str, Any]:
     """What every network peer shares."""
-    return {
-        "budget_s": budget,
-        "width": networks.WIDTH,
-        "batch": networks.BATCH,
-        "learning_rate": networks.LEARNING_RATE,
-        "adam_part": networks.ADAM_PART,
-        "patience": networks.PATIENCE,
-        "dtype": "float64",
-    }
+    names = ("WIDTH", "BATCH", "LEARNING_RATE", "ADAM_PART", "PATIENCE")
+    return {"budget_s": budget, **{name.lower(): getattr(networks, name) for name in names}, "dtype": "float64"}
 
 
 def opened(path: Path, budget: float | None) -> dict[str, Any]:

@@ -26,7 +26,7 @@ import torch
 from torch import Tensor, nn
 
 from .networks import Network, Scales, count, fit_rates, gradient, scales_of, split, train
-from .rollouts import Flow, rk4
+from .rollouts import Flow
 from .samples import Samples
 
 WINDOW = 9  # samples of a window of the neural ODE
@@ -74,21 +74,6 @@ def acceleration(L: Tensor, q: Tensor, v: Tensor) -> Tensor:
     return torch.linalg.solve_ex(mass, L_q - (mixed @ v[..., None])[..., 0])[0]
 
 
-class FreeLagrangian:
-    """L(q, v) = E [½|v/σ|² + net(q, v)]."""
-
-    def __init__(self, scales: Scales, generator: torch.Generator):
-        self.scales = scales
-        self.net = Network(scales.q_inputs + len(scales.angles), 1, generator, nn.Softplus())
-        self.parameters = list(self.net.parameters())
-
-    def rates(self, q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-        """(v, v̇) at (q, v)."""
-        q, v = q.requires_grad_(), v.requires_grad_()
-        L = (v / self.scales.v).square().sum(-1) / 2 + self.net(self.scales.of_state(q, v))[:, 0]
-        return v, acceleration(L, q, v)
-
-
 class DeepLagrangian:
     """½ vᵀM(q)v − V(q) with M = CCᵀ + ε, and the friction −d v of each coordinate.
 
@@ -129,11 +114,17 @@ class DeepLagrangian:
 
 
 def train_lnn(samples: Samples, seed: int, budget: float) -> Flow:
-    """Fit one network L(q, v) to accelerations."""
+    """Fit one network in L(q, v) = E [½|v/σ|² + net(q, v)] to accelerations."""
     generator = torch.Generator().manual_seed(seed)
     scales = scales_of(samples, samples.motion())
-    model = FreeLagrangian(scales, generator)
-    return fit_rates(model.rates, model.parameters, samples, generator, budget, momentum=False)
+    net = Network(scales.q_inputs + samples.dof, 1, generator, nn.Softplus())
+
+    def rates(q: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+        q, v = q.requires_grad_(), v.requires_grad_()
+        L = (v / scales.v).square().sum(-1) / 2 + net(scales.of_state(q, v))[:, 0]
+        return v, acceleration(L, q, v)
+
+    return fit_rates(rates, net.parameters(), samples, generator, budget, momentum=False)
 
 
 def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
@@ -144,11 +135,9 @@ def train_delan(samples: Samples, seed: int, budget: float) -> Flow:
 
 
 def integrator(field: Callable[[Tensor], Tensor], h: float, parts: int) -> Callable[[Tensor], Tensor]:
-    """One step of length h: torchdiffeq's fixed-step rk4 where it is installed, else the classical one."""
-    try:
-        from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        return lambda y: rk4(field, y, h, parts)
+    """One step of length h, by torchdiffeq's fixed-step rk4."""
+    from torchdiffeq import odeint  # pyright: ignore[reportMissingImports]
+
     times = torch.linspace(0.0, h, parts + 1, dtype=torch.float64)
 
     def step(y: Tensor) -> Tensor:

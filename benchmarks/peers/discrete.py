@@ -96,38 +96,20 @@ def train_discrete_lagrangian(samples: Samples, seed: int, budget: float, *, for
     return ThreePoint(model.residual, count(model.weights))
 
 
-class StepMap:
-    """q2 = 2q1 − q0 + h² σ_a net(q1, (q1 − q0)/h): a network that predicts the second difference."""
+def train_mlp(samples: Samples, seed: int, budget: float) -> ThreePoint:
+    """One-step least squares of a network for the second difference: q2 = 2q1 − q0 + h² σ_a net(q1, (q1 − q0)/h)."""
+    generator, h = torch.Generator().manual_seed(seed), samples.h
+    scales = scales_of_triples(samples)
+    net = Network(scales.q_inputs + samples.dof, samples.dof, generator)
 
-    def __init__(self, samples: Samples, generator: torch.Generator):
-        self.h, self.scales = samples.h, scales_of_triples(samples)
-        self.net = Network(self.scales.q_inputs + samples.dof, samples.dof, generator)
-        self.parameters = count(list(self.net.parameters()))
-
-    def second_difference(self, q0: Tensor, q1: Tensor) -> Tensor:
-        """Predicted (q2 − 2q1 + q0) / (h² σ_a), (B, n)."""
-        return self.net(self.scales.of_state(q1, (q1 - q0) / self.h))
-
-    def rollout(self, q0: Tensor, q1: Tensor, steps: int, exact: Tensor | None = None) -> Tensor:  # noqa: ARG002
-        """See `rollouts.Predictor`."""
-        out = [q0, q1]
-        with torch.no_grad():
-            for _ in range(steps):
-                bend = self.h**2 * self.scales.a * self.second_difference(out[-2], out[-1])
-                out.append(2 * out[-1] - out[-2] + bend)
-        return torch.stack(out, 1)
-
-
-def train_mlp(samples: Samples, seed: int, budget: float) -> StepMap:
-    """One-step least squares of the second difference."""
-    generator = torch.Generator().manual_seed(seed)
-    model = StepMap(samples, generator)
-    q0, q1, q2 = samples.triples()
-    target = (q2 - 2 * q1 + q0) / (samples.h**2 * model.scales.a)
-    rows, held = split(len(q0), generator)
+    def residual(q0: Tensor, q1: Tensor, q2: Tensor) -> Tensor:
+        return net(scales.of_state(q1, (q1 - q0) / h)) - (q2 - 2 * q1 + q0) / (h**2 * scales.a)
 
     def loss(i: Tensor) -> Tensor:
-        return (model.second_difference(q0[i], q1[i]) - target[i]).square().mean()
+        return residual(q0[i], q1[i], q2[i]).square().mean()
 
-    train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), list(model.net.parameters()), generator, budget)
-    return model
+    q0, q1, q2 = samples.triples()
+    rows, held = split(len(q0), generator)
+    weights = list(net.parameters())
+    train(lambda i: loss(rows[i]), len(rows), lambda: loss(held), weights, generator, budget)
+    return ThreePoint(residual, count(weights))

@@ -148,6 +148,7 @@ def _pendulum_problem(h: float, samples: Any, tests: Any, what: str) -> Problem:
     return Problem(f"damped pendulum, {what}; {STEPS} steps from 100 unseen starts", samples, judge)
 
 
+LINKS = scene("double_pendulum", gamma=0.0)  # in absolute angles, without friction
 # m = ℓ = 1, g = 9.81, viscous 0.1 at both joints, over the first arm's inertia 2: see `known_equation`.
 DOUBLE = torch.tensor([[0.5, 0.5, 9.81, 4.905, 0.05, 0.05]], dtype=torch.float64)
 
@@ -165,9 +166,8 @@ def double_motion(q: Tensor, v: Tensor, h: float, samples: int) -> tuple[Tensor,
 
 def double_momentum(q: Tensor, v: Tensor) -> Tensor:
     """Momentum ∂L/∂v of the joint angles, (..., 2)."""
-    (w1, w2), C = v.cumsum(-1).unbind(-1), q[..., 1].cos()
-    p1, p2 = 2 * w1 + C * w2, C * w1 + w2
-    return torch.stack([p1 + p2, p2], -1)
+    p = LINKS.momentum(q.cumsum(-1), v.cumsum(-1), q[..., 0])
+    return torch.stack([p.sum(-1), p[..., 1]], -1)
 
 
 def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
@@ -192,12 +192,8 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
         return Samples(tuple(q), h, (True, True), False, tuple(Motion(*x) for x in zip(*parts, strict=True)))
 
     def energy(q: Tensor) -> Tensor:
-        q, v = _middle(q, h)
-        q = q.cumsum(-1)
-        drop = 1 - q.cos()
-        w = v.cumsum(-1)
-        kinetic = w[..., 0] ** 2 + w[..., 1] ** 2 / 2 + w[..., 0] * w[..., 1] * (q[..., 0] - q[..., 1]).cos()
-        return kinetic + 9.81 * (2 * drop[..., 0] + drop[..., 1])
+        (q, v), s = (x.cumsum(-1) for x in _middle(q, h)), torch.zeros((), dtype=q.dtype)
+        return LINKS.hamiltonian(q, LINKS.momentum(q, v, s), s)
 
     def judge(model: Predictor, exact: bool) -> Metrics:
         q, v = runs(1000, steps + 2)

@@ -6,7 +6,6 @@ import math
 import unicodedata
 from bisect import bisect_right
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
@@ -22,36 +21,23 @@ SMALLEST, LARGEST = 1e-50, 1e50  # of numbers that are fitted: cubes and sums of
 DTYPES = (torch.float32, torch.float64)
 
 
-@dataclass(frozen=True)
-class Labels:
-    """What the coordinates and the time are called, and which coordinates are angles."""
-
-    names: tuple[str, ...]
-    units: tuple[str, ...]
-    angles: tuple[bool, ...]
-    time_unit: str
-
-
 def unnamed(n: int) -> tuple[str, ...]:
     """Names of n coordinates that have none: q, or q1, q2, … as a model's features number them."""
     return ("q",) if n == 1 else tuple(f"q{i + 1}" for i in range(n))
 
 
-def check(
-    where: str,  # begins every message
-    arrays: Mapping[str, Tensor],  # t (N,), q (N, n) and those of s, p, u that are known
-    lengths: tuple[int, ...],  # samples of each trajectory
-    labels: Labels,
-) -> None:
-    """Check types, shapes, labels and values of a set of trajectories, in this order.
+def check(data: Any) -> None:
+    """Check types, shapes, labels and values of `Trajectories`, in this order.
 
     InputError names the field, the trajectory and the sample (both counted from 0), the value and the remedy.
     """
+    where = data.source or "trajectories"
+    arrays = {name: x for name in ARRAYS if (x := getattr(data, name)) is not None}
     _check_tensors(where, arrays)
     _check_shapes(where, arrays)
-    _check_lengths(where, lengths, len(arrays["t"]))
-    _check_labels(where, labels, arrays["q"].shape[1])
-    offsets = offsets_of(lengths)
+    _check_lengths(where, data.lengths, len(arrays["t"]))
+    _check_labels(where, data, arrays["q"].shape[1])
+    offsets = offsets_of(data.lengths)
     for name, x in arrays.items():
         _check_finite(where, offsets, name, x)
     _check_time(where, offsets, arrays["t"])
@@ -60,12 +46,6 @@ def check(
 def offsets_of(lengths: Sequence[int]) -> tuple[int, ...]:
     """Row of the concatenation at which each trajectory starts."""
     return (0, *accumulate(lengths[:-1]))
-
-
-def check_fraction(fraction: float) -> None:
-    """Raise unless 0 < fraction < 1."""
-    if not 0.0 < fraction < 1.0:
-        raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
 
 
 def locate(offsets: tuple[int, ...], row: int) -> tuple[int, int]:
@@ -120,7 +100,7 @@ def _check_lengths(where: str, lengths: tuple[int, ...], samples: int) -> None:
         raise InputError(f"{where}: lengths add up to {sum(lengths)} but t has {samples} samples; correct the lengths")
 
 
-def _check_labels(where: str, labels: Labels, n: int) -> None:
+def _check_labels(where: str, labels: Any, n: int) -> None:
     for field in ("names", "units", "angles"):
         entries = getattr(labels, field)
         if len(entries) != n:

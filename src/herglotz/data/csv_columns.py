@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from herglotz.data.checks import Labels
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -261,37 +260,32 @@ ANGULAR = re.compile(r"(theta|phi|psi|angle|alpha|beta)(_?\d+|_.*)?", re.I)  # n
 LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
 
 
-def column_table(
-    columns: Sequence[tuple[str, str, str]],  # name, role and unit of each column, as it was read
-    labels: Labels,  # of what was made of them
-    source: str,
-    notes: Sequence[str] = (),
-) -> str:
-    """Return a line a column: its role, and its unit with the conversion that was made; then the notes.
+def column_table(data: Any) -> str:
+    """Return of `Trajectories` a line a column: its role, its unit with the conversion that was made; then the notes.
 
     Of more than `LISTED` columns the first and the last ones are shown, and the number of the others.
     """
-    rows = [("column", "is taken for", "unit"), *column_rows(columns, labels)]
+    rows = [("column", "is taken for", "unit"), *column_rows(data)]
     left = len(rows) - 1 - LISTED
     if left > 0:
         rows[1 + LISTED // 2 : 1 + LISTED // 2 + left] = [("…", f"{left} more", "")]
     widths = [max(len(row[k]) for row in rows) for k in range(2)]
     lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
-    return "\n".join([f"{source or 'table'}:", *lines, *(f"  {note}" for note in notes)])
+    return "\n".join([f"{data.source or 'table'}:", *lines, *(f"  {note}" for note in data.notes)])
 
 
-def column_rows(columns: Sequence[tuple[str, str, str]], labels: Labels) -> list[tuple[str, str, str]]:
-    """Name, role and unit of each column, in words, after all that was said of it and made of it."""
-    now = dict(zip(labels.names, zip(labels.units, labels.angles, strict=True), strict=True))
+def column_rows(data: Any) -> list[tuple[str, str, str]]:
+    """Name, role and unit of each column of `Trajectories`, in words, after all that was said of it and made of it."""
+    now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
     rows = []
-    for name, role, unit in columns:
+    for name, role, unit in data.columns:
         if role == "coordinate" and name in now:
             role = "angle" if now[name][1] else role
             unit = _converted(unit, now[name][0])
             if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
                 unit = f"- (an angle in rad? --angles {name})"
         elif role == "time":
-            unit = _converted(unit, labels.time_unit) if unit else f"- (taken for {labels.time_unit})"
+            unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
         rows.append((name, role, unit or "-"))
     return rows
 

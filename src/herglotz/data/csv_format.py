@@ -13,7 +13,7 @@ from typing import TextIO
 import numpy as np
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
-from herglotz.data.csv_columns import Columns, Names, Wanted, assign, is_number
+from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.csv_dialect import cells_of, header_cells, in_commas
 from herglotz.data.files import PathLike, read_lines, write_atomically
 from herglotz.data.rows import MISSING, SHOWN, number, number_or_none, quote
@@ -27,17 +27,8 @@ LONG = 100_000  # characters of a row of plain numbers
 SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs before they act, and what sensors read
 
 
-def read_csv(
-    path: PathLike,
-    *,
-    time: str | None = None,  # name of the time column; left out: t, time, timestamp or datetime
-    coordinates: Names | None = None,  # left out: every column without another role
-    inputs: Names | None = None,  # left out: those called u, force, torque, ...; () for none
-    drop: Names = (),  # columns to leave aside
-    group: str | None = None,  # column that numbers the trajectories; left out: trajectory or trial
-    angles: Names | None = None,  # coordinates that are angles; left out: those in rad; () for none
-) -> Trajectories:
-    """Read trajectories from a csv file (UTF-8).
+def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
+    """Read trajectories from a csv file (UTF-8) whose columns have the wanted roles, and others by their names.
 
     Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
     which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
@@ -66,13 +57,6 @@ def read_csv(
     InputError
         Naming file, row (line of the file, from 1), column, value and remedy.
     """
-    wanted = Wanted(time, coordinates, inputs, drop, group)
-    found = read_table(path, wanted)
-    return found if angles is None else found.with_angles(angles)
-
-
-def read_table(path: PathLike, wanted: Wanted) -> Trajectories:
-    """Read a csv file whose columns have the wanted roles, and others by their names."""
     return _read_numbers(Path(path), wanted) or _read_rows(Path(path), wanted)
 
 
@@ -145,7 +129,7 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
     `comments` become lines that start with #. A coordinate in rad that is not an angle is written too, although
-    `read_csv` reads it as an angle unless it is given `angles=()`. Raise InputError if a coordinate's name or a unit
+    `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
     cannot stand in the header (it has a comma, or means another column).
     """
     q = trajectories.names

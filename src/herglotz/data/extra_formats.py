@@ -42,14 +42,14 @@ class Table:
         return self.columns[name]
 
 
-def read_packed(path: PathLike, **columns: Any) -> Trajectories:
-    """Read a table of a suffix of `ARRAYS` like a csv file with the same header; `columns` are those of `read_csv`.
+def read_packed(path: PathLike, wanted: Wanted) -> Trajectories:
+    """Read a table of a suffix of `ARRAYS` like a csv file with the same header.
 
     Raise InputError if the package that reads it is missing, the file is damaged, columns differ in length, or as
     `read_csv`.
     """
     every = ARRAYS[Path(path).suffix.lower()](path)  # of each recording
-    return Trajectories.cat(from_frame(Table(Path(path), one), Wanted(**columns), Path(path)) for one in every)
+    return Trajectories.cat(from_frame(Table(Path(path), one), wanted, Path(path)) for one in every)
 
 
 def _parquet(path: PathLike) -> list[dict[str, np.ndarray]]:

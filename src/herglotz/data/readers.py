@@ -10,7 +10,7 @@ from typing import Any
 
 from herglotz.data.checks import check_alike
 from herglotz.data.csv_columns import Names, Wanted
-from herglotz.data.csv_format import read_table, write_csv
+from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
@@ -45,8 +45,7 @@ FORMATS = (
         "Schmidt & Lipson, first line '% o v' or '% x v' (.txt)", ".txt", read_schmidt_lipson, False,
         lambda line: line.startswith("%"),
     ),
-    *(Format(f"t[s],q[rad],... ({end})", end, lambda path, **columns: read_table(path, Wanted(**columns)), True)
-      for end in (".csv", ".txt", ".tsv", ".dat")),
+    *(Format(f"t[s],q[rad],... ({end})", end, read_csv, True) for end in (".csv", ".txt", ".tsv", ".dat")),
     Format("columns as in csv (.parquet)", ".parquet", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".h5", read_packed, True),
     Format("datasets t, q, ... (.h5, .hdf5)", ".hdf5", read_packed, True),
@@ -65,7 +64,7 @@ def load(
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
     sensor_scales: Sequence[float] | None = (),  # what one unit of each reading is worth
     like: Trajectories | None = None,  # another recording: columns of the same names mean the same
-    **columns: Any,  # of a table: time, coordinates, inputs, drop and group, as in `read_csv`
+    **columns: Any,  # of a table: time, coordinates, inputs, drop and group
 ) -> Trajectories:
     """Read trajectories from any of `FORMATS`, and say what each column of a table was taken for.
 
@@ -87,8 +86,8 @@ def load(
         Another recording, such as `run.data`: columns of a table that have the names of its columns are taken for the
         same, in the same order, and its angles are angles, where nothing else is said.
     **columns
-        Of a table: time, coordinates, inputs, drop and group, each by column names, as in `read_csv`; motion=False
-        where inputs alone are needed.
+        Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
+        motion=False where inputs alone are needed.
 
     Returns
     -------
@@ -186,7 +185,7 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
         if one.first_line(line):
             if wanted and not one.is_table:
                 raise InputError(f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}")
-            return one.read(path, **vars(wanted)) if one.is_table else one.read(path)
+            return one.read(path, wanted) if one.is_table else one.read(path)
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
     known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
     raise InputError(f"{path}: cannot read {what}; known formats: {known}")

@@ -16,12 +16,12 @@ from herglotz.errors import InputError
 HEADER = re.compile(r"%\s*([ox]\d*(?:\s+[ox]\d*)*)((?:\s+[va]\d*)*)\s*")
 
 
-def read_schmidt_lipson(path: PathLike, *, time_unit: str = "1") -> Trajectories:
+def read_schmidt_lipson(path: PathLike) -> Trajectories:
     """Read one of the supplementary data files: `% o v` or `% x v`, then rows `trial t coordinate v`.
 
     A coordinate `o` is an angle in rad, here named `theta`; `x` is a position in pixels. Trials become trajectories.
-    The files give no unit of time (`real_linear_h_1` is in s, `real_pend_h_1` in the video's own unit): pass
-    `time_unit` if you know it. Files of two coordinates (`% o1 o2 v1 v2`) follow the same pattern and are read too.
+    The files give no unit of time (`real_linear_h_1` is in s, `real_pend_h_1` in the video's own unit). Files of two
+    coordinates (`% o1 o2 v1 v2`) follow the same pattern and are read too.
 
     Velocities (and accelerations) are left aside: in `real_pend_h_1` the column `v` is 0.954 times the true dq/dt,
     because it was smoothed, and a stepper is learned from positions alone.
@@ -58,4 +58,4 @@ def read_schmidt_lipson(path: PathLike, *, time_unit: str = "1") -> Trajectories
     columns = Columns(names, units, time=1, q=tuple(range(2, len(labels))), trajectory=0)
     trials = [f"{row[0]:g}" for row in numbers]
     found = from_table(path, columns, [at for at, _ in rows[1:]], trials, [row[1:] for row in numbers])
-    return replace(found, time_unit=time_unit, columns=())  # the format, not a header, says what each column is
+    return replace(found, time_unit="1", columns=())  # the format, not a header, says what each column is

@@ -14,24 +14,14 @@ from herglotz.errors import InputError, refuse
 
 
 def measured(
-    data: Trajectories, zeros: Sequence[float] | None = (), scales: Sequence[float] | None = ()
+    data: Trajectories,  # readings, in the units of their columns
+    zeros: Sequence[float] | None = (),  # n numbers, in degrees where the table has degrees; empty or None: 0
+    scales: Sequence[float] | None = (),  # what one unit of each reading is worth, n numbers; empty or None: 1
 ) -> Trajectories:
     """The positions q = scale · (y − zero) of readings y; momenta and the action stay as they are recorded.
 
-    Parameters
-    ----------
-    data
-        Readings, in the units of their columns.
-    zeros
-        What each sensor reads where its coordinate is 0, in degrees where the table has degrees: n numbers or, of B
-        recordings that differ, B · n numbers, recording after recording; empty or None: 0.
-    scales
-        What one unit of each reading is worth, n numbers (or B · n); empty or None: 1.
-
-    Raises
-    ------
-    InputError
-        If there is another number of them, one is not finite, or a scale is 0.
+    B recordings that differ have B · n numbers, recording after recording. Raise InputError if there is another number
+    of them, one is not finite, or a scale is 0.
     """
     read, worth = ([] if x is None else np.atleast_1d(x).tolist() for x in (zeros, scales))
     if not read and not worth:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import torch
@@ -98,11 +97,21 @@ def simulate(
     q, p, s = _roll(scene, q0, v0, steps, h, u)
     q = q + noise * torch.randn(q.shape, generator=generator, dtype=q.dtype)
     keep = torch.stack([_kept(steps + 1, gaps, generator) for _ in range(trajectories)])  # (B, steps + 1) bool
-    t = (h * torch.arange(steps + 1, dtype=torch.float64)).expand(trajectories, -1)
-    found = _sampled(scene, t, q, keep, f"simulate({scene.name}, h={h:g}, seed={seed})")
-    if u is not None:
-        found = replace(found, u=torch.cat([_mean_inputs(u, one) for one in keep]), hold="zero")
-    return (replace(found, s=s[keep], p=p[keep]) if keep_state else found).to(dtype=dtype)
+    whole = Trajectories(
+        (h * torch.arange(steps + 1, dtype=torch.float64)).repeat(trajectories),
+        q.flatten(0, 1),
+        (steps + 1,) * trajectories,
+        names=tuple(scene.coordinates),
+        units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
+        angles=tuple(scene.angles),
+        s=s.flatten() if keep_state else None,
+        p=p.flatten(0, 1) if keep_state else None,
+        u=None if u is None else u.repeat(trajectories, 1),
+        hold="" if u is None else "zero",
+        time_unit=getattr(scene, "time_unit", "s"),
+        source=f"simulate({scene.name}, h={h:g}, seed={seed})",
+    )
+    return whole.keep(keep.flatten()).to(dtype=dtype)
 
 
 def _roll(scene: Any, q: Tensor, v: Tensor, steps: int, h: float, u: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
@@ -123,28 +132,6 @@ def _roll(scene: Any, q: Tensor, v: Tensor, steps: int, h: float, u: Tensor | No
             states.append((q, p, s))
     qs, ps, ss = zip(*states, strict=True)
     return torch.stack(qs, 1), torch.stack(ps, 1), torch.stack(ss, 1)
-
-
-def _sampled(scene: Scene, t: Tensor, q: Tensor, keep: Tensor, source: str) -> Trajectories:
-    """The samples that are kept (B, steps + 1) of t (B, steps + 1) and q (B, steps + 1, n), as the scene calls them."""
-    return Trajectories(
-        t[keep],
-        q[keep],
-        tuple(keep.sum(1).tolist()),
-        names=tuple(scene.coordinates),
-        units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
-        angles=tuple(scene.angles),
-        time_unit=getattr(scene, "time_unit", "s"),
-        source=source,
-    )
-
-
-def _mean_inputs(u: Tensor, keep: Tensor) -> Tensor:
-    """Return the mean input from each kept sample to the next, (kept, m); the last sample keeps its own input."""
-    at = keep.nonzero()[:, 0]
-    total = torch.cat([torch.zeros_like(u[:1]), u.cumsum(0)])
-    means = (total[at[1:]] - total[at[:-1]]) / (at[1:] - at[:-1])[:, None]
-    return torch.cat([means, u[at[-1:]]])
 
 
 def _kept(samples: int, gaps: int, generator: torch.Generator) -> Tensor:

@@ -42,11 +42,6 @@ def spikes(data: Trajectories) -> Tensor:
     return found
 
 
-def without(data: Trajectories, dropped: Tensor) -> Trajectories:
-    """Return the trajectories without the samples that `dropped`, (N,) bool, marks; never a trajectory's first one."""
-    return data.keep(~dropped) if bool(dropped.any()) else data
-
-
 def _worst(t: Tensor, q: Tensor, size: Tensor, run: int) -> Tensor:
     """Return the runs of `run` spikes that are the worst among their neighbours, (N,) bool."""
     window = 2 * BESIDE + run

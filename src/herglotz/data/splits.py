@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import MIN_SAMPLES, check_fraction, offsets_of
+from herglotz.data.checks import MIN_SAMPLES, offsets_of
 from herglotz.errors import InputError
 
 RUN = 200  # samples in a row of a part of a trajectory, at least
@@ -24,7 +24,8 @@ def time_split(
     Raise InputError if the fraction is not inside (0, 1), or a part of any trajectory would have fewer than three
     samples.
     """
-    check_fraction(fraction)
+    if not 0.0 < fraction < 1.0:
+        raise InputError(f"fraction must lie between 0 and 1, got {fraction}; for example 2/3 trains on two thirds")
     cuts = tuple(round(fraction * length) for length in lengths)
     rest = tuple(length - cut for cut, length in zip(cuts, lengths, strict=True))
     for b, (cut, left) in enumerate(zip(cuts, rest, strict=True)):

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from herglotz.data.checks import ARRAYS, DTYPES, Labels, check, check_alike, offsets_of, unnamed
+from herglotz.data.checks import ARRAYS, DTYPES, check, check_alike, offsets_of, unnamed
 from herglotz.data.csv_columns import column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
-from herglotz.data.windows import Steps, Triples, steps, triples, unwrap
+from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import InputError, refuse
 
 DEGREES = ("deg", "°", "degree", "degrees")
@@ -67,9 +67,8 @@ class Trajectories:
     notes: tuple[str, ...] = ()  # on reading the table: its separators, rows left out
 
     def __post_init__(self) -> None:
-        labels = Labels(self.names, self.units, self.angles, self.time_unit)
         check_arrival(self.source or "trajectories", self.arrival)
-        check(self.source or "trajectories", self._map(lambda x: x), self.lengths, labels)
+        check(self)
 
     @classmethod
     def of(
@@ -170,7 +169,8 @@ class Trajectories:
 
     def steps(self) -> Steps:
         """Return all N - B steps, with their trajectory and the row they start from."""
-        return steps(self.t, self.trajectory)
+        index = (self.trajectory[1:] == self.trajectory[:-1]).nonzero()[:, 0]
+        return Steps(self.t[index + 1] - self.t[index], self.trajectory[index], index)
 
     def inputs_of_steps(self, row: Tensor | None = None, part: Tensor | None = None) -> Tensor | None:
         """Return the input of each step as `hold` has it between samples; None without inputs.
@@ -326,8 +326,7 @@ class Trajectories:
 
     def table(self) -> str:
         """Return what every column of the table that was read was taken for, a line each, for people."""
-        labels = Labels(self.names, self.units, self.angles, self.time_unit)
-        return column_table(self.columns, labels, self.source, self.notes)
+        return column_table(self)
 
     def _map(self, change: Callable[[Tensor], Tensor]) -> dict[str, Tensor]:
         return {name: change(x) for name in ARRAYS if (x := getattr(self, name)) is not None}

@@ -45,15 +45,6 @@ class Triples:
         return Triples(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
-def steps(
-    t: Tensor,  # (N,) time
-    trajectory: Tensor,  # (N,) long
-) -> Steps:
-    """Return every step from one sample to the next."""
-    index = (trajectory[1:] == trajectory[:-1]).nonzero()[:, 0]
-    return Steps(t[index + 1] - t[index], trajectory[index], index)
-
-
 def triples(
     t: Tensor,  # (N,) time
     q: Tensor,  # (N, n) position

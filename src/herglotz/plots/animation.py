@@ -100,14 +100,10 @@ def save_animation(run: Run, path: PathLike, trajectory: int = 0) -> Animation:
             for ax, artist in zip((left, left, right), artists, strict=True):
                 ax.draw_artist(artist)
             images.append(Image.fromarray(np.array(canvas.buffer_rgba())).convert("RGB").quantize(COLOURS))
-    write_atomically(path, _gif(images))
+    moved = io.BytesIO()
+    images[0].save(moved, "GIF", save_all=True, append_images=images[1:], duration=1000 // PER_SECOND, loop=0)
+    write_atomically(path, moved.getvalue())
     return Animation(Path(path))
-
-
-def _gif(images: list[Image.Image]) -> bytes:
-    buffer = io.BytesIO()
-    images[0].save(buffer, "GIF", save_all=True, append_images=images[1:], duration=1000 // PER_SECOND, loop=0)
-    return buffer.getvalue()
 
 
 def _at(time: float, t: np.ndarray, q: np.ndarray) -> np.ndarray:

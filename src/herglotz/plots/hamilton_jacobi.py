@@ -56,6 +56,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
     _refuse_nothing(points)
     worst = float(np.abs(everything[0] - everything[1]).max())
     floor = BELOW * torch.finfo(fan.start.q.dtype).eps
+    missing = f", {left_out} left out {WITHOUT}" if left_out else ""
     with styled():
         figure = new_figure(9.2, 4.4, f"The action's derivative is the momentum, to {worst:.1e}")
         left, right = figure.subplots(1, 2, width_ratios=[1.0, 1.0])
@@ -63,7 +64,7 @@ def plot_momentum_vs_generating_function(source: Any, *, h: float | None = None)
         ends = [everything.min(), everything.max()]
         left.plot(ends, ends, color=MUTED, lw=0.9, zorder=1)
         left.plot(*everything, "o", ms=4, mfc="none", mec=MODEL, mew=0.9, zorder=2)
-        captions(left, [(f"○ {points} end points" + _without(left_out), MODEL), ("─ y = x", "#666666")])
+        captions(left, [(f"○ {points} end points{missing}", MODEL), ("─ y = x", "#666666")])
         left.set(xlabel=with_unit("$p_k$ from the stepper", unit), box_aspect=1)
         left.set(ylabel=with_unit(r"$D_2S^k(q_k)$ from the action", unit))
         for k, (p, dS) in enumerate(pairs, 1):
@@ -153,9 +154,10 @@ def _draw_table(figure: Figure, ax: Axes, fan: Fan, table: np.ndarray) -> None:
     ax.set_facecolor("#DDDDDD")
     bar = figure.colorbar(image, ax=ax, ticks=np.linspace(low, -1, 5).round())
     bar.set_label("log₁₀ relative residual", fontsize=9)
+    missing = "" if np.isfinite(table).all() else f", grey: left out {WITHOUT}"
     name = r"initial momentum $\hat p_0$" + (", first coordinate" if fan.start.p.shape[1] > 1 else "")
     ax.set(xlabel=with_unit(name, fan.momentum_unit and f"{fan.momentum_unit}, mass 1"))
-    ax.set(ylabel="steps k", yticks=range(1, STEPS + 1), title="on the flow" + _caustics(table))
+    ax.set(ylabel="steps k", yticks=range(1, STEPS + 1), title="on the flow" + missing)
     ax.spines[:].set_visible(False)
 
 
@@ -192,11 +194,3 @@ def _slope(d: np.ndarray, r: np.ndarray, noise: float) -> float:
 def _refuse_nothing(count: int) -> None:
     if not count:
         raise InputError("no solution has an S^k to draw: all failed, or all are at a caustic; give a smaller h")
-
-
-def _without(count: int) -> str:
-    return f", {count} left out {WITHOUT}" if count else ""
-
-
-def _caustics(table: np.ndarray) -> str:
-    return "" if np.isfinite(table).all() else f", grey: left out {WITHOUT}"

@@ -50,6 +50,8 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
     force = momentum + "²" if momentum and run.data.time_unit not in ("", "1") else ""  # rad/s, rad/s²
     length = "" if run.data.units[0] == "1" else run.data.units[0]
     energy = force.replace(length, f"{length}²", 1) if length else force  # rad²/s²: the first mass is 1
+    steps, q = run.data.steps(), run.data.unwrapped().q
+    speeds = (q[steps.index + 1] - q[steps.index]) / steps.h[:, None]
     with styled():
         figure = new_figure(1.2 + 3.9 * columns, 2.3 * rows + 0.5, "What the model has learned, mass 1")
         axes = figure.subplots(rows, columns, squeeze=False)
@@ -60,7 +62,7 @@ def plot_learned(run: Run, posterior: Laplace | None = None) -> Figure:
             _panel(axes[1, i], x, _curves(posterior, _force(run, i, x)), (low, high))
             axes[1, i].set_ylabel(with_unit(r"force $-\partial V/\partial q$", force))
             if rubs:
-                v, low, high = _range(_speeds(run)[:, i])
+                v, low, high = _range(speeds[:, i])
                 _panel(axes[2, i], v, _curves(posterior, _friction(run, i, v)), (low, high))
                 axes[2, i].set(xlabel=with_unit(f"velocity of {run.data.names[i]}", momentum))
                 axes[2, i].set_ylabel(with_unit("friction", force))
@@ -83,12 +85,6 @@ def _range(values: Tensor) -> tuple[Tensor, float, float]:
     low, high = float(values.min()), float(values.max())
     room = BEYOND * ((high - low) or 1.0)
     return torch.linspace(low - room, high + room, POINTS, dtype=torch.float64), low, high
-
-
-def _speeds(run: Run) -> Tensor:
-    """Recorded velocities, (steps, n), by differences."""
-    data, steps = run.data.unwrapped(), run.data.steps()
-    return (data.q[steps.index + 1] - data.q[steps.index]) / steps.h[:, None]
 
 
 def _line(run: Run, i: int, x: Tensor) -> Tensor:

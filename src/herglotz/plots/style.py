@@ -28,9 +28,6 @@ SUPPORT = "#EAF2F8"  # where the data are
 FORMATS = ("png", "svg", "pdf")
 
 STYLE: Any = {
-    "figure.dpi": DPI,
-    "figure.facecolor": "white",
-    "figure.constrained_layout.use": True,
     "font.size": 9.5,
     "font.family": "DejaVu Sans",  # ships with matplotlib: the same figure everywhere
     "text.color": INK,
@@ -40,9 +37,7 @@ STYLE: Any = {
     "axes.titlelocation": "left",
     "axes.spines.top": False,
     "axes.spines.right": False,
-    "axes.linewidth": 0.8,
     "axes.axisbelow": True,
-    "axes.unicode_minus": True,
     "xtick.color": "#555555",
     "ytick.color": "#555555",
     "xtick.labelcolor": INK,
@@ -50,7 +45,6 @@ STYLE: Any = {
     "lines.linewidth": 1.4,
     "lines.solid_capstyle": "round",
     "legend.frameon": False,
-    "path.simplify": True,
 }
 
 

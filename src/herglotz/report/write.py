@@ -10,7 +10,6 @@ from typing import Any
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.checks import Labels
 from herglotz.data.csv_columns import column_rows
 from herglotz.data.files import folder_at, write_atomically
 from herglotz.data.units import as_recorded, common_unit, size, span
@@ -158,8 +157,7 @@ def _data(run: Run) -> tuple[Block, ...]:
     table = Table(("", ""), tuple(rows))
     if not data.columns:
         return (table,)
-    rows = column_rows(data.columns, Labels(data.names, data.units, data.angles, data.time_unit))
-    return (table, Table(("column", "is taken for", "unit"), tuple(rows)))
+    return (table, Table(("column", "is taken for", "unit"), tuple(column_rows(data))))
 
 
 def _plan(run: Run) -> tuple[Block, ...]:

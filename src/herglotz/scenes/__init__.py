@@ -9,7 +9,6 @@ from herglotz.scenes.exact import (
     Reason as Reason,
     exact_discrete_lagrangian as exact_discrete_lagrangian,
 )
-from herglotz.scenes.forced_oscillator import ExactForcedOscillator as ExactForcedOscillator
 from herglotz.scenes.kepler import kepler as kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag as ExactLinearDrag, linear_drag as linear_drag
 from herglotz.scenes.motion import herglotz_motion as herglotz_motion
@@ -31,7 +30,6 @@ from herglotz.scenes.registry import scene as scene, scene_names as scene_names
 from herglotz.scenes.rigid_body import rigid_body as rigid_body
 from herglotz.scenes.rules import (
     ORDERS as ORDERS,
-    adjoint as adjoint,
     left as left,
     midpoint as midpoint,
     midpoint_heun as midpoint_heun,

@@ -16,18 +16,10 @@ Balance = Callable[[Tensor, Tensor, Tensor], tuple[Tensor, Tensor, Tensor, Tenso
 
 @dataclass(frozen=True)
 class Motion:
-    """The equations of motion of x = (q, y, s), where y is the momentum p or the velocity v, differentiable in x.
+    """The equations of motion of x = (q, y, s), where y is the momentum p or the velocity v, differentiable in x."""
 
-    Parameters
-    ----------
-    start
-        (q, v, s) → y: where a velocity is known.
-    balance
-        (q, y, s) → (q̇, p, ṗ, ṡ, L_s), which needs no acceleration; L_s is the rate at which the contact form is
-        scaled, ċ = c L_s.
-    """
-
-    start: StateFunction
+    start: StateFunction  # (q, v, s) → y: where a velocity is known
+    # (q, y, s) → (q̇, p, ṗ, ṡ, L_s), which needs no acceleration; L_s scales the contact form, ċ = c L_s.
     balance: Balance
 
     def vector_field(self, q: Tensor, p: Tensor, s: Tensor) -> State:

@@ -23,20 +23,12 @@ MAP_START = (100.0, 1.0, 1.0)  # (q, p, s), section 4 of the paper
 
 @dataclass(frozen=True)
 class PrintedParachute:
-    """The printed map Φ̃, with the paper's λ = −0.01, m = 1, g = 10 as defaults.
-
-    Parameters
-    ----------
-    m, g, lam
-        As printed; the paper gives no units.
-    squared
-        Whether s_k is squared in the third line, as the printed H⁺ demands.
-    """
+    """The printed map Φ̃, with the paper's λ = −0.01, m = 1, g = 10 as defaults; it gives no units."""
 
     m: float = 1.0
     g: float = 10.0
     lam: float = -0.01
-    squared: bool = False
+    squared: bool = False  # whether s_k is squared in the third line, as the printed H⁺ demands
 
     def H_plus(self, q0: Tensor, p1: Tensor, s0: Tensor, h: Tensor | float = 1.0) -> Tensor:  # noqa: ARG002
         """The printed H⁺, shape (...); h is not in it."""
@@ -55,10 +47,6 @@ class PrintedParachute:
         s_term = s * s if self.squared else s
         s1 = s + (p1 * p1)[..., 0] / (2 * m) - 2 * lam**2 * s_term / m - self.potential(q)
         return q1, p1, s1
-
-    def conformal_factor(self, q1: Tensor) -> Tensor:
-        """The conformal factor 1 − D3H⁺ = 1 − 2λq_{k+1}, shape (...)."""
-        return 1.0 - 2 * self.lam * q1[..., 0]
 
     def orbit(self, q: Tensor, p: Tensor, s: Tensor, steps: int) -> tuple[State, int]:
         """(q, p, s) with the K + 1 points in front, and how many of the steps gave finite numbers in every sample."""

@@ -84,7 +84,9 @@ def _integrated(f: Derivative, x0: Tensor, span: Tensor, max_substeps: int) -> t
         if substeps >= max_substeps or bool(((error <= TOLERANCE) | hopeless).all()):
             return x, error
         substeps *= 2
-        finer = _integrate(f, x0, span, substeps)
+        finer = x0
+        for _ in range(substeps):
+            finer = _extrapolated_step(f, finer, span / substeps)
 
 
 def reference_flow(
@@ -103,12 +105,6 @@ def reference_flow(
             f"sample {sample} with {max_substeps} substeps; use a smaller h or more substeps"
         )
     return solution.q1, solution.p1, solution.s1
-
-
-def _integrate(f: Derivative, x: Tensor, span: Tensor, substeps: int) -> Tensor:
-    for _ in range(substeps):
-        x = _extrapolated_step(f, x, span / substeps)
-    return x
 
 
 def _extrapolated_step(f: Derivative, x: Tensor, h: Tensor) -> Tensor:

@@ -102,19 +102,6 @@ def trapezoid_plain(L: Lagrangian, q0: Tensor, q1: Tensor, v: Tensor, s0: Tensor
     return 0.5 * h * (L(q0, v, s0) + L(q1, v, s0))
 
 
-def adjoint(L_d: DiscreteLagrangian) -> Rule:
-    """L_d* of the adjoint method (Φ̃_{−h})⁻¹: L_d* = −L_d(q1, q0, s0 + L_d*, −h), implicit in one scalar.
-
-    `right` is the adjoint of `left`; a method followed by its adjoint, each over h/2, has even order.
-    """
-
-    def reversed_step(q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor) -> Tensor:
-        h = as_step(h, q0)
-        return _implicit(lambda x: -L_d(q1, q0, s0 + x, -h), q0, q1, s0, h)
-
-    return reversed_step
-
-
 def strang(potential: Callable[[Tensor], Tensor], m: float, gamma: float) -> Rule:
     """L_d = (E−1)s0 + √E [m|Δ|²/2h − (h/2)(V0 + V1)], E = e^{−γh}: order 2, its own adjoint, explicit to step.
 

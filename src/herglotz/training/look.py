@@ -12,7 +12,7 @@ from herglotz.data import Trajectories
 from herglotz.data.holds import HOLDS, Arrival
 from herglotz.data.roughness import roughness, spread
 from herglotz.data.sensors import measured
-from herglotz.data.spikes import spikes, without
+from herglotz.data.spikes import spikes
 from herglotz.data.windows import Triples
 from herglotz.models import ContactLagrangian
 from herglotz.training.baseline import Baseline, across_translations, estimate_baseline, outliers_pull
@@ -127,7 +127,7 @@ def _seen(
     train, unseen = _split(data, settings)
     check_size(train, *([SMOOTHED] if settings.objective == "smoothing" else []))
     dropped = torch.zeros_like(train.t, dtype=torch.bool) if settings.robust == "off" else spikes(train)
-    kept, drag = without(train, dropped), drag_starts_the_fit(settings)
+    kept, drag = train.keep(~dropped), drag_starts_the_fit(settings)
     outliers = settings.robust == "on" or bool(dropped.any())
     outliers = outliers or (settings.robust == "auto" and outliers_pull(kept, drag=drag))
     settings = settings if plan is None else plan.applied(settings)

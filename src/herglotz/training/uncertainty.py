@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.spikes import spikes, without
+from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
@@ -97,7 +97,7 @@ class Laplace:
         states, train, out = run.states.joined[rows], data.rows(rows, run.train_lengths), out[rows]
         if run.config.robust != "off":
             lone = spikes(train)
-            train, out, states = without(train, lone), out[~lone], states[~lone]
+            train, out, states = train.keep(~lone), out[~lone], states[~lone]
         self.freedom = FREEDOM if run.metrics.get("robust") else None
         found = run.config.robust == "on" or bool(run.metrics.get("outliers"))
         self.base = estimate_baseline(train, outliers=found, substeps=run.decided.substeps)

@@ -23,7 +23,6 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precision
-from herglotz.data.spikes import without
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
 from herglotz.training.foresight import Foresight, foresee
@@ -108,7 +107,7 @@ def judged(
 ) -> dict[str, Any]:
     """The verdict, and the errors it rests on; samples that the fit takes for gross errors have no say."""
     used = torch.ones_like(task.data.t, dtype=torch.bool) if fitted.used is None else fitted.used
-    kept, states = without(task.data, ~used), fitted.states[~seen.spikes]
+    kept, states = task.data.keep(used), fitted.states[~seen.spikes]
     windows = window_errors(task, fitted, states[used], kept)
     unseen = None if seen.unseen is None else unseen_window_errors(task, fitted, seen.unseen)
     unit = kept.q.std(0, correction=0).clamp_min(1e-300) if kept.dof > 1 else kept.q.new_ones(1)

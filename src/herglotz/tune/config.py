@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 from herglotz.errors import InputError, refuse
 
@@ -69,10 +68,6 @@ class TuneConfig:
                for name in ("iterations", "pairs", "rounds")},
         })  # fmt: skip
         allowed_failures(self.starts, self.quantile, self.confidence)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain dictionary for JSON."""
-        return asdict(self)
 
 
 def allowed_failures(count: int, quantile: float, confidence: float) -> int:

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from torch import Tensor
@@ -37,26 +36,17 @@ DEGREE = 4  # of the polynomials of a kick
 class KickStepper(OneStepMethod):
     """A stepper of kicks and drifts, with `step` and `rollout` as `Stepper` has them, at its own h only.
 
-    Parameters
-    ----------
-    h, rate
-        The step and γ, so that c = e^{−γh}.
-    angle, middle, half
-        Whether q is an angle; a length enters the polynomials as (q − middle)/half.
-    drifts
-        (K + 1,) d_0 … d_K, in time over mass.
-    cosines, sines
-        (K, N) coefficients: V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, for a length.
+    V_i = Σ_n a_in cos nq + b_in sin nq for an angle, Σ_n a_in x^n, n ≥ 1, with x = (q − middle)/half for a length.
     """
 
     h: float
-    rate: float
-    angle: bool
+    rate: float  # γ, so that c = e^{−γh}
+    angle: bool  # whether q is an angle
     middle: float
     half: float
-    drifts: Tensor
-    cosines: Tensor
-    sines: Tensor
+    drifts: Tensor  # (K + 1,) d_0 … d_K, in time over mass
+    cosines: Tensor  # (K, N) a_in
+    sines: Tensor  # (K, N) b_in
     offset: float = 0.0  # added to s after a step: the sum of the constants of the V_i, which do not move q or p
     error: float = 0.0  # RMS error of q after one step, in units of q; the sines of the C form are made as accurate
 
@@ -71,11 +61,6 @@ class KickStepper(OneStepMethod):
     def parameters(self) -> int:
         """Return how many numbers were fitted."""
         return self.drifts.numel() + self.cosines.numel() + self.sines.numel()
-
-    def to(self, dtype: torch.dtype) -> KickStepper:
-        """Return the stepper in another dtype."""
-        numbers = {name: getattr(self, name).to(dtype) for name in ("drifts", "cosines", "sines")}
-        return replace(self, **numbers)
 
     def kick(self, i: int, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return V_i(q) and V_i′(q), of the shape of q."""
@@ -116,10 +101,6 @@ class KickStepper(OneStepMethod):
         status = torch.where(bad, Status.DIVERGED, Status.CONVERGED).to(torch.uint8)
         return Step(State((q + nan)[..., None], (p + nan)[..., None], s + nan), c, status, torch.zeros_like(s), 0)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain numbers for JSON."""
-        return {k: v.tolist() if isinstance(v, Tensor) else v for k, v in vars(self).items()}
-
 
 def can_kick(model: ContactLagrangian) -> bool:
     """Return whether kicks can replace the model's step: one coordinate, a constant c and no forces."""
@@ -127,21 +108,17 @@ def can_kick(model: ContactLagrangian) -> bool:
 
 
 def fit_kicks(
-    model: ContactLagrangian, before: State, after: State, h: float, *, kicks: int, iterations: int = 150
+    model: ContactLagrangian,  # has γ, whether q is an angle, and the start: leapfrog with its stiffness
+    before: State,  # (T, 1), (T, 1), (T)
+    after: State,  # the same a time h later
+    h: float,
+    *,
+    kicks: int,
+    iterations: int = 150,
 ) -> KickStepper:
     """Fit kicks and drifts to a flow map over h by Levenberg–Marquardt on (q1, p1).
 
-    Parameters
-    ----------
-    model
-        Source of γ, of whether q is an angle, and of the start: leapfrog with the stiffness of its potential.
-    before, after
-        Pairs of states a time h apart, (T, 1), (T, 1), (T) each.
-
-    Raises
-    ------
-    InputError
-        If the model has several coordinates, a c that varies, or forces.
+    Raise InputError if the model has several coordinates, a c that varies, or forces.
     """
     if not can_kick(model):
         raise InputError(f"kicks need one coordinate at the {' or '.join(LEVELS)} level")

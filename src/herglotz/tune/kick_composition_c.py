@@ -114,7 +114,7 @@ def kicks_c(stepper: KickStepper, dtype: str = "float64") -> str:
     number = partial(c_numbers.number, dtype=dtype)
     root = math.exp(-0.5 * stepper.rate * stepper.h)
     unit = math.pi if stepper.angle else 1.0
-    drifts = [_drift(float(d), unit, number) for d in stepper.drifts]
+    drifts = [f"  s += {number(0.5 * d)} * p * p;\n  q += {number(d / unit)} * p;" for d in stepper.drifts.tolist()]
     body = [drifts[0], *(_kick(stepper, i, dtype) + drifts[i + 1] for i in range(stepper.kicks))]
     return HEADER.format(
         h=number(stepper.h), kicks=stepper.kicks, c=number(root * root), root=number(root), real=TYPES[dtype],
@@ -158,10 +158,6 @@ class CompiledKicks:
         pointers = [ctypes.c_void_p(x.data_ptr()) for x in (*arrays, *outputs)]
         function, sizes = self.library.herglotz_kicks_rollouts, (ctypes.c_long(count), ctypes.c_long(steps))
         return lambda keep=(arrays, outputs): function(*sizes, ctypes.c_double(0.0), *pointers), outputs  # noqa: ARG005
-
-
-def _drift(d: float, unit: float, number: Any) -> str:
-    return f"  s += {number(0.5 * d)} * p * p;\n  q += {number(d / unit)} * p;"
 
 
 def _kick(stepper: KickStepper, i: int, dtype: str) -> str:

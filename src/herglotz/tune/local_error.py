@@ -3,25 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Protocol
 
 import torch
 from torch import Tensor
 
 from herglotz.errors import InputError
-from herglotz.stepping import Rollout, State, Status, Step
+from herglotz.stepping import OneStepMethod, Rollout, State, Status
 from herglotz.stepping.state import check_h, step_sizes
 
 
-class Steps(Protocol):
-    """A stepper that takes any h, such as `Stepper`."""
-
-    def step(self, state: State, h: Any, /) -> Step:
-        """One step."""
-        ...
-
-
-def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
+def local_errors(stepper: OneStepMethod, out: Rollout, h: Tensor | float) -> Tensor:
     """Return |q after a step − q after two half steps|, the largest coordinate, over the step's move; (..., K).
 
     Values near 1 and above mean that h does not resolve the motion, even where every step equation was solved: a step
@@ -54,7 +45,7 @@ def local_errors(stepper: Steps, out: Rollout, h: Tensor | float) -> Tensor:
     return (whole - end).abs().amax(-1) / moved.clamp(min=torch.finfo(end.dtype).tiny)
 
 
-def flag_unresolved(stepper: Steps, out: Rollout, h: Tensor | float, bound: float = 0.1) -> Rollout:
+def flag_unresolved(stepper: OneStepMethod, out: Rollout, h: Tensor | float, bound: float = 0.1) -> Rollout:
     """Return the rollout with `Status.UNRESOLVED` at every converged step whose `local_errors` exceed a bound.
 
     The states stay as they are; `Rollout.ok` is then False for a motion that is finite and wrong, such as one that

@@ -163,7 +163,7 @@ class Tuning:
             "time_unit": self.run.data.time_unit,
             "own": self.own.to_dict(),
             "candidates": [{**c.to_dict(), "front": c in front} for c in self.candidates],
-            "config": self.config.to_dict(),
+            "config": asdict(self.config),
             "notes": self.notes,
         }
 

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings, strategies as st
 
 from herglotz.data import Trajectories, read_csv, write_csv
+from herglotz.data.csv_columns import Wanted
 from herglotz.errors import InputError
 
 GOOD = "trajectory,t[s],q[rad]\n0,0,0.0\n0,1,0.1\n0,2,0.2\n1,0,1.0\n1,1,1.1\n1,3,1.2\n"
@@ -18,7 +19,9 @@ GOOD = "trajectory,t[s],q[rad]\n0,0,0.0\n0,1,0.1\n0,2,0.2\n1,0,1.0\n1,1,1.1\n1,3
 def read(folder: Path, text: str | bytes, **options) -> Trajectories:
     path = folder / "data.csv"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
-    return read_csv(path, **options)
+    angles = options.pop("angles", None)
+    found = read_csv(path, Wanted(**options))
+    return found if angles is None else found.with_angles(angles)
 
 
 def rich() -> Trajectories:

@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, load, read_csv, save
+from herglotz.data.csv_columns import Wanted
 from herglotz.data.csv_dialect import cells_of
 from herglotz.data.extra_formats import Table
 from herglotz.data.table import from_frame
@@ -135,11 +136,12 @@ def test_units_at_the_end_of_a_name(tmp_path, header, name, unit, time_unit):
 def test_names_with_units_at_their_end_stay_apart(tmp_path):
     # fails if angle_deg beside angle_rad is one column twice, or the whole name cannot be told
     path = written(tmp_path, "t,angle_deg,angle_rad,gyro_deg_s\n0,1,2,3\n1,2,3,4\n2,3,4,5\n")
-    data = read_csv(path, drop="angle_rad")
+    data = read_csv(path, Wanted(drop="angle_rad"))
     assert (data.names, data.units) == (("angle_deg",), ("deg",))
     assert ("gyro", "left aside", "deg/s") in data.columns
     path = written(tmp_path, "t,angle_deg\n0,1\n1,2\n2,3\n")
-    assert read_csv(path, coordinates="angle_deg").names == read_csv(path, coordinates="angle").names == ("angle",)
+    for coordinate in ("angle_deg", "angle"):
+        assert read_csv(path, Wanted(coordinates=coordinate)).names == ("angle",)
 
 
 def test_names_that_look_like_units_are_written_and_read(tmp_path):

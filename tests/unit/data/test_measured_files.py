@@ -54,7 +54,7 @@ def test_real_air_track():  # fails if pixels are unwrapped as angles
 )
 def test_dfki_pendulum(name, samples, gaps):  # fails if velocity is a coordinate, or torque is not an input
     path = SHARED / f"dfki_pendulum/control_method_{name}__data_measured.csv"
-    data = read_csv(path, angles=("position",))
+    data = read_csv(path).with_angles("position")
     assert (data.samples, data.names, data.angles, data.units) == (samples, ("position",), (True,), ("rad",))
     assert data.gaps == gaps
     raw = np.loadtxt(path, delimiter=",", skiprows=1)

@@ -23,8 +23,8 @@ def test_angle_file(tmp_path):  # fails if v is read, the trial is taken for tim
 
 def test_position_file_with_trials(tmp_path):  # fails if trials are joined or x is marked as an angle
     second = ROWS.replace(" 0.0e+000", " 1").replace(" 0 ", " 1 ")
-    data = read(tmp_path, "% x v\r\n" + ROWS + second, time_unit="s")
-    assert (data.names, data.units, data.angles, data.time_unit) == (("x",), ("pixel",), (False,), "s")
+    data = read(tmp_path, "% x v\r\n" + ROWS + second)
+    assert (data.names, data.units, data.angles, data.time_unit) == (("x",), ("pixel",), (False,), "1")
     assert data.lengths == (3, 3)
 
 

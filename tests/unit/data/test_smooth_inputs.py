@@ -7,8 +7,6 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories
-from herglotz.data.checks import Labels
-from herglotz.data.csv_columns import column_table
 from herglotz.data.seal import ONNX_ENTRY, SIZE, check_seal, sealed_bytes, sealed_onnx, sealed_text, sealed_zip
 from herglotz.data.smoothing import _quality, local_polynomials, smooth_triples
 from herglotz.data.splits import RUN, liveliest_rows
@@ -46,18 +44,23 @@ def test_the_length_of_the_seal_of_onnx():
     assert ONNX_ENTRY[1] == len(ONNX_ENTRY) - 2 + SIZE
 
 
+def table_of(names, units, *columns):
+    """Lines of the table of columns, for lengths of these names and units."""
+    q = torch.zeros(3, len(names), dtype=F64)
+    data = Trajectories.of([0.0, 1.0, 2.0], q, names=names, units=units, source="a.csv", columns=columns)
+    return data.table().splitlines()
+
+
 def test_only_an_angular_name_without_a_unit_gets_the_hint():
     # fails if a length is asked whether it is an angle
-    labels = Labels(("x", "theta"), ("m", "1"), (False, False), "s")
-    said = column_table([("x", "coordinate", "m"), ("theta", "coordinate", "")], labels, "a.csv").splitlines()
+    said = table_of(("x", "theta"), ("m", "1"), ("x", "coordinate", "m"), ("theta", "coordinate", ""))
     assert "an angle" not in next(line for line in said if line.split()[0] == "x")
     assert "--angles theta" in next(line for line in said if line.split()[0] == "theta")
 
 
 def test_a_column_that_was_left_out_keeps_its_unit():
     # fails if what a coordinate was made of is looked up for a column that is none
-    labels = Labels(("x",), ("m",), (False,), "s")
-    said = column_table([("x", "coordinate", "mm"), ("y", "coordinate", "cm")], labels, "a.csv").splitlines()
+    said = table_of(("x",), ("m",), ("x", "coordinate", "mm"), ("y", "coordinate", "cm"))
     assert [line.split()[2:] for line in said[-2:]] == [["mm,", "converted", "to", "m"], ["cm"]]
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from herglotz.data import Trajectories, simulate
-from herglotz.data.spikes import spikes, without
+from herglotz.data.spikes import spikes
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 
@@ -43,12 +43,12 @@ def test_what_is_left_out_keeps_its_impulse():
     data = Trajectories.of(t, t.clone(), (5, 5), u=u)
     dropped = torch.zeros(10, dtype=torch.bool)
     dropped[[2, 8]] = True
-    left = without(data, dropped)
+    left = data.keep(~dropped)
     assert left.lengths == (4, 4)
     assert left.u is not None
     # 2 over one unit of time and 3 over two; 3 over two units and 4 over one
     torch.testing.assert_close(left.u[:, 0], torch.tensor([1, 8 / 3, 4, 9, 1, 2, 10 / 3, 9], dtype=torch.float64))
-    assert without(data, torch.zeros_like(dropped)) is data
+    assert data.keep(torch.ones_like(dropped)) is data
 
 
 def test_every_mth_sample():

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from herglotz.mechanics import autograd_partials, partials
-from herglotz.scenes import ORDERS, adjoint, damped_pendulum, midpoint, midpoint_heun, parachute, scene
-from herglotz.scenes.rules import RULES
+from herglotz.scenes import ORDERS, damped_pendulum, midpoint, midpoint_heun, parachute, scene
+from herglotz.scenes.rules import RULES, _implicit
 from herglotz.stepping import Stepper
 
 HORIZON = 2.0
@@ -64,6 +64,11 @@ def test_trap_is_invisible_without_damping(name):
 def pairs():
     q0, p, s0 = pendulum_start()
     return q0, q0 + 0.3 * p, s0, torch.tensor(0.4, dtype=torch.float64)
+
+
+def adjoint(L_d):
+    """L_d* of the adjoint method (Φ̃_{−h})⁻¹: L_d* = −L_d(q1, q0, s0 + L_d*, −h), implicit in one scalar."""
+    return lambda q0, q1, s0, h: _implicit(lambda x: -L_d(q1, q0, s0 + x, -h), q0, q1, s0, h)
 
 
 @pytest.mark.parametrize(
