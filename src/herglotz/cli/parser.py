@@ -105,4 +105,5 @@ def _add(command: argparse.ArgumentParser, flags: Iterable[Flag | str]) -> None:
         if isinstance(one, str):
             place = command.add_argument_group(one)
         else:
-            place.add_argument(*one.names, **one.options)
+            names, options = one
+            place.add_argument(*names, **options)

@@ -114,9 +114,8 @@ def _posterior(run: Run) -> Laplace | str:
 
 
 def _equation(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
-    equation = getattr(run, "equation", None)
-    blocks: list[Block] = [] if equation is None else [Code(str(equation()))]
-    blocks.append("The first coordinate's mass is 1: positions alone do not fix the unit of force.")
+    mass = "The first coordinate's mass is 1: positions alone do not fix the unit of force."
+    blocks: list[Block] = [Code(str(run.equation())), mass]
     if isinstance(posterior, str):
         return (*blocks, posterior, Picture(plot_learned(run), "Potential and force of the model."))
     found = quantities(posterior, run)

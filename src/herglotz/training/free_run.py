@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.splits import leading
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.first_states import states_of_pairs
@@ -22,15 +23,13 @@ def states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
     """States at every sample, those of the training part and a free run from the last of them; and "ok", or why not."""
-    first, lengths = torch.tensor(data.offsets), torch.tensor(data.lengths)
-    index, owner, trained = torch.arange(data.samples), data.trajectory.cpu(), torch.tensor(train_lengths)
     out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
-    out[index < (first + trained)[owner]] = fitted.states
-    unseen = trained < lengths
-    if not bool(unseen.any()):
+    out[leading(data.lengths, train_lengths)] = fitted.states
+    before = [k - 1 if k < length else length for k, length in zip(train_lengths, data.lengths, strict=True)]
+    rows = (~leading(data.lengths, before)).nonzero()[:, 0]
+    if not len(rows):
         return state_of(out), "ok"
-    rows = index[unseen[owner] & (index >= (first + trained)[owner] - 1)]
-    rest = data.rows(rows, tuple((lengths - trained + 1)[unseen].tolist()))
+    rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))
     grid = segment_grid(rest, rest.samples, max_step)
     inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
     found = free_runs(Stepper(fitted.model), rest, grid, out[rows[grid.start_sample]], inputs)

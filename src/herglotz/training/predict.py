@@ -14,6 +14,7 @@ from herglotz.data import Trajectories
 from herglotz.data.actuator import acting
 from herglotz.data.holds import Arrival
 from herglotz.data.sensors import measured
+from herglotz.data.splits import leading, leading_rows
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
@@ -62,8 +63,7 @@ class Prediction:
     @property
     def free(self) -> Tensor:
         """Whether a sample is in the free run, (N,) bool."""
-        first = torch.tensor(self.data.offsets, device=self.data.t.device)[self.data.trajectory]
-        return torch.arange(self.data.samples, device=first.device) - first >= self.warmup
+        return ~leading(self.data.lengths, self.train_lengths)
 
     @property
     def failed_steps(self) -> float:
@@ -87,12 +87,11 @@ class Prediction:
         """The predicted motion as far as it was reached; None where no trajectory has three samples."""
         reached = torch.isfinite(torch.cat([self.states.q, self.states.p], -1)).all(-1)
         counts = [int(reached[a : a + k].sum()) for a, k in zip(self.data.offsets, self.data.lengths, strict=True)]
-        spans = [(a, k) for a, k in zip(self.data.offsets, counts, strict=True) if k >= 3]
-        if not spans:
+        counts = [k if k >= 3 else 0 for k in counts]
+        if not any(counts):
             return None
-        rows = torch.cat([torch.arange(a, a + k) for a, k in spans])
         whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
-        return whole.rows(rows, tuple(k for _, k in spans))
+        return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
         """The numbers, for JSON."""
@@ -287,8 +286,9 @@ def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor,
 
 def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
     """The rows of the first samples of every trajectory, (B, K), and these samples as recordings."""
-    rows = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
-    return rows, data.rows(rows.flatten(), (warmup,) * len(data))
+    lengths = (warmup,) * len(data)
+    rows = leading_rows(data.lengths, lengths)
+    return rows.reshape(-1, warmup), data.rows(rows, lengths)
 
 
 def _sigma(run: FittedRun) -> float:
@@ -314,7 +314,7 @@ def _smoothed(
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
     """Fill in the states after the warm-up of every trajectory, all of them stepped as one batch; return the grid."""
-    rows = torch.cat([torch.arange(a + warmup - 1, a + k) for a, k in zip(data.offsets, data.lengths, strict=True)])
+    rows = (~leading(data.lengths, (warmup - 1,) * len(data))).nonzero()[:, 0]
     rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)
     inputs = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]

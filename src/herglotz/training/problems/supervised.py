@@ -70,10 +70,6 @@ class SupervisedProblem(OneStep):
         kappa = float(least_squares(columns, (s[t.index + 1] - before)[:, None].cpu())[0])
         return torch.cat([theta, theta.new_tensor([kappa if kappa > 0 else 1.0]).log()])
 
-    def unit(self, x: Tensor) -> float:
-        """κ: the recorded s and p over the model's."""
-        return float(x[-1].exp())
-
     def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]:  # noqa: ARG002
         t, d = self.triples, self.data
         assert d.s is not None
