@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.checks import Labels
@@ -19,11 +16,11 @@ from herglotz.plots import plot_bands, plot_learned, plot_training, plot_traject
 from herglotz.plots.motion import plot_prediction
 from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
-from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.quantities import held_out_rms, quantities
 from herglotz.training.recorded_range import range_in_words, warning
+from herglotz.training.selection import step_cost
 from herglotz.training.summary import rows as summary_rows
 from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
@@ -232,15 +229,8 @@ def _verification(run: Run) -> tuple[Block, ...]:
 
 
 def _speed(run: Run) -> tuple[Block, ...]:
-    state, _ = run.last_fitted()
-    stepper, steps = Stepper(run.model), 50
-    with torch.no_grad():
-        stepper.rollout(*state, h=run.h, steps=2)
-        began = time.process_time()
-        stepper.rollout(*state, h=run.h, steps=steps)
-        cost = (time.process_time() - began) / steps
     text = "For a control loop or many runs, step it in C: export it, or hz.compile(run.stepper)."
-    return (f"One step of one trajectory in PyTorch takes {1e6 * cost:.0f} µs of processor time here. {text}",)
+    return (f"One step of one trajectory in PyTorch takes {step_cost(run):.0f} µs of processor time here. {text}",)
 
 
 def _origin(run: Run) -> tuple[Block, ...]:

@@ -149,18 +149,6 @@ def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
     raise AssertionError("the last rule has no condition")
 
 
-def drawing() -> str:
-    """Return the choice of the objective as a mermaid flowchart (docs/trajectory.md)."""
-    lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
-    for k, rule in enumerate(RULES, 1):
-        if k == len(RULES):
-            lines.append(f'    q{k}["{rule.question.lower()}"] --> o{k}(["{rule.objective}"])')
-        else:
-            lines.append(f'    q{k}{{"{rule.question}"}} -- yes --> o{k}(["{rule.objective}"])')
-            lines.append(f"    q{k} -- no --> q{k + 1}")
-    return "\n".join(lines)
-
-
 def _network(objective: str, covered: bool, named: bool) -> tuple[str, str]:
     if named:
         return "none", "the named terms are the whole model"

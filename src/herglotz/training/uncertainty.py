@@ -67,18 +67,7 @@ class Bands:
 
 
 class Laplace:
-    """Posterior of a run's parameters and start states.
-
-    Parameters
-    ----------
-    run
-        A fit whose model follows its data (`metrics["follows_data"]`).
-
-    Raises
-    ------
-    InputError
-        If the trajectories cannot be solved from the run's states.
-    """
+    """Posterior of a run's parameters and start states, as `laplace` gives it."""
 
     def __init__(self, run: Run):
         self.run = run

@@ -18,7 +18,7 @@ from herglotz.least_squares import least_squares
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
-from herglotz.training.problems.one_step import CHUNK, OneStep
+from herglotz.training.problems.one_step import OneStep
 
 
 class SupervisedProblem(OneStep):
@@ -34,8 +34,6 @@ class SupervisedProblem(OneStep):
         If s, or p where it is asked for, is not recorded.
     """  # noqa: D400  the formula is part of the sentence
 
-    latents = 1
-
     def __init__(
         self,
         model: ContactLagrangian,
@@ -43,8 +41,6 @@ class SupervisedProblem(OneStep):
         *,
         momenta: bool,  # whether recorded momenta are used too
         max_step: float | None = None,
-        sigma: float = 1.0,
-        chunk: int = CHUNK,
         **settings: Any,
     ):
         for name, wanted in (("s", True), ("p", momenta)):
@@ -53,8 +49,8 @@ class SupervisedProblem(OneStep):
                     f"{data.source or 'data'}: supervision by {name} needs {name} at every sample; "
                     "record it or set supervision='q'"
                 )
-        super().__init__(model, data, sigma=sigma, **settings)
-        self.chunk, self.momenta, self.triples = chunk, momenta, data.triples(max_step)
+        super().__init__(model, data, data.triples(max_step), **settings)
+        self.momenta = momenta
         size = max(model.config.scale)
         self.of_s = size / sum(v * x for v, x in zip(model.config.speed, model.config.scale, strict=True))
         self.of_p = size / data.q.new_tensor(model.config.speed)
