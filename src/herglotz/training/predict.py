@@ -12,7 +12,6 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.actuator import acting
-from herglotz.data.holds import Arrival
 from herglotz.data.sensors import measured
 from herglotz.data.splits import leading, leading_rows
 from herglotz.data.waves import with_waves
@@ -189,12 +188,6 @@ def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyo
     )
 
 
-def arrival_of(run: FittedRun) -> Arrival:
-    """What happened to the inputs of the fit before they acted; other recordings that say nothing are alike."""
-    plan = run.metrics.get("plan") or {}
-    return Arrival(plan.get("hold") or run.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
-
-
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
     """The zeros of the sensors in the recordings of the fit, each once, those of the reference first."""
     zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
@@ -225,7 +218,7 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
         data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
-    return acting(data, arrival_of(run))
+    return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:

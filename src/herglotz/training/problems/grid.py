@@ -60,13 +60,8 @@ class SegmentGrid:
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
     """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).
 
-    None for a model that takes none. Between samples inputs do what the `hold` of the data says
-    (`herglotz.data.holds`), by default nothing. The last one of a trajectory acts on no step.
-
-    Raises
-    ------
-    InputError
-        If the model takes inputs and the data hold none, or another number of them.
+    None for a model that takes none. The last one of a trajectory acts on no step. Raise InputError if the model takes
+    inputs and the data hold none, or another number of them.
     """
     if not model.inputs:
         return None

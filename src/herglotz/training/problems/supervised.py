@@ -26,12 +26,8 @@ class SupervisedProblem(OneStep):
 
         r_q = J⁻¹R at the recorded s,    r_s = (s₁ − s₀)/κ − L_d,    r_p = p₁/κ − D2 L_d − F⁺ (with momenta only),
 
-    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`.
-
-    Raises
-    ------
-    InputError
-        If s, or p where it is asked for, is not recorded.
+    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`. Raise
+    InputError if s, or p where it is asked for, is not recorded.
     """  # noqa: D400  the formula is part of the sentence
 
     def __init__(
