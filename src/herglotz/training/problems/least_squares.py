@@ -91,12 +91,10 @@ class StatesProblem(LeastSquares, ABC):
     @abstractmethod
     def cost(self, x: Tensor) -> Tensor:
         """½|r|², a scalar; infinite where a step has no solution."""
-        ...
 
     @abstractmethod
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
         """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
-        ...
 
 
 class StatesOnly:

@@ -53,7 +53,6 @@ class OneStep(LeastSquares, ABC):
     @abstractmethod
     def start(self) -> Tensor:
         """All unknowns, the parameters first."""
-        ...
 
     @abstractmethod
     def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]: ...
