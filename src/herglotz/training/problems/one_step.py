@@ -24,7 +24,6 @@ from herglotz.training.distributed import LaneSums, add_over_processes, own_part
 from herglotz.training.problems.least_squares import LeastSquares
 from herglotz.training.problems.recorded_action import action, action_derivative
 
-OBJECTIVES = ("position", "raw")
 MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost more than all the rest
 CHUNK = 4096  # triples whose Jacobian is held in memory at once: 4096 · 2 · 300 parameters are 20 MB
 
