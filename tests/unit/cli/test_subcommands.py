@@ -74,7 +74,7 @@ def test_choices_are_the_packages_own():  # fails if a level is added there but 
     assert (ROBUST, SUPERVISION, HOLDS) == (own.ROBUST, own.SUPERVISION, own.HOLDS)
     assert herglotz.cli.plot.FORMATS == FORMATS
     for name in scene_names():
-        assert name in herglotz.cli.simulate.DESCRIPTION
+        assert name in herglotz.cli.simulate.description()
 
 
 def test_the_help_of_fit_tells_the_packages_defaults():  # fails if a default changes and the help has the old one
