@@ -32,8 +32,7 @@ def states_everywhere(
     rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))
     grid = segment_grid(rest, rest.samples, max_step)
     inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
-    found = free_runs(Stepper(fitted.model), rest, grid, out[rows[grid.start_sample]], inputs)
-    out[rows[grid.sample]] = found.flatten(0, 1)[grid.node]
+    out[rows] = grid.at_samples(free_runs(Stepper(fitted.model), rest, grid, out[rows[grid.start_sample]], inputs))
     lost = rest.trajectory[~torch.isfinite(out[rows]).all(-1)]
     if not len(lost):
         return state_of(out), "ok"

@@ -311,6 +311,5 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)
     inputs = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    nodes = free_runs(stepper, rest, grid, states[rows[grid.start_sample]], inputs)
-    states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
+    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], inputs))
     return grid
