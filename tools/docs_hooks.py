@@ -42,12 +42,10 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
 def helps() -> str:
     """The help of every command."""
     from herglotz.cli.parser import build_parser
-    from herglotz.cli.simulate import __getattr__ as scenes
 
     os.environ["COLUMNS"] = "80"
     parser = build_parser()
     action = next(a for a in parser._actions if isinstance(a, argparse._SubParsersAction))
-    action.choices["simulate"].description = scenes("DESCRIPTION")
     parts = [f"```text\n{parser.format_help().rstrip()}\n```"]
     for name, command in action.choices.items():
         parts.append(f"## herglotz {name}\n\n```text\n{command.format_help().rstrip()}\n```")

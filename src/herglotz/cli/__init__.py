@@ -26,7 +26,7 @@ from herglotz.errors import InputError
 __all__ = ["main"]
 
 # The last one is what shells report of a process that SIGINT has ended, 128 + 2.
-OK, FAILED, WRONG_INPUT, INTERNAL, INTERRUPTED = 0, 1, 2, 70, 130
+OK, WRONG_INPUT, INTERNAL, INTERRUPTED = 0, 2, 70, 130
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

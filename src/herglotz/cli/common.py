@@ -11,7 +11,7 @@ import tempfile
 import textwrap
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO
+from typing import TYPE_CHECKING, Any, TextIO
 
 from herglotz.errors import InputError, no_such_file
 
@@ -23,17 +23,13 @@ COLUMNS = 80  # of a terminal as it opens
 KICKS = "kicks.h"  # file in a folder of `tune` with the chosen step, where kicks were chosen
 
 
-class Flag(NamedTuple):
-    """One flag or argument of a command, as argparse takes it."""
-
-    names: tuple[str, ...]
-    options: dict[str, Any]
+Flag = tuple[tuple[str, ...], dict[str, Any]]  # names and options of a flag or argument, as argparse takes them
 
 
 def flag(*names_and_help: str, **options: Any) -> Flag:
     """A flag by its names, its help and argparse's further options."""
     *names, text = names_and_help
-    return Flag(tuple(names), {"help": text, **options})
+    return tuple(names), {"help": text, **options}
 
 
 def exit_code(run: Run) -> int:

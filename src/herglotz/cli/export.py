@@ -48,9 +48,8 @@ def run(arguments: argparse.Namespace) -> int:
     form: str | None = arguments.format or FORMAT.get(arguments.out.suffix.lower())
     check_output_file(arguments.out, tuple(FORMAT) if form is None else (SUFFIX[form],), arguments.force)
     assert form is not None  # the name ends in one of them
-    arguments.format = form
     kicks = arguments.source / KICKS
-    if kicks.is_file() and arguments.format == "c":
+    if kicks.is_file() and form == "c":
         if arguments.name is not None:
             raise InputError("--name: kicks that tune chose have the prefix herglotz_kicks; leave --name out")
         return _kicks(arguments, kicks)
@@ -63,9 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
     from herglotz.export.c_header import read_metadata
 
     warn_of_misfit(result, "the file will not step as the recorded system does")
-    export_run(result, arguments.out, arguments.format, h_range=arguments.h_range, name=arguments.name)
-    tuned = result.setting
-    if arguments.format == "c":  # the header is read, not compiled: no compiler is needed to write it
+    export_run(result, arguments.out, form, h_range=arguments.h_range, name=arguments.name)
+    if form == "c":  # the header is read, not compiled: no compiler is needed to write it
         found = read_metadata(arguments.out.read_text(), arguments.out)
     else:
         found = load_exported(arguments.out).metadata
@@ -77,9 +75,9 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"{arguments.out}: {size / 1024:.0f} KiB, {found['dtype']}, {found['dof']} {plural}, h {result.h:g}")
         if kicks.is_file():
             print(f"tune chose kicks, which exist in C only (--format c); {arguments.out} holds the run's own model")
-        if arguments.format != "c" and tuned.get("tol"):
-            print(f"The tolerance {tuned['tol']:g} of tune applies to PyTorch and C only; this file solves to rounding")
-        if arguments.format == "c":
+        if form != "c" and (tol := result.setting.get("tol")):
+            print(f"The tolerance {tol:g} of tune applies to PyTorch and C only; this file solves to rounding")
+        if form == "c":
             say(f"The example at the top of {arguments.out} compiles with cc -O3 -march=native")
         print_next(["verify", arguments.out, "--against", arguments.source])
     return 0

@@ -97,7 +97,7 @@ def report(result: Run, out: Path, drawn: list[Path]) -> None:
     from herglotz.training import Plan
 
     print("Plan (what was decided, and why):")
-    print(Plan.from_dict(result.metrics["plan"]).table(unit=common_unit(result.data.units)))
+    print(Plan.from_dict(result.metrics["plan"]).table(common_unit(result.data.units)))
     print("Result:")
     print(result.summary())
     if drawn:

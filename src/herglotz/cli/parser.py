@@ -65,6 +65,12 @@ class Parser(argparse.ArgumentParser):
         super().__init__(*args, formatter_class=Help, **options)
         self._negative_number_matcher = NEGATIVE_NUMBER
 
+    def format_help(self) -> str:
+        """Make a description that is a function when it is asked for."""
+        if callable(self.description):
+            self.description = self.description()
+        return super().format_help()
+
     def parse_known_args(self, args=None, namespace=None):
         """Refuse what no flag takes here, where the subcommand's own help is the one to name."""
         found, rest = super().parse_known_args(args, namespace)
@@ -88,10 +94,10 @@ def build_parser() -> Parser:
     parser.add_argument("--version", action="version", version=f"herglotz {herglotz.__version__}")
     commands = parser.add_subparsers(title="subcommands", metavar="COMMAND", required=True)
     for module in (simulate, fit, select, predict, rollout, export, verify, trust, report, tune, plot):
-        own = vars(module)  # the description of `simulate` is made when its help is asked for
+        own = vars(module)
         command = commands.add_parser(
             module.__name__.rpartition(".")[2], help=module.HELP, description=own.get("DESCRIPTION"),
-            usage=own.get("USAGE"), add_help=module is not simulate,
+            usage=own.get("USAGE"),
         )  # fmt: skip
         _add(command, module.FLAGS)
         command.set_defaults(run=module.run)
@@ -105,4 +111,5 @@ def _add(command: argparse.ArgumentParser, flags: Iterable[Flag | str]) -> None:
         if isinstance(one, str):
             place = command.add_argument_group(one)
         else:
-            place.add_argument(*one.names, **one.options)
+            names, options = one
+            place.add_argument(*names, **options)

@@ -6,7 +6,7 @@ import argparse
 import math
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from herglotz.data import Trajectories
     from herglotz.data.holds import Arrival
     from herglotz.export import ExportedStepper
+    from herglotz.export.box import Box
     from herglotz.stepping import Rollout, State, Stepper
     from herglotz.training.recorded_range import Beyond
 
@@ -50,15 +51,14 @@ class Source:
     units: tuple[str, ...]
     angles: tuple[bool, ...]
     time_unit: str
-    limits: Mapping[str, Sequence[float]] | None  # lowest and highest q, p, s of the fit
-    box: Callable[..., torch.Tensor] | None  # (q, p, s) → whether a state is outside the states of the fit
+    limits: Mapping[str, Sequence[float]]  # lowest and highest q, p, s of the fit; empty: not known
+    box: Box | None  # the same, as a function of states
     h_range: tuple[float, float] | None  # steps of the fit
-    arrival: Arrival | None = None  # what happened to the inputs of the fit before they acted
+    arrival: Arrival  # what happened to the inputs of the fit before they acted
+    inputs: int
+    degrees: tuple[str, ...]  # coordinates that were recorded in degrees
+    columns: Sequence[Sequence[str]]  # name, role and unit of each column of the fit's table
     frequencies: tuple[float, ...] = ()  # of waves that are its inputs
-    inputs: int = 0
-    states: str = "(q, p, s)"  # what the box bounds
-    degrees: tuple[str, ...] = ()  # coordinates that were recorded in degrees
-    columns: Sequence[Sequence[str]] = ()  # name, role and unit of each column of the fit's table
 
 
 HELP = "step a model and write the motion"
@@ -93,6 +93,8 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.q0 is None) != (arguments.p0 is None):
         raise InputError("--q0 and --p0 go together; give both, or neither to start from the last fitted state")
 
+    import torch
+
     from herglotz.data import save
     from herglotz.data.units import in_degrees
     from herglotz.training.recorded_range import quantities_outside
@@ -102,7 +104,9 @@ def run(arguments: argparse.Namespace) -> int:
     u, times = _driven(arguments, source, t0)
     h = times.diff().to(start.q.dtype) if arguments.inputs else (arguments.h or source.h)
     began = time.perf_counter()
-    found = _stepped(source, start, h, arguments.steps, u)
+    with torch.no_grad():
+        inputs = None if u is None else u.to(start.q.dtype)
+        found = source.stepper.rollout(*start, h=h, steps=arguments.steps, inputs=inputs)
     seconds = time.perf_counter() - began
     _check(found, float(times.diff().mean()))
     motion = _motion(source, found, times, str(arguments.source))
@@ -110,7 +114,7 @@ def run(arguments: argparse.Namespace) -> int:
     save(out, in_degrees(motion, source.degrees) if out.suffix.lower() == ".csv" else motion)
     outside = None if source.box is None else source.box(found.q, found.p, found.s)
     left = None if outside is None or not bool(outside.any()) else int(outside.nonzero()[0])
-    far = quantities_outside(source.limits, motion, motion.t, motion.q, found.p.double()) if source.limits else []
+    far = quantities_outside(source.limits, motion, motion.t, motion.q, found.p.double())
     if arguments.json:
         left_by = {"beyond": [asdict(each) for each in far]}
         print_json(_numbers(found, times, seconds, left) | left_by | {"file": str(out)})
@@ -120,13 +124,6 @@ def run(arguments: argparse.Namespace) -> int:
     if source.inputs and u is None:
         _note("the model is driven: without --inputs FILE or --u all of its inputs are 0")
     return 0
-
-
-def _stepped(source: Source, start: State, h: torch.Tensor | float, steps: int, u: torch.Tensor | None) -> Rollout:
-    import torch
-
-    with torch.no_grad():
-        return source.stepper.rollout(*start, h=h, steps=steps, inputs=None if u is None else u.to(start.q.dtype))
 
 
 def _motion(source: Source, found: Rollout, times: torch.Tensor, name: str) -> Trajectories:
@@ -165,12 +162,10 @@ def _warn(source: Source, times: torch.Tensor, left: int | None, far: Sequence[B
     """Say on stderr where the motion or its steps are beyond the data of the fit; a remedy for its steps."""
     from herglotz.training.recorded_range import other_steps
 
-    if left is not None and (far or not source.limits or "s" in source.states):  # a hair beyond q or p is no news
+    if left is not None and source.box is not None and (far or source.box.by_s):  # a hair beyond q or p is no news
+        states = "(q, p, s)" if source.box.by_s else "(q, p)"
         each = "".join(f"; {one.words(source.time_unit)}" for one in far)
-        _note(
-            f"from step {left} on, the motion leaves the range of states {source.states} that the model was fitted "
-            f"to{each}"
-        )
+        _note(f"from step {left} on, the motion leaves the range of states {states} that the model was fitted to{each}")
     if words := other_steps(times, source.h_range or (0.0, math.inf), source.time_unit):
         _note(words + remedy)
 
@@ -192,13 +187,12 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     if path.is_dir() or path.suffix.lower() not in SUFFIXES:
         from herglotz.training import load_run
 
-        run_, data = (found := load_run(path)), found.data
-        start, t0 = run_.last_fitted(trajectory)
-        model, labels = run_.model, (data.names, data.units, data.angles, data.time_unit)
-        box = Box(run_.box, data.angles, start.q.dtype, by_s=model.s_enters_motion)
+        fitted = load_run(path)
+        model, data = fitted.model, fitted.data
         return Source(
-            run_.stepper, start, t0, run_.h, *labels, run_.box, box, run_.h_range, run_.arrival,
-            run_.config.frequencies, model.inputs, _bounded(model.s_enters_motion), data.degrees, data.columns,
+            fitted.stepper, *fitted.last_fitted(trajectory), fitted.h, data.names, data.units, data.angles,
+            data.time_unit, fitted.box, Box.of(fitted.box, model), fitted.h_range, fitted.arrival, model.inputs,
+            data.degrees, data.columns, fitted.config.frequencies,
         )  # fmt: skip
 
     from herglotz.data.checks import unnamed
@@ -212,19 +206,13 @@ def read_source(path: Path, trajectory: int, trust_code: bool = False) -> Source
     names = tuple(m.get("names") or unnamed(n))
     angles = tuple(m.get("angles") or [False] * n)
     units = tuple(m.get("units") or ["rad" if angle else "1" for angle in angles])
-    by_s = s_matters(m)
-    box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype, by_s=by_s)
+    box = None if m["box"] is None else Box(m["box"], angles, stepper.dtype, by_s=s_matters(m))
     span, stepper.metadata["h_range"] = m.get("h_range"), None  # a note beside the motion, as for a run: no refusal
     t0 = (stored or {}).get("t", 0.0)
     return Source(
-        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), m["box"], box, span,
-        Arrival(**m.get("arrival", {})), inputs=stepper.inputs, states=_bounded(by_s),
-        degrees=tuple(m.get("degrees", ())), columns=m.get("columns", ()),
+        stepper, start, t0, stepper.h, names, units, angles, m.get("time_unit", "s"), m["box"] or {}, box, span,
+        Arrival(**m.get("arrival", {})), stepper.inputs, tuple(m.get("degrees", ())), m.get("columns", ()),
     )  # fmt: skip
-
-
-def _bounded(by_s: bool) -> str:
-    return "(q, p, s)" if by_s else "(q, p)"
 
 
 def _start(arguments: argparse.Namespace, source: Source) -> tuple[State, float]:
@@ -253,7 +241,6 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
     import torch
 
     from herglotz.data.driving import driven, even_times, input_recording
-    from herglotz.data.holds import Arrival
     from herglotz.data.waves import waves
 
     steps, path = arguments.steps, arguments.inputs
@@ -267,7 +254,7 @@ def _driven(arguments: argparse.Namespace, source: Source, t0: float) -> tuple[t
         return torch.tensor(arguments.u, dtype=torch.float64).expand(steps, -1), times
     if arguments.u is not None:
         raise InputError("--u and --inputs both give the inputs; leave one out")
-    found = input_recording(path, arguments.trajectory, source.time_unit, source.arrival or Arrival(), source.columns)
+    found = input_recording(path, arguments.trajectory, source.time_unit, source.arrival, source.columns)
     if arguments.q0 is not None and arguments.t0 is None:
         t0 = float(found.t[0])
     return driven(found, t0, steps, arguments.h)

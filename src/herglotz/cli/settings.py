@@ -36,7 +36,7 @@ def settings_of(arguments: argparse.Namespace) -> FitConfig:
     config = FitConfig() if arguments.config is None else _read(arguments.config)[0]
     names = {field.name for field in fields(FitConfig)}
     given = {name: x for name, x in vars(arguments).items() if name in names}
-    return config.changed({name: tuple(x) if isinstance(x, list) else x for name, x in given.items()})
+    return config.changed(given)
 
 
 def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Trajectories, dict[str, Any]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 from herglotz.cli.common import check_output_file, count, finite, flag, positive, print_json, print_next, say, seed
 from herglotz.cli.flags import FORCE
@@ -21,28 +20,16 @@ example:
 """
 
 
-def __getattr__(name: str) -> str:
-    """Return `DESCRIPTION`, the text of --help; the registry of scenes is read only when the text is."""
-    if name != "DESCRIPTION":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+def description() -> str:
+    """The text of --help; the registry of scenes is read only when the text is."""
     from herglotz.scenes import scene, scene_names
 
     return ABOUT.format(scenes="".join(f"  {name:<20}{scene(name).description}\n" for name in scene_names()))
 
 
-class Help(argparse.Action):
-    """Print the help with the list of scenes, which needs the import of PyTorch."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *arguments: Any) -> None:  # noqa: ARG002
-        """Print and exit."""
-        parser.description = __getattr__("DESCRIPTION")
-        parser.print_help()
-        parser.exit()
-
-
+DESCRIPTION = description
 HELP = "write data of a scene with a known answer"
 FLAGS = (
-    flag("-h", "--help", "show this help message and exit", action=Help, nargs=0),
     flag("scene", "name of the scene", metavar="SCENE"),
     flag("--out", "file to write: .csv or .npz", required=True, type=Path, metavar="FILE"),
     flag("--trajectories", "number of motions (default %(default)s)", type=count, default=4, metavar="N"),

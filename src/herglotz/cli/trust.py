@@ -23,7 +23,6 @@ examples:
   herglotz trust runs/pendulum --level 0.95 --json
   herglotz trust runs/seed0 --with runs/seed1 runs/seed2
 """
-UNKNOWN = 0.9  # posterior over prior standard deviation from which a direction counts as not determined
 
 
 HELP = "how far to trust a run"
@@ -74,11 +73,6 @@ def _numbers(result: Run, posterior: Laplace, bands: Bands, level: float) -> dic
         "inside_held_out": float(inside[held].double().mean()) if bool(held.any()) else None,
         "noise": dict(zip(result.data.names, bands.sigma.tolist(), strict=True)),
         "held_out_over_noise": posterior.inflation,
-        "not_determined": [
-            {"reduction": d.reduction, "parts": dict(d.parts)}
-            for d in posterior.least_identified()
-            if d.reduction > UNKNOWN
-        ],
         "traded": [{"index": t.index, "parts": dict(t.parts), "words": str(t)} for t in traded(posterior)],
         "effective_parameters": posterior.effective_parameters(),
         "all_parameters": len(posterior.theta),

@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 from typing import Any
-
-import torch
 
 from herglotz.data import Trajectories
 from herglotz.data.csv_columns import column_rows
@@ -18,11 +15,11 @@ from herglotz.plots import plot_bands, plot_learned, plot_training, plot_traject
 from herglotz.plots.motion import plot_prediction
 from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
-from herglotz.stepping import Stepper
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
 from herglotz.training.quantities import held_out_rms, quantities
 from herglotz.training.recorded_range import range_in_words, warning
+from herglotz.training.selection import step_cost
 from herglotz.training.summary import rows as summary_rows
 from herglotz.training.uncertainty import determined
 from herglotz.verify import verify
@@ -113,9 +110,8 @@ def _posterior(run: Run) -> Laplace | str:
 
 
 def _equation(run: Run, posterior: Laplace | str) -> tuple[Block, ...]:
-    equation = getattr(run, "equation", None)
-    blocks: list[Block] = [] if equation is None else [Code(str(equation()))]
-    blocks.append("The first coordinate's mass is 1: positions alone do not fix the unit of force.")
+    mass = "The first coordinate's mass is 1: positions alone do not fix the unit of force."
+    blocks: list[Block] = [Code(str(run.equation())), mass]
     if isinstance(posterior, str):
         return (*blocks, posterior, Picture(plot_learned(run), "Potential and force of the model."))
     found = quantities(posterior, run)
@@ -231,15 +227,8 @@ def _verification(run: Run) -> tuple[Block, ...]:
 
 
 def _speed(run: Run) -> tuple[Block, ...]:
-    state, _ = run.last_fitted()
-    stepper, steps = Stepper(run.model), 50
-    with torch.no_grad():
-        stepper.rollout(*state, h=run.h, steps=2)
-        began = time.process_time()
-        stepper.rollout(*state, h=run.h, steps=steps)
-        cost = (time.process_time() - began) / steps
     text = "For a control loop or many runs, step it in C: export it, or hz.compile(run.stepper)."
-    return (f"One step of one trajectory in PyTorch takes {1e6 * cost:.0f} µs of processor time here. {text}",)
+    return (f"One step of one trajectory in PyTorch takes {step_cost(run):.0f} µs of processor time here. {text}",)
 
 
 def _origin(run: Run) -> tuple[Block, ...]:

@@ -124,8 +124,9 @@ def choose(seen: Look, user_settings: FitConfig) -> Plan:
 def _reasons(seen: Look, user_settings: FitConfig, *, named: bool, one_step: bool) -> dict[str, str]:
     """Why the fields of a plan are as they are, where the look at the data says it."""
     prior = "one-step fits use the last" if one_step else "held-out blocks of time choose among them"
-    as_set = {name: getattr(seen.settings, name) == getattr(user_settings, name) for name in AS_FOUND}
-    return {name: _structure_reason(seen, same) for name, same in as_set.items()} | {
+    found = {name for name in AS_FOUND if getattr(seen.settings, name) != getattr(user_settings, name)}
+    why = seen.structure or AS_SET
+    return {name: why if name in found else AS_SET for name in AS_FOUND} | {
         "level": _level_reason(seen, user_settings),
         "every": "more samples tell no more than these: residuals are no noise, and their steps are short enough",
         "substeps": (HALVED if seen.settings.substeps > 1 else KEPT_STEPS) if named else AS_SET,
@@ -149,18 +150,6 @@ def choose_objective(seen: Look, user_settings: FitConfig) -> tuple[str, str]:
     raise AssertionError("the last rule has no condition")
 
 
-def drawing() -> str:
-    """Return the choice of the objective as a mermaid flowchart (docs/trajectory.md)."""
-    lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
-    for k, rule in enumerate(RULES, 1):
-        if k == len(RULES):
-            lines.append(f'    q{k}["{rule.question.lower()}"] --> o{k}(["{rule.objective}"])')
-        else:
-            lines.append(f'    q{k}{{"{rule.question}"}} -- yes --> o{k}(["{rule.objective}"])')
-            lines.append(f"    q{k} -- no --> q{k + 1}")
-    return "\n".join(lines)
-
-
 def _network(objective: str, covered: bool, named: bool) -> tuple[str, str]:
     if named:
         return "none", "the named terms are the whole model"
@@ -181,10 +170,6 @@ def _level_reason(seen: Look, config: FitConfig) -> str:
     if seen.data.u is not None:
         return "inputs are recorded"
     return "dry or coupled friction is a force" if config.coulomb or config.coupled else "the simplest with damping"
-
-
-def _structure_reason(seen: Look, as_set: bool) -> str:
-    return AS_SET if as_set or seen.structure is None else seen.structure
 
 
 def _forces_reason(seen: Look) -> str:

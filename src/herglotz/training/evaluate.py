@@ -14,7 +14,7 @@ from torch import Tensor
 import herglotz
 from herglotz.data import Trajectories
 from herglotz.data.spikes import spikes
-from herglotz.data.splits import leading_rows
+from herglotz.data.splits import leading, leading_rows
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.config import FitConfig
 from herglotz.training.free_run import states_everywhere
@@ -101,9 +101,7 @@ def _errors(
 ) -> tuple[dict[str, Any], Tensor | None]:
     """RMS errors in units of q, None where none can be measured, and (M, n) errors of the free run where unseen."""
     data, train, base, robust = seen.data, seen.train, task.base, task.config.robust != "off"
-    training = torch.zeros(data.samples, dtype=torch.bool, device=data.t.device)
-    for first, trained in zip(data.offsets, train.lengths, strict=True):
-        training[first : first + trained] = True
+    training = leading(data.lengths, train.lengths).to(data.t.device)
     error, unit = states.q - data.q, fitted.notes.get("unit_of_s")
     used, beyond = training.clone(), ~training
     used[training] = ~dropped

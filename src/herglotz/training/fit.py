@@ -32,7 +32,7 @@ from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
 from herglotz.training.stages import Progress, Stages
-from herglotz.training.tensorboard import tensorboard_log
+from herglotz.training.tensorboard import log_result, tensorboard_log
 from herglotz.training.uncertainty import laplace
 
 
@@ -107,7 +107,7 @@ def fit(
         run = _fit(data, config, plan, Stages(progress, checkpoint, _key(data, config, plan), resume, log))
         run = replace(run, reading=reading_told(reading, data.names))
         if log is not None:
-            log.finish(run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
+            log_result(log, run.metrics, {"summary": run.summary(), "equation": str(run.equation())})
         return run
 
 

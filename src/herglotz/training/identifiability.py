@@ -71,7 +71,7 @@ def traded(posterior: Laplace) -> list[Trade]:
     `posterior` is that of a fit (`herglotz.training.laplace`).
     """
     A, P = posterior.information, len(posterior.theta)
-    names = posterior.names()
+    names = posterior.problem.parameters.numbers
     own = torch.tensor([name.startswith(PHYSICAL) for name in names])
     rows = own.nonzero()[:, 0]
     rest = torch.cat([(~own).nonzero()[:, 0], torch.arange(P, len(A))])

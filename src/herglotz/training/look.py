@@ -100,12 +100,8 @@ def look(
 ) -> Look:  # fmt: skip
     """Measure what the choice of a plan, or a given plan, needs; `named`: search for a model of named terms too.
 
-    `zeros` are those of the sensors, where the recordings differ in them (`herglotz.training.sensor_zeros`).
-
-    Raises
-    ------
-    InputError
-        If the data cannot be used, or do not suit the settings.
+    `zeros` are those of the sensors, where the recordings differ in them (`herglotz.training.sensor_zeros`). Raise
+    InputError if the data cannot be used, or do not suit the settings.
     """
     seen = _seen(data, user_settings, stages, plan, named, zeros)
     hold = "" if seen.found is None else seen.found.hold

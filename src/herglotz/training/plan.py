@@ -12,6 +12,7 @@ from herglotz.schema import from_plain
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 
+COLUMNS = 80  # of a table for people
 STARTS = ("stiffness", "tilt", "rate")  # of the baseline; `start` holds all other parameters
 
 
@@ -59,17 +60,6 @@ class Plan:
         rest = {name: values for name, values in self.start.items() if name not in STARTS}
         return replace(base, stiffness=own["stiffness"], tilt=own["tilt"], rate=own["rate"][0], start=rest)
 
-    def decisions(self, unit: str = "") -> list[tuple[str, str, str]]:
-        """What was decided, how, and why, in words: of `DECISIONS`, those that have an effect in this fit.
-
-        `unit` is that of the coordinates, where they have one in common.
-        """
-        return [
-            (WORDS[name], in_words(name, getattr(self, name), unit), self.reasons.get(name, ""))
-            for name in DECISIONS
-            if self._has_effect(name)
-        ]
-
     def _has_effect(self, name: str) -> bool:
         one_step = self.objective in ("residual", "raw")
         idle = {
@@ -90,18 +80,22 @@ class Plan:
         return not idle.get(name, False)
 
     def by_reason(self, unit: str = "") -> list[tuple[list[str], str]]:
-        """Decisions in words (`order of the time step: 2`) with the reason that they share."""
+        """Decisions in words (`order of the time step: 2`) that have an effect, with the reason that they share.
+
+        `unit` is that of the coordinates, where they have one in common.
+        """
         found: dict[str, list[str]] = {}
-        for name, taken, reason in self.decisions(unit):
-            found.setdefault(reason, []).append(f"{name}: {taken}")
+        for name in filter(self._has_effect, DECISIONS):
+            taken = in_words(name, getattr(self, name), unit)
+            found.setdefault(self.reasons.get(name, ""), []).append(f"{WORDS[name]}: {taken}")
         return [(decisions, reason) for reason, decisions in found.items()]
 
-    def table(self, width: int = 80, unit: str = "") -> str:
+    def table(self, unit: str = "") -> str:
         """The decisions, those of one reason together, and the reason below them, for people."""
         lines = []
         for decisions, reason in self.by_reason(unit):
-            lines += [textwrap.fill(x, width, initial_indent="  ", subsequent_indent="    ") for x in decisions]
-            lines.append(textwrap.fill(reason, width, initial_indent="      ", subsequent_indent="      "))
+            lines += [textwrap.fill(x, COLUMNS, initial_indent="  ", subsequent_indent="    ") for x in decisions]
+            lines.append(textwrap.fill(reason, COLUMNS, initial_indent="      ", subsequent_indent="      "))
         return "\n".join(filter(None, lines))
 
     def to_dict(self) -> dict[str, Any]:

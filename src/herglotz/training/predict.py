@@ -12,8 +12,8 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.actuator import acting
-from herglotz.data.holds import Arrival
 from herglotz.data.sensors import measured
+from herglotz.data.splits import leading, leading_rows
 from herglotz.data.waves import with_waves
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
@@ -21,7 +21,7 @@ from herglotz.stepping import State, Stepper, state_of
 from herglotz.threads import one_thread
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.free_run import near_data
+from herglotz.training.free_run import free_runs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
@@ -62,8 +62,7 @@ class Prediction:
     @property
     def free(self) -> Tensor:
         """Whether a sample is in the free run, (N,) bool."""
-        first = torch.tensor(self.data.offsets, device=self.data.t.device)[self.data.trajectory]
-        return torch.arange(self.data.samples, device=first.device) - first >= self.warmup
+        return ~leading(self.data.lengths, self.train_lengths)
 
     @property
     def failed_steps(self) -> float:
@@ -87,12 +86,11 @@ class Prediction:
         """The predicted motion as far as it was reached; None where no trajectory has three samples."""
         reached = torch.isfinite(torch.cat([self.states.q, self.states.p], -1)).all(-1)
         counts = [int(reached[a : a + k].sum()) for a, k in zip(self.data.offsets, self.data.lengths, strict=True)]
-        spans = [(a, k) for a, k in zip(self.data.offsets, counts, strict=True) if k >= 3]
-        if not spans:
+        counts = [k if k >= 3 else 0 for k in counts]
+        if not any(counts):
             return None
-        rows = torch.cat([torch.arange(a, a + k) for a, k in spans])
         whole = replace(self.data, q=self.states.q.nan_to_num(), p=self.states.p.nan_to_num(), s=None)
-        return whole.rows(rows, tuple(k for _, k in spans))
+        return whole.rows(leading_rows(self.data.lengths, counts), tuple(filter(None, counts)))
 
     def metrics(self) -> dict[str, Any]:
         """The numbers, for JSON."""
@@ -190,12 +188,6 @@ def _beyond(box: Mapping[str, Sequence[float]], found: Prediction) -> tuple[Beyo
     )
 
 
-def arrival_of(run: FittedRun) -> Arrival:
-    """What happened to the inputs of the fit before they acted; other recordings that say nothing are alike."""
-    plan = run.metrics.get("plan") or {}
-    return Arrival(plan.get("hold") or run.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
-
-
 def zeros_of(run: FittedRun) -> list[tuple[float, ...]]:
     """The zeros of the sensors in the recordings of the fit, each once, those of the reference first."""
     zeros, n = (run.metrics.get("plan") or {}).get("zeros") or (), run.data.dof
@@ -226,7 +218,7 @@ def _of_the_run(run: FittedRun, data: Trajectories) -> Trajectories:
         data, q=data.q[:, at], p=p, u=u, names=wanted.names, units=wanted.units, angles=wanted.angles,
         columns=tuple((called.get(name, name), role, unit) for name, role, unit in data.columns),
     )  # fmt: skip
-    return acting(data, arrival_of(run))
+    return acting(data, run.arrival)  # other recordings that say nothing are like those of the fit
 
 
 def _windows(data: Trajectories, warmup: int, count: int | None, horizon: float | None) -> Trajectories:
@@ -287,8 +279,9 @@ def _warmed_up(run: FittedRun, data: Trajectories, warmup: int) -> tuple[Tensor,
 
 def _warm_ups(data: Trajectories, warmup: int) -> tuple[Tensor, Trajectories]:
     """The rows of the first samples of every trajectory, (B, K), and these samples as recordings."""
-    rows = torch.tensor(data.offsets)[:, None] + torch.arange(warmup)
-    return rows, data.rows(rows.flatten(), (warmup,) * len(data))
+    lengths = (warmup,) * len(data)
+    rows = leading_rows(data.lengths, lengths)
+    return rows.reshape(-1, warmup), data.rows(rows, lengths)
 
 
 def _sigma(run: FittedRun) -> float:
@@ -314,21 +307,9 @@ def _smoothed(
 
 def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int, max_step: float) -> SegmentGrid:
     """Fill in the states after the warm-up of every trajectory, all of them stepped as one batch; return the grid."""
-    spans = list(zip(data.offsets, data.lengths, strict=True))
-    rows = torch.cat([torch.arange(a + warmup - 1, a + length) for a, length in spans])
+    rows = (~leading(data.lengths, (warmup - 1,) * len(data))).nonzero()[:, 0]
     rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)
-    start = states[[a + warmup - 1 for a, _ in spans]]
-    known = torch.isfinite(start).all(-1).nonzero()[:, 0]
-    if not len(known):
-        return grid
-    u = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    nodes = near_data(stepper.L_d, rest, grid, start, u) if len(known) == len(spans) else None  # type: ignore[arg-type]
-    if nodes is None:
-        with torch.no_grad():
-            inputs = None if u is None else u[known]
-            out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)
-        nodes = states.new_full((len(spans), grid.longest + 1, states.shape[-1]), torch.nan)
-        nodes[known] = out.states.joined
-    states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
+    inputs = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
+    states[rows] = grid.at_samples(free_runs(stepper, rest, grid, states[rows[grid.start_sample]], inputs))
     return grid

@@ -25,7 +25,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
-from herglotz.training.predict import Prediction, arrival_of, predict
+from herglotz.training.predict import Prediction, predict
 from herglotz.training.summary import as_html, one_line, summary
 
 
@@ -95,7 +95,8 @@ class Run:
     @property
     def arrival(self) -> Arrival:
         """What happens to recorded inputs before they act: hold, delay and lag; `data.u` is what acts."""
-        return arrival_of(self)
+        plan = self.metrics.get("plan") or {}
+        return Arrival(plan.get("hold") or self.data.hold, plan.get("delay", 0.0), plan.get("lag", 0.0))
 
     @property
     def setting(self) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def select(
     data = as_trajectories(data, **reading)
     levels = levels_for(data, config) if levels is None else levels
     candidates, ladder = [], [level for level in LADDER if level in levels]
-    told = _Told(len(ladder) * seeds, progress)
+    began, silent = time.monotonic(), progress is False or (progress is None and not sys.stderr.isatty())
 
     def one(level: str, seed: int) -> Run:
         folder = None if out is None else Path(out) / "fits" / f"{level}-{seed}"
@@ -186,33 +186,24 @@ def select(
             folder.mkdir(parents=True, exist_ok=True)
         settings = replace(config, level=level, seed=seed)
         run = fit(data, settings, out=folder, progress=progress, resume=resume)
-        run = replace(run, reading=reading_told(reading, data.names))
-        told(run)
-        return run
+        if not silent:
+            done = len(candidates) * seeds + seed - config.seed + 1
+            _tell(run, done, len(ladder) * seeds, time.monotonic() - began)
+        return replace(run, reading=reading_told(reading, data.names))
 
     for level in ladder:
         runs = [one(level, config.seed + k) for k in range(seeds)]
         errors = torch.stack([block_errors(run) for run in runs])
-        candidates.append(Candidate(level, tuple(runs), errors, _step_cost(runs[0])))
+        candidates.append(Candidate(level, tuple(runs), errors, step_cost(runs[0])))
     return Selection(tuple(candidates), _simplest(candidates))
 
 
-class _Told:
-    """One line on stderr after every fit, with the time that the fits to come will take at the pace so far."""
-
-    def __init__(self, total: int, progress: Progress):
-        self.total, self.done, self.began = total, 0, time.monotonic()
-        self.silent = progress is False or (progress is None and not sys.stderr.isatty())
-
-    def __call__(self, run: Run) -> None:
-        self.done += 1
-        if self.silent:
-            return
-        took, rms = time.monotonic() - self.began, run.metrics.get("extrapolation_rms")
-        left = took / self.done * (self.total - self.done)
-        error = "fails" if rms is None else f"{rms:.3g}"
-        text = f"fit {self.done} of {self.total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
-        tell(f"{text}; about {left:.0f} s left")
+def _tell(run: Run, done: int, total: int, took: float) -> None:
+    """One line on stderr after a fit, with the time that the fits to come will take at the pace so far."""
+    rms, left = run.metrics.get("extrapolation_rms"), took / done * (total - done)
+    error = "fails" if rms is None else f"{rms:.3g}"
+    text = f"fit {done} of {total}: {run.decided.level}, seed {run.config.seed}: held-out RMS {error}"
+    tell(f"{text}; about {left:.0f} s left")
 
 
 def check_levels(levels: Sequence[str] | None) -> None:
@@ -263,13 +254,13 @@ def _simplest(candidates: list[Candidate]) -> Candidate:
     return min(filter(as_good, candidates), key=lambda c: c.parameters)  # the first of equals
 
 
-def _step_cost(run: Run) -> float:
-    """Microseconds a step of the eager stepper takes, one trajectory, the best of three."""
+def step_cost(run: Run) -> float:
+    """Microseconds of processor time that a step of the eager stepper takes, one trajectory, the best of three."""
     q, p, s = (x[:1] for x in run.states)
     costs = []
     with torch.no_grad():
         for _ in range(3):
-            began = time.perf_counter()
+            began = time.process_time()
             run.stepper.rollout(q, p, s, h=run.h, steps=TIMED_STEPS)
-            costs.append((time.perf_counter() - began) / TIMED_STEPS)
+            costs.append((time.process_time() - began) / TIMED_STEPS)
     return 1e6 * min(costs)

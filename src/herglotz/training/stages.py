@@ -20,7 +20,6 @@ from herglotz.schema import check_entries
 from herglotz.telling import tell
 from herglotz.training.distributed import is_first
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, remind
-from herglotz.training.tensorboard import TensorboardLog
 
 FORMAT = 2  # 2 holds all that a search goes on from
 REMEDY = "delete it and fit from the start"
@@ -79,7 +78,7 @@ class Stages:
         checkpoint: Path | None = None,  # file to write
         key: str = "",  # identifies data and settings; a checkpoint of another fit is refused
         resume: bool = False,  # read the checkpoint if there is one
-        log: TensorboardLog | None = None,  # is told the cost of every iteration, as it is reached
+        log: Any = None,  # TensorBoard's writer, which is told the cost of every iteration as it is reached
     ):
         self.log = log if is_first() else None
         self.lines = progress in ("lines", "iterations") and is_first()
@@ -151,7 +150,7 @@ class Stages:
                 self._write()
 
             start, log = len(self.history), self.log
-            told = None if log is None else lambda k, cost: log.cost(name, start + k, cost)
+            told = None if log is None else lambda k, cost: log.add_scalar(f"cost/{name}", cost, start + k)
             began = time.monotonic()
             result = optimise(x, Callback(self.bar, store, resumed, name if self.verbose else "", told))
             if self.lines:

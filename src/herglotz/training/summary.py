@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from html import escape
 from textwrap import fill
-from typing import Any
 
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import Equation
@@ -25,11 +24,11 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
-        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
-        ("training RMS", _error(m.get("train_rms"), unit, degrees)),
-        ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
-        ("damping rate", show(m.get("rate"), f"per {per}")),
-        ("time", show(m.get("seconds"), "s")),
+        ("extrapolation RMS", _told(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
+        ("training RMS", _told(m.get("train_rms"), unit, degrees)),
+        ("one-step RMS", _told(m.get("one_step_rms"), unit, degrees)),
+        ("damping rate", _told(m.get("rate"), f"per {per}")),
+        ("time", _told(m.get("seconds"), "s")),
     ]
     return [(name, value) for name, value in found if value]
 
@@ -82,10 +81,6 @@ def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
     ])  # fmt: skip
 
 
-def _error(value: float | None, unit: str, degrees: bool, after: str = "") -> str:
-    return "" if value is None else size(value, unit, degrees) + after
-
-
-def show(value: Any, unit: str) -> str:
+def _told(value: float | None, unit: str, degrees: bool = False, after: str = "") -> str:
     """Three digits and a unit; "" where there is no value."""
-    return "" if value is None else size(value, unit)
+    return "" if value is None else size(value, unit, degrees) + after

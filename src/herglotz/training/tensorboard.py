@@ -13,28 +13,9 @@ from herglotz.errors import InputError
 SECONDS = 5  # after which TensorBoard can read what was logged
 
 
-class TensorboardLog:
-    """The cost of every iteration as it is reached, a curve a stage; at the end metrics, summary and equation."""
-
-    def __init__(self, writer: Any):
-        self.writer = writer
-
-    def cost(self, stage: str, iteration: int, cost: float) -> None:
-        """One iteration of a stage, counted over all stages."""
-        self.writer.add_scalar(f"cost/{stage}", cost, iteration)
-
-    def finish(self, metrics: dict[str, Any], words: dict[str, str]) -> None:
-        """What the fit reached: its numbers, and texts by name."""
-        for name, value in metrics.items():
-            if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
-                self.writer.add_scalar(f"metrics/{name}", value, 0)
-        for name, text in words.items():
-            self.writer.add_text(name, f"```\n{text}\n```")
-
-
 @contextmanager
-def tensorboard_log(folder: str | Path | None) -> Iterator[TensorboardLog | None]:
-    """A log into this folder, which `tensorboard --logdir FOLDER` shows while the fit runs; None without a folder.
+def tensorboard_log(folder: str | Path | None) -> Iterator[Any]:
+    """TensorBoard's writer into this folder, which it shows while the fit runs; None without a folder.
 
     Raise InputError if TensorBoard is not installed.
     """
@@ -46,4 +27,13 @@ def tensorboard_log(folder: str | Path | None) -> Iterator[TensorboardLog | None
     except ImportError:
         raise InputError("a log for TensorBoard needs it: pip install 'herglotz[tensorboard]'") from None
     with SummaryWriter(str(folder), flush_secs=SECONDS) as writer:
-        yield TensorboardLog(writer)
+        yield writer
+
+
+def log_result(writer: Any, metrics: dict[str, Any], words: dict[str, str]) -> None:
+    """What the fit reached: its numbers, and texts by name."""
+    for name, value in metrics.items():
+        if isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value):
+            writer.add_scalar(f"metrics/{name}", value, 0)
+    for name, text in words.items():
+        writer.add_text(name, f"```\n{text}\n```")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
@@ -182,8 +181,23 @@ class SegmentStages:
         trial = self.fit(length, max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
         if trial is None or not heavy_tailed(trial.misfit):
             return first
-        rest = _without_outliers(trial, lambda sigma, used: self.fit(length, sigma, None, trial, used))
-        return trial if rest is None else rest
+        return self._without_outliers(trial) or trial
+
+    def _without_outliers(self, trial: TrajectoryFit) -> TrajectoryFit | None:
+        """The same segments by least squares without the samples far from the robust fit; None if outliers remain.
+
+        A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least
+        squares, Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
+        """
+        problem, out = trial.problem, far_out(trial.misfit)
+        if float(out.double().mean()) > FEW:
+            return None
+        used = torch.ones_like(problem.used)
+        used[problem.grid.sample[out]] = False
+        rest = self.fit(self.lengths[0], trial.noise, None, trial, used)
+        if rest is None or heavy_tailed(rest.misfit):
+            return None
+        return None if float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR else rest
 
     def at_once(
         self, sigma: float, freedom: float | None = None, begin: Trajectories | None = None
@@ -328,23 +342,3 @@ def _wide_enough(task: Task, model: ContactLagrangian, sigma: float) -> tuple[Se
         if found is not None and (first is None or scale_of(found.misfit) < scale_of(first.misfit) / HALVED):
             stages, first = other, found
     return stages, first
-
-
-def _without_outliers(
-    trial: TrajectoryFit, again: Callable[[float, Tensor], TrajectoryFit | None]
-) -> TrajectoryFit | None:
-    """The same segments by least squares without the samples far from the robust fit; None if outliers remain.
-
-    A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least squares,
-    Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
-    """
-    problem = trial.problem
-    out = far_out(trial.misfit)
-    if float(out.double().mean()) > FEW:
-        return None
-    used = torch.ones_like(problem.used)
-    used[problem.grid.sample[out]] = False
-    rest = again(trial.noise, used)
-    if rest is None or heavy_tailed(rest.misfit) or float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR:
-        return None
-    return rest

@@ -1,4 +1,4 @@
-"""How far to trust a fit: the Gauss–Newton (Laplace) posterior, bands on its predictions, and what is not identified.
+"""How far to trust a fit: the Gauss–Newton (Laplace) posterior, and bands on its predictions.
 
 Around the fit, −log posterior ≈ ½ (x − x̂)ᵀ A (x − x̂) with A = JᵀJ of the trajectory problem, prior included, so the
 unknowns x (parameters and start states) have covariance A⁻¹. What a deterministic model misses is not white, and A⁻¹
@@ -66,27 +66,8 @@ class Bands:
         return (q >= low) & (q <= high)
 
 
-@dataclass(frozen=True)
-class Direction:
-    """A combination of parameters that the data say little about."""
-
-    reduction: float  # posterior over prior standard deviation along it; 1 means the data say nothing
-    parts: tuple[tuple[str, float], ...]  # the parameters it moves most, with their share
-
-
 class Laplace:
-    """Posterior of a run's parameters and start states.
-
-    Parameters
-    ----------
-    run
-        A fit whose model follows its data (`metrics["follows_data"]`).
-
-    Raises
-    ------
-    InputError
-        If the trajectories cannot be solved from the run's states.
-    """
+    """Posterior of a run's parameters and start states, as `laplace` gives it."""
 
     def __init__(self, run: Run):
         self.run = run
@@ -173,36 +154,11 @@ class Laplace:
         P = len(self.theta)
         return self.problem.parameters.unflatten(self.covariance.diagonal()[:P].clamp_min(0).sqrt())
 
-    def names(self) -> list[str]:
-        """Every entry of the parameters θ by name: `damping.rate`, `potential.network.weights.0[3]`."""
-        return self.problem.parameters.numbers
-
     def effective_parameters(self) -> float:
         """How many of the parameters the data determine: P − tr(C A_prior) (MacKay 1992)."""
         P = len(self.theta)
         _, prior, _ = self.prior.normal_equations(self.theta)
         return P - float((self.covariance[:P, :P] / self.inflation**2 * prior.double()).sum())
-
-    def least_identified(self, count: int = 5) -> list[Direction]:
-        """The parameter combinations that the data determine least, the worst first.
-
-        Eigenvectors of the posterior covariance of θ measured in units of the prior's: an eigenvalue of 1 is a
-        direction of which the data say nothing (gauge freedom, or motion that was never recorded).
-        """
-        P = len(self.theta)
-        _, prior, _ = self.prior.normal_equations(self.theta)
-        values, vectors = torch.linalg.eigh(prior.double())
-        root = vectors * values.clamp_min(values.max() * 1e-14).sqrt()  # prior = root rootᵀ
-        posterior = self.covariance[:P, :P] / self.inflation**2
-        reductions, directions = torch.linalg.eigh(root.T @ posterior @ root)
-        names, found = self.names(), []
-        for k in reversed(range(max(0, P - count), P)):
-            share = (torch.linalg.pinv(root.T) @ directions[:, k]).square()
-            share = share / share.sum()
-            top = share.argsort(descending=True)[:3].tolist()
-            parts = tuple((names[i], float(share[i])) for i in top)
-            found.append(Direction(float(reductions[k].clamp(0, 1).sqrt()), parts))
-        return found
 
     def _solved(
         self, data: Trajectories, start: Tensor, used: Tensor | None = None, guess: Tensor | None = None
@@ -235,7 +191,7 @@ def laplace(run: Run) -> Laplace:
     Returns
     -------
     Laplace
-        `bands()` on the data of the run, `predict(data)` on others, `directions()` that the data leave open.
+        `bands()` on the data of the run, `predict(data, seen)` on others, `standard_deviations()` of the parameters.
 
     Raises
     ------

@@ -113,7 +113,7 @@ def test_steps_beyond_those_of_the_fit_are_told(step, said, capsys):  # fails if
     assert ("fitted to, 0.1 to 0.2 s" in " ".join(capsys.readouterr().err.split())) is said
 
 
-@pytest.mark.parametrize("arrival", [Arrival("first", 0.2, 0.1), None])
+@pytest.mark.parametrize("arrival", [Arrival("first", 0.2, 0.1), Arrival()])
 def test_inputs_of_a_recording_arrive_as_those_of_the_fit(arrival, monkeypatch):
     # fails if a rollout drops the delay and the lag of the fit, or a file that names none is not driven
     asked = []
@@ -122,7 +122,7 @@ def test_inputs_of_a_recording_arrive_as_those_of_the_fit(arrival, monkeypatch):
     source = SimpleNamespace(arrival=arrival, time_unit="s", columns=())
     arguments = Namespace(steps=3, inputs=Path("u.csv"), u=None, h=0.1, q0=None, t0=None, trajectory=0)
     assert rollout._driven(arguments, source, 0.0) == "driven"  # pyright: ignore[reportArgumentType]
-    assert asked == [(Path("u.csv"), 0, "s", arrival or Arrival(), ())]
+    assert asked == [(Path("u.csv"), 0, "s", arrival, ())]
 
 
 def test_a_file_without_labels(monkeypatch):  # fails if a file that says nothing of its coordinates is not stepped

@@ -16,7 +16,7 @@ from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, Plan, choose, fit, look
-from herglotz.training.choose import RULES, choose_objective, drawing
+from herglotz.training.choose import RULES, choose_objective
 from herglotz.training.plan import DECISIONS, WORDS
 from herglotz.training.stages import Stages
 
@@ -38,6 +38,18 @@ def seen(noise=0.0, **settings):
     config = replace(QUICK, **settings)
     data = pendulum(noise, state=config.supervision != "q")
     return look(data, config, Stages(False, None, "", resume=False)), config
+
+
+def drawing():
+    """The choice of the objective as a mermaid flowchart."""
+    lines = ["flowchart TD", '    look["look: spikes, outliers, noise, baseline, structure, probe"] --> q1']
+    for k, rule in enumerate(RULES, 1):
+        if k == len(RULES):
+            lines.append(f'    q{k}["{rule.question.lower()}"] --> o{k}(["{rule.objective}"])')
+        else:
+            lines.append(f'    q{k}{{"{rule.question}"}} -- yes --> o{k}(["{rule.objective}"])')
+            lines.append(f"    q{k} -- no --> q{k + 1}")
+    return "\n".join(lines)
 
 
 def test_the_drawing_in_the_docs_is_the_code():
@@ -153,7 +165,7 @@ def test_what_is_no_config_is_refused():  # fails if hz.fit(t, q) ends in numpy'
 
 def test_the_plan_in_words():  # fails if a newcomer reads names of fields, or of decisions that have no effect
     plan = replace(choose(*seen(0.01)), network="none", sigma=0.0123, fitted_before=True, substeps=1)
-    words = {name: taken for name, taken, _ in plan.decisions("rad")}
+    words = dict(taken.split(": ", 1) for decisions, _ in plan.by_reason("rad") for taken in decisions)
     assert words["fitted to"] == "whole trajectories (trajectory)"
     assert words["noise assumed"] == "0.0123 rad"
     assert words["masses and friction"] == "one mass, and a potential of the named terms alone"

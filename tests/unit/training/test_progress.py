@@ -15,7 +15,7 @@ from herglotz.progress import FEWER_TERMS, FIRST_TERMS, STAGES, FitBar, Progress
 from herglotz.training.run_folder import _log
 from herglotz.training.solvers.levenberg_marquardt import OptimiserResult, levenberg_marquardt
 from herglotz.training.stages import Progress, Stages
-from herglotz.training.tensorboard import tensorboard_log
+from herglotz.training.tensorboard import log_result, tensorboard_log
 
 
 def optimise(x, callback):
@@ -195,8 +195,7 @@ def test_the_log_for_tensorboard(monkeypatch, tmp_path):
             ("cost/rest", 8.0, 3),
             ("cost/rest", 2.0, 4),
         ]
-        assert log is not None
-        log.finish(metrics, {"summary": "S", "equation": "E"})
+        log_result(log, metrics, {"summary": "S", "equation": "E"})
     words = [("summary", "```\nS\n```"), ("equation", "```\nE\n```")]
     assert (rows[0][0], rows[5:]) == (str(tmp_path), [("metrics/train_rms", 0.01, 0), *words, "closed"])
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -61,13 +60,8 @@ class SegmentGrid:
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
     """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).
 
-    None for a model that takes none. Between samples inputs do what the `hold` of the data says
-    (`herglotz.data.holds`), by default nothing. The last one of a trajectory acts on no step.
-
-    Raises
-    ------
-    InputError
-        If the model takes inputs and the data hold none, or another number of them.
+    None for a model that takes none. The last one of a trajectory acts on no step. Raise InputError if the model takes
+    inputs and the data hold none, or another number of them.
     """
     if not model.inputs:
         return None
@@ -96,67 +90,44 @@ def segment_lengths(data: Trajectories) -> list[int]:
     return [*lengths, longest]
 
 
-def substeps(h: float, max_step: float) -> int:
-    """In how many equal model steps a recorded step is crossed (a hair of tolerance for rounded time stamps)."""
-    return max(1, math.ceil(h / max_step - 1e-6))
-
-
-def _steps(
-    times: list[float], a: int, b: int, max_step: float
-) -> tuple[list[float], list[int], list[float], list[int]]:
-    """Model steps from sample a to b, the row and the middle of each, and the node of every sample after a."""
-    line: list[float] = []
-    rows: list[int] = []
-    middle: list[float] = []
-    ends: list[int] = []
-    for j in range(a, b):
-        m = substeps(times[j + 1] - times[j], max_step)
-        line += [(times[j + 1] - times[j]) / m] * m
-        rows += [j] * m
-        middle += [(k + 0.5) / m for k in range(m)]
-        ends.append(len(line))
-    return line, rows, middle, ends
-
-
 def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGrid:
     """Cut each trajectory into segments of about `length` recorded steps.
 
     Segments of one trajectory have equal lengths up to one step, so that none is a stub. The last sample of a segment
     is the first of the next; it is observed once, by the earlier segment.
     """
-    steps: list[list[float]] = []
-    rows: list[list[int]] = []
-    parts: list[list[float]] = []
-    nodes: list[list[tuple[int, int]]] = []  # (k, sample) of the observed nodes
+    recorded = data.t.double().diff()
+    counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()  # model steps; a hair for rounded time stamps
+    lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
+    seen: list[tuple[Tensor, Tensor]] = []  # its observed nodes, and their samples
     starts: list[int] = []
     joined: list[int] = []
-    times = data.t.tolist()
     for first, count in zip(data.offsets, data.lengths, strict=True):
         pieces = max(1, round((count - 1) / length))
         bounds = [first + round(i * (count - 1) / pieces) for i in range(pieces + 1)]
         for i, (a, b) in enumerate(pairwise(bounds)):
             joined.append(-1 if i == 0 else len(starts) - 1)
             starts.append(a)
-            line, from_row, middle, ends = _steps(times, a, b, max_step)
-            seen = [(0, a)] if i == 0 else []
-            seen += zip(ends, range(a + 1, b + 1), strict=True)
-            steps.append(line)
-            rows.append(from_row)
-            parts.append(middle)
-            nodes.append(seen)
-    K = max(len(line) for line in steps)
-    padded, padded_rows, padded_parts = (
-        [line + [line[-1]] * (K - len(line)) for line in lines] for lines in (steps, rows, parts)
+            sample = torch.arange(a, b + 1, device=counts.device)
+            node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
+            row = sample[:-1].repeat_interleave(counts[a:b])
+            before = torch.arange(len(row), device=row.device) - node[row - a]
+            lines.append((recorded[row] / counts[row], row, (before.double() + 0.5) / counts[row]))
+            seen.append((node[i > 0 :], sample[i > 0 :]))
+    end = torch.tensor([len(row) for _, row, _ in lines], device=counts.device)
+    K = int(end.max())
+    padding = torch.arange(K, device=end.device).minimum(end[:, None] - 1)  # the last model step again
+    h, row, part = (
+        torch.stack([x[at] for x, at in zip(each, padding, strict=True)]) for each in zip(*lines, strict=True)
     )
-    device = data.t.device
     return SegmentGrid(
-        h=torch.tensor(padded, dtype=data.t.dtype, device=device),
-        node=torch.tensor([s * (K + 1) + k for s, seen in enumerate(nodes) for k, _ in seen], device=device),
-        sample=torch.tensor([j for seen in nodes for _, j in seen], device=device),
-        start_sample=torch.tensor(starts, device=device),
-        joined_to=torch.tensor(joined, device=device),
-        end=torch.tensor([len(line) for line in steps], device=device),
-        row=torch.tensor(padded_rows, device=device),
-        part=torch.tensor(padded_parts, dtype=data.t.dtype, device=device),
+        h=h.to(data.t),
+        node=torch.cat([s * (K + 1) + node for s, (node, _) in enumerate(seen)]),
+        sample=torch.cat([sample for _, sample in seen]),
+        start_sample=torch.tensor(starts, device=end.device),
+        joined_to=torch.tensor(joined, device=end.device),
+        end=end,
+        row=row,
+        part=part.to(data.t),
         length=length,
     )

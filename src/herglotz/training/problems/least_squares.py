@@ -69,14 +69,14 @@ class StatesProblem(LeastSquares, ABC):
         super().__init__(model, data, **settings)
         self.grid = grid
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
-        self.u = step_inputs(model, data, grid)  # (S, K, m)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
         self.mass = self._masses(model)  # (n,) in the units of p over those of v
+        self.u = step_inputs(model, data, grid)  # (S, K, m)
 
     def _masses(self, model: ContactLagrangian) -> Tensor:
         """Median of h times the diagonal of the mixed Hessian over steps of the data, (n,); 1 where it is no size."""
-        steps, u = self.data.steps(), step_inputs(model, self.data)
+        steps, u = self.data.steps(), self.u
         some = torch.linspace(0, len(steps.h) - 1, min(SOME, len(steps.h)), device=steps.h.device).round().long()
         i, h = steps.index[some], steps.h[some]
         with torch.no_grad():
@@ -91,12 +91,10 @@ class StatesProblem(LeastSquares, ABC):
     @abstractmethod
     def cost(self, x: Tensor) -> Tensor:
         """½|r|², a scalar; infinite where a step has no solution."""
-        ...
 
     @abstractmethod
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Any, Tensor]:
         """(½|r|², JᵀJ, Jᵀr); `held`: of the states alone, the parameters as they are."""
-        ...
 
 
 class StatesOnly:

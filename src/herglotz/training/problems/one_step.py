@@ -24,26 +24,34 @@ from herglotz.training.distributed import LaneSums, add_over_processes, own_part
 from herglotz.training.problems.least_squares import LeastSquares
 from herglotz.training.problems.recorded_action import action, action_derivative
 
-OBJECTIVES = ("position", "raw")
 MANY = 6  # coordinates from which on second derivatives of L_d by θ would cost more than all the rest
 CHUNK = 4096  # triples whose Jacobian is held in memory at once: 4096 · 2 · 300 parameters are 20 MB
 
 
 class OneStep(LeastSquares, ABC):
-    """Σ ρ(r/σ) + prior over the parameters and `latents` further unknowns, with r a function of three samples.
+    """Σ ρ(r/σ) + prior over the parameters and a few further unknowns, with r a function of three samples.
 
     A subclass supplies `start`, `_rows` (what `_local` takes of some triples) and `_local` (the residuals of one triple
     or of a batch of them).
     """
 
-    latents: int
-    triples: Triples
-    chunk: int
+    def __init__(
+        self,
+        model: ContactLagrangian,
+        data: Trajectories,
+        triples: Triples,
+        *,
+        sigma: float = 1.0,
+        chunk: int = CHUNK,  # triples whose Jacobian is held in memory at once
+        **settings: Any,  # of `LeastSquares`
+    ):
+        super().__init__(model, data, sigma=sigma, **settings)
+        self.triples, self.chunk = triples, chunk
+        self.deviation = triples.h0.new_full((len(triples), 1), sigma)  # the standard deviation of every r
 
     @abstractmethod
     def start(self) -> Tensor:
-        """All unknowns: parameters, then the latents."""
-        ...
+        """All unknowns, the parameters first."""
 
     @abstractmethod
     def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]: ...
@@ -63,11 +71,6 @@ class OneStep(LeastSquares, ABC):
         return r, J
 
     @property
-    def deviation(self) -> Tensor:
-        """The standard deviation of every r, (T, 1)."""
-        return self.triples.h0.new_full((self.rows, 1), self.sigma)
-
-    @property
     def rows(self) -> int:
         """Number of triples."""
         return len(self.triples)
@@ -75,7 +78,7 @@ class OneStep(LeastSquares, ABC):
     def all_residuals(self, x: Tensor) -> Tensor:
         """R of every triple, (T, k), in units of q."""
         with torch.no_grad():
-            return self._local(self._theta(x), *self._rows(slice(None), self._carried(x, derivative=False)))
+            return self._local(x, *self._rows(slice(None), self._carried(x, derivative=False)))
 
     def residuals(self, x: Tensor) -> Tensor:
         """The errors of the recorded positions, (T, n), over the balance of the coordinates (of p: the raw metric)."""
@@ -128,10 +131,6 @@ class OneStep(LeastSquares, ABC):
             rows = self._rows(part, None)
             yield part, lambda theta, rows=rows, by=self.deviation[part]: (self._local(theta, *rows) / by).reshape(-1)
 
-    def _theta(self, x: Tensor) -> Tensor:
-        """What `_local` takes of the unknowns: all of them."""
-        return x
-
     def _inputs(self, rows: Tensor) -> tuple[Tensor | None, Tensor | None]:
         """Inputs of the two steps of the triples that start at these rows; None, None for a model without inputs."""
         return (None, None) if self.u is None else (self.u[rows], self.u[rows + 1])
@@ -148,36 +147,22 @@ class ResidualProblem(OneStep):
         model: ContactLagrangian,
         data: Trajectories,
         *,
-        sigma: float = 1.0,
         metric: str = "position",  # for J⁻¹R; "raw" for R
         max_step: float | None = None,  # triples that span a longer step (gaps) are left out
         # Triples that were not recorded, and their standard deviation (`baseline_motion`).
         expected: tuple[Triples, float] | None = None,
         most: int | None = None,  # recorded triples, evenly spread; None: all, and so where s enters the motion
-        chunk: int = CHUNK,  # triples whose Jacobian is held in memory at once
-        **settings: Any,  # of `LeastSquares`
+        **settings: Any,  # of `OneStep`
     ):
-        super().__init__(model, data, sigma=sigma, **settings)
-        self.metric, self.chunk, self.carries_s = metric, chunk, model.s_enters_motion
-        self.triples = data.triples(max_step)
+        self.metric, self.carries_s, triples = metric, model.s_enters_motion, data.triples(max_step)
         if most is not None and not self.carries_s:
-            self.triples = self.triples.spread_out(most)
-        self.expected, self.error = 0, sigma
+            triples = triples.spread_out(most)
+        super().__init__(model, data, triples if expected is None else join(triples, expected[0]), **settings)
+        self.recorded = len(triples)  # those that are only expected follow them
         if expected is not None:
-            self.triples, self.expected, self.error = join(self.triples, expected[0]), len(expected[0]), expected[1]
+            self.deviation[self.recorded :] = expected[1]
         self.latents = len(data) if self.carries_s else 0
         self.many = data.dof >= MANY and not self.carries_s and metric == "position"
-
-    @property
-    def recorded(self) -> int:
-        """How many of the triples are data; those that are only expected follow them."""
-        return len(self.triples) - self.expected
-
-    @property
-    def deviation(self) -> Tensor:
-        """The standard deviation of every r, (T, 1)."""
-        kinds = (self.recorded, self.sigma), (self.expected, self.error)
-        return torch.cat([self.triples.h0.new_full((count, 1), s) for count, s in kinds])
 
     def start(self) -> Tensor:
         """Parameters, then the latents (zero)."""
@@ -195,9 +180,6 @@ class ResidualProblem(OneStep):
         assert rows is None  # FitConfig checked
         cost, _, gradient = self.normal_equations(x)
         return cost, gradient
-
-    def _theta(self, x: Tensor) -> Tensor:
-        return x[: self.P]
 
     def _carried(self, x: Tensor, *, derivative: bool) -> tuple[Tensor, Tensor | None] | None:
         """S at every sample, (N,), and ds/dx, (N, unknowns)."""
@@ -229,8 +211,9 @@ class ResidualProblem(OneStep):
     def _local(self, x: Tensor, *rows: Any) -> Tensor:
         """J⁻¹R over the balance of the coordinates (or R) of one triple or of a batch of them."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
-        before = self.parameters.partials(x, q0, q1, s0, h0, 1, u0)
-        after = self.parameters.partials(x, q1, q2, s0 + before.L, h1, 2, u1)
+        theta = x[: self.P]
+        before = self.parameters.partials(theta, q0, q1, s0, h0, 1, u0)
+        after = self.parameters.partials(theta, q1, q2, s0 + before.L, h1, 2, u1)
         p = momentum_plus(before)
         R = momentum_residual(after, p)
         if self.metric == "raw":

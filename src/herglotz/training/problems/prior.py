@@ -17,7 +17,7 @@ NETWORKS = ("potential.network", "damping.network", "correction", "kinetic.netwo
             "action.weight", "action.bias")  # fmt: skip
 WIDTH = 0.5  # of the logarithms of dry friction's widths: below what a step resolves, they only make it stiff
 SPLIT = 1e-3  # of a rate: friction of one coordinate is its rate, and a rate that friction cancels hides long steps
-MOST = 256  # points of the grid: more do not change an RMS, and each of them has a row for every coordinate
+EACH, MOST = 64, 256  # points of the grid, a coordinate and at most: more do not change an RMS, and each has n rows
 BREAKAWAY = 0.01  # of Stribeck's excess force, in forces of the baseline: a broad one would replace viscous friction
 
 
@@ -44,12 +44,11 @@ class Prior:
         departure: float | None,
         weight: float = 10.0,
         rate_spread: float = 1.0,
-        grid: int = 64,
     ):
         self.parameters = ParameterVector(model)
         self.start, self.departure = self.parameters.get(), departure
         points = torch.quasirandom.SobolEngine(2 * len(low), seed=0, scramble=True)
-        unit = points.draw(min(grid * len(low), MOST)).to(low)
+        unit = points.draw(min(EACH * len(low), MOST)).to(low)
         speed = low.new_tensor(model.config.speed)
         self.grid = unit[:, : len(low)] * (high - low) + low
         self.velocity = (2 * unit[:, len(low) :] - 1) * speed

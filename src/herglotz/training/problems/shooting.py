@@ -196,9 +196,7 @@ class ShootingProblem(StatesProblem):
     def guess_from(self, other: ShootingProblem, path: Path) -> Tensor:
         """Start the next solve from a path over other segments, samples or model steps, linear between its nodes.
 
-        Returns the states (S, d) that it has where segments start.
-
-        Without one the next solve steps through the trajectories, one small step after the other.
+        Return the states (S, d) that it has where segments start.
         """
         old, new = other.grid.times(other.data), self.grid.times(self.data)
         values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])

@@ -18,7 +18,7 @@ from herglotz.least_squares import least_squares
 from herglotz.mechanics import momentum_jacobian, momentum_plus, momentum_residual
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import solve
-from herglotz.training.problems.one_step import CHUNK, OneStep
+from herglotz.training.problems.one_step import OneStep
 
 
 class SupervisedProblem(OneStep):
@@ -26,15 +26,9 @@ class SupervisedProblem(OneStep):
 
         r_q = J⁻¹R at the recorded s,    r_s = (s₁ − s₀)/κ − L_d,    r_p = p₁/κ − D2 L_d − F⁺ (with momenta only),
 
-    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`.
-
-    Raises
-    ------
-    InputError
-        If s, or p where it is asked for, is not recorded.
+    r_s and r_p brought to units of q by the natural sizes of s and p. Settings are those of `ResidualProblem`. Raise
+    InputError if s, or p where it is asked for, is not recorded.
     """  # noqa: D400  the formula is part of the sentence
-
-    latents = 1
 
     def __init__(
         self,
@@ -43,8 +37,6 @@ class SupervisedProblem(OneStep):
         *,
         momenta: bool,  # whether recorded momenta are used too
         max_step: float | None = None,
-        sigma: float = 1.0,
-        chunk: int = CHUNK,
         **settings: Any,
     ):
         for name, wanted in (("s", True), ("p", momenta)):
@@ -53,8 +45,8 @@ class SupervisedProblem(OneStep):
                     f"{data.source or 'data'}: supervision by {name} needs {name} at every sample; "
                     "record it or set supervision='q'"
                 )
-        super().__init__(model, data, sigma=sigma, **settings)
-        self.chunk, self.momenta, self.triples = chunk, momenta, data.triples(max_step)
+        super().__init__(model, data, data.triples(max_step), **settings)
+        self.momenta = momenta
         size = max(model.config.scale)
         self.of_s = size / sum(v * x for v, x in zip(model.config.speed, model.config.scale, strict=True))
         self.of_p = size / data.q.new_tensor(model.config.speed)
@@ -69,10 +61,6 @@ class SupervisedProblem(OneStep):
         columns = torch.stack([L, t.h0 * before], 1).cpu()
         kappa = float(least_squares(columns, (s[t.index + 1] - before)[:, None].cpu())[0])
         return torch.cat([theta, theta.new_tensor([kappa if kappa > 0 else 1.0]).log()])
-
-    def unit(self, x: Tensor) -> float:
-        """κ: the recorded s and p over the model's."""
-        return float(x[-1].exp())
 
     def _rows(self, part: Tensor | slice, carried: Any) -> tuple[Tensor | None, ...]:  # noqa: ARG002
         t, d = self.triples, self.data

@@ -33,34 +33,19 @@ class Differentiable(Protocol):
 
 def adam(
     problem: Differentiable,
-    x: Tensor,
+    x: Tensor,  # (P,) start
     *,
-    max_iterations: int = 2000,
-    learning_rate: float = 3e-3,
-    decay: float = 0.0,
-    batch: int | None = None,
-    seed: int = 0,
-    callback: Progress | None = None,
+    max_iterations: int = 2000,  # length of the schedule
+    learning_rate: float = 3e-3,  # its peak
+    decay: float = 0.0,  # of the weights, as in AdamW
+    batch: int | None = None,  # rows a step, each once a round; None: all
+    seed: int = 0,  # of the order of the rows
+    callback: Progress | None = None,  # called after each iteration; a search goes on from what it holds, bit for bit
 ) -> OptimiserResult:
     """Adam with a cosine schedule; returns the best finite point visited.
 
-    Parameters
-    ----------
-    problem
-        The objective.
-    x
-        (P,) start.
-    max_iterations, learning_rate
-        Length and peak of the cosine schedule. The search ends earlier where the cost has stopped to change.
-    decay
-        Of the weights, as in AdamW.
-    batch
-        Rows a step, drawn without replacement, each once a round; None: all. The cost of all of them is taken, and the
-        best point chosen by it, once a round.
-    seed
-        Of the order of the rows.
-    callback
-        Called after each iteration; an interrupted search goes on from what it holds, and gives the same bits.
+    The search ends earlier where the cost has stopped to change. With batches the cost of all rows is taken, and the
+    best point chosen by it, once a round.
     """
     current = x.clone().requires_grad_()
     optimiser = torch.optim.AdamW([current], lr=learning_rate, weight_decay=decay)

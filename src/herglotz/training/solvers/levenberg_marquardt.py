@@ -110,14 +110,14 @@ class _Search:
 
 def levenberg_marquardt(
     problem: SumOfSquares,
-    x: Tensor,
+    x: Tensor,  # (P,) start
     *,
-    max_iterations: int = 150,
+    max_iterations: int = 150,  # accepted and rejected steps together
     rtol: float = 1e-6,
     atol: float = 0.0,
     patience: int = 5,
-    damping: float = 1e-3,
-    callback: Progress | None = None,
+    damping: float = 1e-3,  # λ of the first step; far smaller where few combinations of the unknowns are free
+    callback: Progress | None = None,  # called after each iteration; a search goes on from what it holds, bit for bit
 ) -> OptimiserResult:
     """Minimise ½|r(x)|².
 
@@ -125,28 +125,10 @@ def levenberg_marquardt(
     monotone version) by Cholesky, or by conjugate gradients where JᵀJ is known by its products; λ follows the ratio of
     actual to predicted decrease (Nielsen's rule).
 
-    Parameters
-    ----------
-    problem
-        Supplies cost and normal equations.
-    x
-        (P,) start.
-    max_iterations
-        Bound on accepted and rejected steps together.
-    rtol, atol, patience
-        Stop after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol` relative.
-        A step that changes it by rounding only is not taken and counts as one of them. Stop at once where an all but
-        undamped step is to lower it by less than a hundredth of that.
-    damping
-        λ of the first step. Where few combinations of the unknowns are free beside the diagonal (smoothed states), it
-        has to be far smaller than where all are.
-    callback
-        Called after each iteration; an interrupted search goes on from what it holds, and gives the same bits.
-
-    Returns
-    -------
-    OptimiserResult
-        Always the best finite point; `reason` tells why the search ended.
+    The search ends after `patience` accepted steps in a row that each lower the cost by less than `atol`, or `rtol`
+    relative. A step that changes it by rounding only is not taken and counts as one of them. It ends at once where an
+    all but undamped step is to lower the cost by less than a hundredth of that. The result is always the best finite
+    point.
     """
     resumed = None if callback is None else callback.resumed
     if resumed is not None:
