@@ -6,12 +6,13 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.splits import leading_rows
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Stepper, state_of
 from herglotz.training.first_states import states_of_pairs
 from herglotz.training.objectives import Fitted
 from herglotz.training.parameter_vector import ParameterVector
-from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs, substeps
+from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import solve_path
 
@@ -19,39 +20,42 @@ from herglotz.training.solvers.lifted_newton import solve_path
 def states_everywhere(
     fitted: Fitted, data: Trajectories, train_lengths: tuple[int, ...], max_step: float
 ) -> tuple[State, str]:
-    """States at every sample, those of the training part and a free run from the last of them; and "ok", or why not.
+    """States at every sample, those of the training part and a free run from the last of them; and "ok", or why not."""
+    out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
+    out[leading_rows(data.lengths, train_lengths)] = fitted.states
+    if train_lengths == data.lengths:
+        return state_of(out), "ok"
+    lengths = zip(data.offsets, data.lengths, train_lengths, strict=True)
+    spans = [(first + trained - 1, length - trained + 1) for first, length, trained in lengths]
+    rows = torch.cat([torch.arange(first, first + length, device=data.t.device) for first, length in spans])
+    rest = data.rows(rows, tuple(length for _, length in spans))
+    grid = segment_grid(rest, rest.samples, max_step)
+    inputs = None if step_inputs(fitted.model, data) is None else data.inputs_of_steps(rows[grid.row], grid.part)
+    nodes = free_runs(Stepper(fitted.model), rest, grid, out[rows[grid.start_sample]], inputs)
+    out[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
+    ends = [first for first, length in spans if not bool(torch.isfinite(out[first + length - 1]).all())]
+    if ends:
+        return state_of(out), f"a step failed after t = {float(data.t[ends[-1]]):g}; nothing is predicted beyond it"
+    return state_of(out), "ok"
+
+
+def free_runs(stepper: Stepper, data: Trajectories, grid: SegmentGrid, start: Tensor, u: Tensor | None) -> Tensor:
+    """Free runs from `start`, (S, 2n+1), over whole trajectories, (S, K+1, 2n+1); NaN from a failed step on.
 
     A model that follows the data has its free run near them: all steps are then solved at once, from the data. Else one
-    after the other.
+    after the other. Starts that are not known, NaN, have no motion.
     """
-    ends = torch.tensor(data.offsets) + torch.tensor(train_lengths)
-    out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
-    trained = torch.arange(data.samples) < ends[data.trajectory.cpu()]
-    out[trained] = fitted.states
-    if bool(trained.all()):
-        return state_of(out), "ok"
-    found, status = _at_once(fitted, data, out, ends, max_step), "ok"
-    if found is None:
-        found, status = _stepped(fitted, data, out, ends, max_step)
-    return state_of(found), status
-
-
-def _at_once(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> Tensor | None:
-    """`out` with the free runs, solved together from the recorded positions; None where that does not converge."""
-    index = torch.arange(data.samples)
-    rows = index[index >= ends[data.trajectory.cpu()] - 1]
-    lengths = tuple((torch.tensor(data.offsets) + torch.tensor(data.lengths) - ends + 1).tolist())
-    if min(lengths) < 2:
-        return None
-    rest = data.rows(rows, lengths)
-    grid = segment_grid(rest, rest.samples, max_step)
-    inputs = None if step_inputs(fitted.model, rest) is None else data.inputs_of_steps(rows[grid.row], grid.part)
-    nodes = near_data(fitted.model, rest, grid, out[rows[grid.start_sample]], inputs)
-    if nodes is None:
-        return None
-    out = out.clone()
-    out[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
-    return out
+    known = torch.isfinite(start).all(-1)
+    nodes = near_data(stepper.L_d, data, grid, start, u) if bool(known.all()) else None  # type: ignore[arg-type]
+    if nodes is not None:
+        return nodes
+    nodes = start.new_full((len(start), grid.longest + 1, start.shape[-1]), torch.nan)
+    if bool(known.any()):
+        inputs = None if u is None else u[known]
+        with torch.no_grad():
+            out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)
+        nodes[known] = out.states.joined
+    return nodes
 
 
 def near_data(
@@ -99,31 +103,3 @@ def continued(model: ContactLagrangian, start: Tensor, h: Tensor, u: Tensor | No
             new = stepped(slice(k, k + 1)) if new is None else new
             x, k = torch.cat([x, new[:, 1:]], 1), k + new.shape[1] - 1
     return x
-
-
-def _stepped(fitted: Fitted, data: Trajectories, out: Tensor, ends: Tensor, max_step: float) -> tuple[Tensor, str]:
-    """`out` with the free runs, one step after the other, and "ok" or why it ends; NaN from a failed step on."""
-    stepper, status, driven = Stepper(fitted.model), "ok", step_inputs(fitted.model, data) is not None
-    for first, length, end in zip(data.offsets, data.lengths, ends.tolist(), strict=True):
-        if end == first + length:
-            continue
-        h, stops, row, part = _fine_steps(data.t[end - 1 : first + length], max_step)
-        inputs = data.inputs_of_steps(end - 1 + row, part) if driven else None
-        with torch.no_grad():
-            run = stepper.rollout(*state_of(out[end - 1]), h=h, inputs=inputs)
-        out[end : first + length] = run.states.joined[stops]
-        if not bool(run.ok.all()):
-            status = f"a step failed after t = {float(data.t[end - 1]):g}; nothing is predicted beyond it"
-    return out, status
-
-
-def _fine_steps(t: Tensor, max_step: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Model steps that cover the recorded times; the node that reaches each of them; each step's row, and its middle.
-
-    The middle is a number from 0 to 1, of the recorded step that starts at the row.
-    """
-    counts = torch.tensor([substeps(h, max_step) for h in t.diff().tolist()], device=t.device)
-    row = torch.arange(len(counts), device=t.device).repeat_interleave(counts)
-    ends = counts.cumsum(0)
-    part = (torch.arange(len(row), device=t.device) - (ends - counts)[row] + 0.5) / counts[row]
-    return (t.diff() / counts).repeat_interleave(counts), ends, row, part.to(t.dtype)

@@ -21,7 +21,7 @@ from herglotz.stepping import State, Stepper, state_of
 from herglotz.threads import one_thread
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.fitted_run import FittedRun
-from herglotz.training.free_run import near_data
+from herglotz.training.free_run import free_runs
 from herglotz.training.problems.grid import SegmentGrid, segment_grid, step_inputs
 from herglotz.training.problems.smoothing import SmoothingProblem
 from herglotz.training.recorded_range import Beyond, farthest, quantities_outside
@@ -319,16 +319,7 @@ def _free_run(stepper: Stepper, data: Trajectories, states: Tensor, warmup: int,
     rest = data.rows(rows, tuple(length - warmup + 1 for length in data.lengths))
     grid = segment_grid(rest, rest.samples, max_step)
     start = states[[a + warmup - 1 for a, _ in spans]]
-    known = torch.isfinite(start).all(-1).nonzero()[:, 0]
-    if not len(known):
-        return grid
     u = step_inputs(stepper.L_d, rest, grid)  # type: ignore[arg-type]
-    nodes = near_data(stepper.L_d, rest, grid, start, u) if len(known) == len(spans) else None  # type: ignore[arg-type]
-    if nodes is None:
-        with torch.no_grad():
-            inputs = None if u is None else u[known]
-            out = stepper.rollout(*state_of(start[known]), h=grid.h[known], inputs=inputs)
-        nodes = states.new_full((len(spans), grid.longest + 1, states.shape[-1]), torch.nan)
-        nodes[known] = out.states.joined
+    nodes = free_runs(stepper, rest, grid, start, u)
     states[rows[grid.sample]] = nodes.flatten(0, 1)[grid.node]
     return grid

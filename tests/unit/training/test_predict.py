@@ -153,7 +153,7 @@ def test_a_step_that_fails_is_counted_and_ends_the_motion(monkeypatch):
         return replace(out, q=q)
 
     monkeypatch.setattr(Stepper, "rollout", breaks)
-    monkeypatch.setattr("herglotz.training.predict.near_data", lambda *_: None)
+    monkeypatch.setattr("herglotz.training.free_run.near_data", lambda *_: None)
     found = predict(run_of_quietly(model, own), recorded_quietly(model, own))
     assert found.failed_steps == pytest.approx(51 / 122)
     assert found.rms < 1e-9  # type: ignore[operator]
