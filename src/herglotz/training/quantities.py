@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from herglotz.training.equation_words import unit_of
 from herglotz.training.evaluate import unseen_errors
 from herglotz.training.identifiability import PHYSICAL, WORDS
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
 
 INPUT_MAP = "friction.input_map"
-# Powers of the coordinate's unit and of time in each parameter's unit; the first coordinate's mass is 1.
+# Each parameter's unit is this power of the coordinate's unit over that of time; the first coordinate's mass is 1.
 DIMENSIONS = {
-    "potential.stiffness": (0, -2),
-    "potential.tilt": (1, -2),
-    "damping.rate": (0, -1),
-    "friction.viscous": (0, -1),
-    "friction.coulomb": (1, -2),
-    "friction.breakaway": (1, -2),
-    INPUT_MAP: (1, -2),  # per unit of the input
+    "potential.stiffness": (0, 2),
+    "potential.tilt": (1, 2),
+    "damping.rate": (0, 1),
+    "friction.viscous": (0, 1),
+    "friction.coulomb": (1, 2),
+    "friction.breakaway": (1, 2),
+    INPUT_MAP: (1, 2),  # per unit of the input
 }
 LOGARITHMS = ("kinetic.log", "friction.log")  # stored as logarithms: such a value has no unit
 
@@ -70,14 +71,12 @@ def _unit(name: str, run: Run, i: int) -> str:
         return run.data.input_labels[i][1]
     if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
         return ""
-    length, time = DIMENSIONS[name]
     row, per = i, ""
     if name == INPUT_MAP:
         row, (of, unit) = i // run.model.inputs, _source(run, i)
         per = f" per {unit or of}"
-    own = run.data.units[min(row, run.data.dof - 1)]
-    above = own if length and own != "1" else "1"
-    return f"{above}/{run.data.time_unit}" + ("²" if time == -2 else "") + per
+    length, time = DIMENSIONS[name]
+    return unit_of(run.data.units[min(row, run.data.dof - 1)], length, run.data.time_unit, time) + per
 
 
 def _source(run: Run, i: int) -> tuple[str, str]:
