@@ -58,8 +58,6 @@ def linear_starts(
     errors may be noise, which whole trajectories tell. The best start `one_of` other families stands alone where it
     errs less than the first, or as little with fewer of them.
     """
-    if not families:
-        return []
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
     starts = (start for terms in families if (start := problem.start(terms)) is not None)
     tried = sorted({start.terms: start for start in starts}.values(), key=lambda start: start.size)
@@ -85,6 +83,8 @@ class LinearTerms:
         self.held = holders([x for x in every.features if x not in self.own], every.drag)
         self.overlap = max(1.0, local.width / 2)
         self.fit = self._problem(local)
+        terms = {parameter: iter(names) for parameter, names in self.held.items()}
+        self.names = [next(terms[x]) if x in terms else x for x in self.fit.names]  # of terms, or of parameters
         self.count = max(3, int(self.fit.R[..., 0].numel() / self.overlap))  # residuals that do not say the same
 
     def start(self, of: NamedTerms) -> LinearStart | None:
@@ -169,27 +169,22 @@ class LinearTerms:
         i, j = pairs(self.data.dof, torch.device("cpu"))
         joints = any(self.data.angles) and not of.apart
         diagonal = iter((i == j).tolist())
-        order = {parameter: iter(names) for parameter, names in self.held.items()}
 
         def used(name: str) -> bool:
             if name == "mass":
                 return next(diagonal) or joints
-            if name in order:
-                return next(order[name]) in of.names
             if name in SPRINGS:
                 return of.springs
-            return of.dry if name == DRY else joints or name != "coupling.viscous"
+            return name in of.names if name in self.all.names else joints or name != "coupling.viscous"
 
-        return torch.tensor([used(name) for name in self.fit.names])
+        return torch.tensor([used(name) for name in self.names])
 
     def _linear_places(self, columns: Tensor) -> dict[str, list[int]]:
         """Columns of each term among those that are used, the first mass not counted."""
-        order = {parameter: iter(names) for parameter, names in self.held.items()}
         own = {parameter: term for term, (parameter, _) in self.own.items()}
-        names = [next(order[x]) if x in order else own.get(x, x) for x in self.fit.names]
-        left = [name for name, used in zip(names, columns.tolist(), strict=True) if used][1:]
+        left = [own.get(self.names[k], self.names[k]) for k in columns.nonzero()[1:, 0].tolist()]
         at: dict[str, list[int]] = {}
         for i, name in enumerate(left):
-            if name in (*self.all.names, DRY):
+            if name in self.all.names:
                 at.setdefault(name, []).append(i)
         return at
