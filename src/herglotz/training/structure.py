@@ -52,7 +52,6 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
-TOLD = ("reason", "sigma", "doubt", "apart", "every", "hold")  # of `Structure`, as a checkpoint has it
 
 VISCOUS = "friction.viscous"
 
@@ -91,23 +90,17 @@ def _nothing_named(c: FitConfig) -> bool:
     return plain and not any(getattr(c, name) for name in NAMED)
 
 
-def dictionary(data: Trajectories) -> tuple[str, ...]:
-    """The features that these coordinates are tried with."""
-    if any(data.angles):
-        return tuple(revolute(data.angles))
-    away = distances(data)
-    return tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
-
-
 def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
-    """The dictionary and, of coordinates without an angle, the springs between them alone, which need fewer samples.
+    """All features and, of coordinates without an angle, the springs between them alone, which need fewer samples.
 
     A dictionary takes part where the samples suffice for its coefficients and their derivatives take no more than
     `NUMBERS`: at 200 samples the whole one up to 14 coordinates, springs up to 22.
     """
-    names = dictionary(data)
-    springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
-    return [names] if any(data.angles) else [names, springs]
+    if any(data.angles):
+        return [tuple(revolute(data.angles))]
+    away = distances(data)
+    names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
+    return [names, tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))]
 
 
 def kept_structure(
@@ -119,12 +112,11 @@ def kept_structure(
     def search() -> dict[str, Any]:
         found = find()
         start = {name: getattr(found.base, name) for name in numbers}
-        rest = {name: getattr(found, name) for name in TOLD}
-        return {"config": found.config.to_dict(), "base": start, **rest}
+        return found._asdict() | {"config": found.config.to_dict(), "base": start}
 
     kept = stages.keep(name, search)
-    found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
-    return Structure(found, replace(base, **kept["base"]), **{name: kept[name] for name in TOLD})
+    settings = replace(FitConfig.from_dict(kept["config"]), device=config.device)
+    return Structure(**kept | {"config": settings, "base": replace(base, **kept["base"])})
 
 
 def search(
