@@ -125,7 +125,7 @@ class DictionarySearch:
         if found is None:
             return None
         for simple in simpler:
-            other = self._grown(simple.terms, simple.values, 1, start)
+            other = self._grown(simple.terms, simple.values, start)
             other = None if other is None else self._finer(self._held(other))
             if other is not None and other.instead_of(found, self.floor):
                 return other
@@ -137,7 +137,7 @@ class DictionarySearch:
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
         linear = starts_of(self.recorded, self.base, self.all, local)
-        grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
+        grown = ((self._grown(of, x.values, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
         if bare is None and self._misled(found):
             bare = self._bare(start)
@@ -192,7 +192,7 @@ class DictionarySearch:
         return max(1, every // (found.config.substeps * 2**halvings))
 
     def _bare(self, start: Trajectories) -> Found | None:
-        return self._grown(*without_terms(self.all, self.base), 1, start)
+        return self._grown(*without_terms(self.all, self.base), start)
 
     def _braking(self, found: Found) -> Found:
         """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
@@ -218,7 +218,7 @@ class DictionarySearch:
         values, config = {**found.values, EXCESS: (excess,) * self.data.dof}, replace(found.config, sticking=True)
         return self.refit(replace(found, values=values, config=config), found.terms)
 
-    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
+    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
         config = replace(config, sticking=bool(sticking) and terms.dry)
         base = started(self.base, self.data, values, config)
@@ -233,9 +233,9 @@ class DictionarySearch:
         base = started(task.base, self.data, values, task.config)
         return Found(terms, task.config, values, base, fit, whole, self.spread)
 
-    def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
+    def _grown(self, terms: NamedTerms, values: dict, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
-        stages = self._stages(terms, values, substeps, self.config.sticking)
+        stages = self._stages(terms, values, 1, self.config.sticking)
         stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
