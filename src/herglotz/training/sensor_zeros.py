@@ -159,17 +159,16 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
 def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
     """By all of these parts; None where the model cannot follow one."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
-    theta, n = problem.parameters.get(), data.dof
-    problem.guess_from_states(states_of_pairs(model, data))
-    x = torch.cat([problem.pack(theta, first_states(problem, theta, data)), theta.new_zeros(n)])
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
-    found = _fitted(target, x)
+    found = _fitted(target, problem.parameters.get(), data)
     return None if found is None else tuple(clearly(found).z.tolist())
 
 
-def _fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
-    """The zeros as a vector, from these unknowns; None where the model cannot follow the recordings."""
+def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros | None:
+    """The zeros as a vector, from 0 with these parameters, and states read off `begin`; None where nothing follows."""
     problem = target.problem
+    problem.guess_from_states(states_of_pairs(problem.parameters.model, begin))
+    x = torch.cat([problem.pack(theta, first_states(problem, theta, begin)), theta.new_zeros(target.count)])
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
         return None
@@ -232,23 +231,20 @@ class ZerosOf:
         Parameters that are `held` are 0, and the reference has zeros too. The misfit is infinite where the model cannot
         follow the recordings.
         """
-        data, n, base = measured(self.data, start.flatten().tolist()), self.data.dof, self.task.base
+        data, base = measured(self.data, start.flatten().tolist()), self.task.base
         rows = [b for b in range(len(data)) if b != self.reference or held is not None]
-        count = len(rows)
         problem = ShootingProblem(
             model, data, segment_grid(data, FIRST_SEGMENT, base.model_step), sigma=self.sigma,
             prior=prior_of(model, base, None), freedom=self.freedom,
         )  # fmt: skip
-        theta, smooth = problem.parameters.get(), smoothed(data)
+        theta = problem.parameters.get()
         theta[[] if held is None else held] = 0.0
-        problem.guess_from_states(states_of_pairs(model, smooth))
-        x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
-        found = _fitted(WithZeros(problem, held), x)
+        found = _fitted(WithZeros(problem, held), theta, smoothed(data))
         if found is None:
             return FoundZeros(start, torch.zeros_like(start), math.inf)
         z, deviations = start.clone(), torch.zeros_like(start)
-        z[rows] += found.z.reshape(count, n)
-        deviations[rows] = found.deviations.reshape(count, n)
+        z[rows] += found.z.reshape(-1, data.dof)
+        deviations[rows] = found.deviations.reshape(-1, data.dof)
         return FoundZeros(z, deviations, found.rms)
 
 
