@@ -26,7 +26,7 @@ from herglotz.training.equation import Equation, equation_of
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, arrival_of, predict
-from herglotz.training.summary import as_html, one_line, summary
+from herglotz.training.summary import one_line, summary
 
 
 @dataclass(frozen=True, repr=False)
@@ -339,9 +339,6 @@ class Run:
 
     def __repr__(self) -> str:
         return one_line(self)
-
-    def _repr_html_(self) -> str:
-        return as_html(self)
 
 
 def _above(module: str) -> Any:

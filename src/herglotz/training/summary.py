@@ -1,10 +1,8 @@
-"""What a run reached, in words: for the screen, a notebook and a file."""
+"""What a run reached, in words: for the screen and a file."""
 
 from __future__ import annotations
 
-from html import escape
 from textwrap import fill
-from typing import Any
 
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.training.equation import Equation
@@ -25,11 +23,11 @@ def rows(run: FittedRun) -> list[tuple[str, str]]:
         ("trained on", f"{kept} of {data.samples} samples; {m.get('objective')} objective, {run.decided.level} level"),
         ("recorded range", range_in_words(run.box, data)),
         ("named terms", run.decided.features and _terms(run.decided.features, data.names)),
-        ("extrapolation RMS", _error(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
-        ("training RMS", _error(m.get("train_rms"), unit, degrees)),
-        ("one-step RMS", _error(m.get("one_step_rms"), unit, degrees)),
-        ("damping rate", show(m.get("rate"), f"per {per}")),
-        ("time", show(m.get("seconds"), "s")),
+        ("extrapolation RMS", _told(m.get("extrapolation_rms"), unit, degrees, "  free run over the unseen samples")),
+        ("training RMS", _told(m.get("train_rms"), unit, degrees)),
+        ("one-step RMS", _told(m.get("one_step_rms"), unit, degrees)),
+        ("damping rate", _told(m.get("rate"), f"per {per}")),
+        ("time", _told(m.get("seconds"), "s")),
     ]
     return [(name, value) for name, value in found if value]
 
@@ -54,16 +52,6 @@ def one_line(run: FittedRun) -> str:
     return f"Run({run.decided.level} level, {names} of {run.data.source or 'data'}; {verdict})"
 
 
-def as_html(run: FittedRun) -> str:
-    """A small table for notebooks."""
-    cells = [*rows(run), ("verdict", run.metrics.get("verdict", "not judged"))]
-    body = "".join(
-        f"<tr><th style='text-align:left'>{escape(name)}</th><td style='text-align:left'>{escape(value)}</td></tr>"
-        for name, value in cells
-    )
-    return f"<table>{body}</table>"
-
-
 def _terms(features: tuple[str, ...], names: tuple[str, ...]) -> str:
     """The named terms, and which coordinate q1 is where it has a name of its own."""
     told = [f"q{i} is {name}" for i, name in enumerate(names, 1) if name != f"q{i}" and len(names) <= MOST_NAMED]
@@ -82,10 +70,5 @@ def model_card(run: FittedRun, h_range: tuple[float, float]) -> str:
     ])  # fmt: skip
 
 
-def _error(value: float | None, unit: str, degrees: bool, after: str = "") -> str:
+def _told(value: float | None, unit: str, degrees: bool = False, after: str = "") -> str:
     return "" if value is None else size(value, unit, degrees) + after
-
-
-def show(value: Any, unit: str) -> str:
-    """Three digits and a unit; "" where there is no value."""
-    return "" if value is None else size(value, unit)

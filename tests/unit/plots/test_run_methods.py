@@ -53,7 +53,6 @@ def test_words_are_short():  # fails if a run, data or a prediction fill the scr
     assert repr(run).startswith("Run(linear level, theta of simulate(damped_pendulum")
     assert repr(run).endswith("; fits to the noise)")
     assert max(map(len, (repr(run), repr(run.data)))) < 200
-    assert "<th style='text-align:left'>training RMS</th>" in run._repr_html_()
     assert "Verdict: fits to the noise" in run.summary()
     degrees = replace(run, data=replace(run.data, columns=(("theta", "coordinate", "deg"),)))
     assert "0.01 rad = 0.573 deg" in degrees.summary()  # fails if data in degrees are told in rad alone
