@@ -6,7 +6,6 @@ import math
 from dataclasses import dataclass
 
 from herglotz.training.equation_words import unit_of
-from herglotz.training.evaluate import unseen_errors
 from herglotz.training.identifiability import PHYSICAL, WORDS
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
@@ -82,8 +81,3 @@ def _unit(name: str, run: Run, i: int) -> str:
 def _source(run: Run, i: int) -> tuple[str, str]:
     """Name and unit of the input that entry i of the map from inputs to forces, row by row, belongs to."""
     return run.data.input_labels[i % run.model.inputs]
-
-
-def held_out_rms(run: Run) -> list[list[float]]:
-    """RMS of the free run over the unseen samples, [trajectory][coordinate]; NaN where nothing was held out."""
-    return [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]  # the mean of nothing is NaN
