@@ -100,17 +100,17 @@ def equation_of(run: FittedRun, covariance: Tensor | None = None) -> Equation:
 
     Standard deviations come from the `covariance`, (P, P), of the numbers that were fitted (`training.laplace`).
     """
-    spread, terms = covariance, []
+    terms = []
     at = {entry: k for k, entry in enumerate(ParameterVector(run.model).entries)}
     for left, what, unit, parts in _Reader(run).parts():
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
         deviation = None
-        if spread is not None:
-            w = spread.new_zeros(len(spread))
+        if covariance is not None:
+            w = covariance.new_zeros(len(covariance))
             for name, i, by in parts:
                 if (name, i) in at:
                     w[at[name, i]] += by
-            deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
+            deviation = math.sqrt(max(0.0, float(w @ covariance @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
     terms[:0] = [*_kinetic(run), *_relative_springs(run)]
