@@ -228,7 +228,7 @@ class DictionarySearch:
 
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
-        values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
+        values = values_of(fit.problem.parameters, fit.theta)
         whole = fit.problem.grid.segments == len(self.data) and fit.noise < self.spread
         base = started(task.base, self.data, values, task.config)
         return Found(terms, task.config, values, base, fit, whole, self.spread)
@@ -295,8 +295,8 @@ class DictionarySearch:
         """With the subset of one coordinate's candidates that the criterion prefers, where residuals are noise."""
         if self.data.dof > 1 or not found.terms.names or (found.coloured and found.rms > self.floor):
             return found
-        stages, problem = self._problem(found, self.all, found.config.substeps)
-        for better in likelier(found, problem, self.all, stages.task.config, self.floor):
+        _, problem = self._problem(found, self.all, found.config.substeps)
+        for better in likelier(found, problem, self.all, self.floor):
             other = self.refit(replace(found, values=better.values), better.terms, states=better.states)
             if other is not None and not other.pushes and preferred(other, found, len(self.all.names), self.floor):
                 return self._likeliest(self._held(self._longer(other)))

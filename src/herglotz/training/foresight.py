@@ -184,13 +184,13 @@ def _with_absent_terms(
     every = _searched(task, own, parameters)
     if every is None or not set(own.names) <= set(every.names):
         return model, task.base, {}
-    values = values_of(parameters, parameters.get(), c, data.angles)
+    values = values_of(parameters, parameters.get())
     full = replace(settings_of(every, data, c, c.order, c.substeps), sticking=c.sticking)
     base = started(task.base, data, values, full)
     more = build_model(base, full, "none")
     more = with_sticking(more, excess=False) if full.sticking else more
     numbers = ParameterVector(more)
-    at = {name: where for name, where in places(numbers, every).items() if name not in own.names}
+    at = {name: where for name, where in places(numbers).items() if name not in own.names}
     return more, base, at | {name: [i] for i, name in enumerate(numbers.numbers) if name in c.absent}
 
 

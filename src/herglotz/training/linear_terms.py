@@ -13,10 +13,9 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.smoothing import LocalPolynomials, smooth_triples
-from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
 from herglotz.training.pruning import prune
 
@@ -133,8 +132,8 @@ class LinearTerms:
         if len(t) > ROWS:
             rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed if self.all.dry else (), u)
-        return LinearFit.of(self.data.angles, (*self.held[STILL], *self.held[MOVING]), t, self.data.balance, forces)
+        features, dry = (*self.held[STILL], *self.held[MOVING]), self.base.speed if self.all.dry else ()
+        return LinearFit.of(self.data.angles, features, t, self.data.balance, drag=self.all.drag, dry=dry, u=u)
 
     def _pruned(self, of: NamedTerms, columns: Tensor, x: Tensor, r: Tensor) -> tuple[NamedTerms, Tensor, Tensor]:
         """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
@@ -166,16 +165,12 @@ class LinearTerms:
 
     def _columns(self, of: NamedTerms) -> Tensor:
         """Columns of a family, and all masses, springs and friction of joints; none between lengths, or `apart`."""
-        i, j = pairs(self.data.dof, torch.device("cpu"))
         joints = any(self.data.angles) and not of.apart
-        diagonal = iter((i == j).tolist())
 
         def used(name: str) -> bool:
-            if name == "mass":
-                return next(diagonal) or joints
             if name in SPRINGS:
                 return of.springs
-            return name in of.names if name in self.all.names else joints or name != "coupling.viscous"
+            return name in of.names if name in self.all.names else joints or name not in (SHARED, "coupling.viscous")
 
         return torch.tensor([used(name) for name in self.names])
 

@@ -300,12 +300,12 @@ def _name_in(of: FitConfig, name: str) -> str:
     return "" if name == "coupling.viscous" and not of.coupled else name
 
 
-def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles: Sequence[bool]):
+def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
     """Values by the name of a term or, as a tuple, of a parameter."""
-    named, n = parameters.unflatten(theta), len(angles)
+    named, of = parameters.unflatten(theta), parameters.model.config
     if baseline_is_named(of):  # −k, b of each angle; k/2, b of the others
-        own, named[STILL] = named[STILL][: 2 * n], named[STILL][2 * n :]
-        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in angles])
+        own, named[STILL] = named[STILL][: 2 * of.dof], named[STILL][2 * of.dof :]
+        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in of.angles])
         named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
     return by_term(named, holders(of.features, of.drag))
 
@@ -315,11 +315,11 @@ def shapes_of_dry(parameters: ParameterVector) -> Tensor:
     return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])
 
 
-def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
+def places(parameters: ParameterVector) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    at: dict[str, list[int]] = {}
-    for parameter, names in holders(terms.features, terms.drag).items():
+    of, at = parameters.model.config, {}
+    for parameter, names in holders(of.features, of.drag).items():
         at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
-    if terms.dry:
+    if of.coulomb:
         at[DRY] = parameters.index(DRY).tolist()
     return at

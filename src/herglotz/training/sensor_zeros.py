@@ -37,7 +37,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import Look, look
-from herglotz.training.named_terms import NamedTerms, places
+from herglotz.training.named_terms import places
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import ResidualProblem
@@ -218,7 +218,7 @@ class ZerosOf:
 
     def symmetric(self, model: ContactLagrangian, found: FoundZeros) -> FoundZeros:
         """With zeros of all recordings in place of terms that q → −q turns round, where these miss no more."""
-        other = clearly(self.moved(model, found.z, odd(model, self.task.config)))
+        other = clearly(self.moved(model, found.z, odd(model)))
         if not other.rms <= MARGIN * found.rms:
             return found
         if not other.z[self.reference].any():
@@ -248,10 +248,10 @@ class ZerosOf:
         return FoundZeros(z, deviations, found.rms)
 
 
-def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
+def odd(model: ContactLagrangian) -> Tensor:
     """Places of the parameters of terms that q → −q, v → −v turns round: tilts, loads, sin(q1), q1^3, friction q v."""
-    parameters, angles = ParameterVector(model), model.config.angles
-    at = places(parameters, NamedTerms(config.features, config.drag))
+    parameters, config, angles = ParameterVector(model), model.config, model.config.angles
+    at = places(parameters)
     turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
     turned += [name for name in config.drag if _pushes_on(parse_drag(name, angles))]
     tilt = parameters.index("potential.tilt").tolist()

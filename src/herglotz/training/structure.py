@@ -23,15 +23,14 @@ from herglotz.data.roughness import AT_THE_NOISE, precision, roughness
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
-from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
 from herglotz.training.found_terms import Found
-from herglotz.training.linear_start import LinearFit
-from herglotz.training.named_terms import MOVING, NamedTerms, by_term, distances, holders, places, started, values_of
+from herglotz.training.linear_start import SHARED, LinearFit
+from herglotz.training.named_terms import MOVING, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -230,25 +229,15 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
         if len(t) * n < ENOUGH * coefficients:
             break
         fit = LinearFit.of(data.angles, names, t, data.balance)
-        (x,) = of_first(fit.solve(_columns(fit, data.angles)))
+        # A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has
+        # masses between all coordinates and no springs; of its diagonal masses one set alone will do.
+        columns = [any(data.angles) or name != SHARED for name in fit.names]
+        (x,) = of_first(fit.solve(torch.tensor(columns)))
         moved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / data.balance
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
             best = score, every, fit, x
     return None if best is None else best[1:]
-
-
-def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
-    """The columns that these coordinates may have, (F,) bool: joints all, others no mass between them.
-
-    A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has masses
-    between all coordinates and no springs; of its diagonal masses one set alone will do.
-    """
-    if any(angles):
-        return torch.ones(len(fit.names), dtype=torch.bool)
-    i, j = pairs(len(angles), torch.device("cpu"))
-    diagonal = iter((i == j).tolist())
-    return torch.tensor([next(diagonal) if name == "mass" else True for name in fit.names])
 
 
 def _mass_turns(fit: LinearFit) -> bool:
@@ -276,8 +265,8 @@ def _short_fit(
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    named = {i: name for name, (i,) in places(problem.parameters, NamedTerms(config.features)).items()}
+    named = {i: name for name, (i,) in places(problem.parameters).items()}
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.tensor(list(named)), math.log(r.numel()))
-    values = values_of(problem.parameters, x, config, data.angles)
+    values = values_of(problem.parameters, x)
     return values, tuple(named[i] for i in kept.tolist()), float(r.square().mean().sqrt())
