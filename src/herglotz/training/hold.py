@@ -199,10 +199,9 @@ def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     omega = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())  # squared
     h = data.typical_step
     longest = max(3, round((3**0.5 / (omega * h**0.5)) ** (2 / 3) / h)) if omega > 0 else 3
-    ends = torch.cat([(t.index.diff() != 1).nonzero()[:, 0] + 1, torch.tensor([len(t)])]).tolist()
-    begins = [0, *ends[:-1]]
-    longest = min(longest, LONGEST, min(b - a for a, b in zip(begins, ends, strict=True)))
-    starts = torch.cat([torch.arange(a, b - longest + 1, longest) for a, b in zip(begins, ends, strict=True)])
+    runs = torch.arange(len(t)).tensor_split((t.index.diff() != 1).nonzero()[:, 0] + 1)
+    longest = min(longest, LONGEST, *map(len, runs))
+    starts = torch.cat([run[: len(run) - longest + 1 : longest] for run in runs])
     rows = starts[:, None] + torch.arange(longest)
     h0, h1 = t.h0[rows], t.h1[rows]
     D = t.q0.new_zeros(len(rows), longest, longest + 2)
