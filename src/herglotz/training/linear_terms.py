@@ -41,22 +41,15 @@ class LinearStart(NamedTuple):
 
 
 def starts_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> list[LinearStart]:
-    """`linear_starts` of all candidates, of the fewer terms of chains of joints, and of one power of the distance."""
-    families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
-    return linear_starts(data, base, families, local, central(data, every))
-
-
-def linear_starts(
-    data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials,
-    one_of: Sequence[NamedTerms] = (),
-) -> list[LinearStart]:  # fmt: skip
-    """The likeliest start, and those of fewer coefficients.
+    """The likeliest start of all candidates or of the fewer terms of chains of joints, and those of fewer coefficients.
 
     The Bayesian information criterion decides: of many candidates noise determines some so poorly that no mass fits,
     or that they stay for nothing. Those behind the first have fewer coefficients than it, the fewest first: their
-    errors may be noise, which whole trajectories tell. The best start `one_of` other families stands alone where it
-    errs less than the first, or as little with fewer of them.
+    errors may be noise, which whole trajectories tell. The best start with one power of the distance stands alone where
+    it errs less than the first, or as little with fewer coefficients.
     """
+    families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
+    one_of = central(data, every)
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
     starts = (start for terms in families if (start := problem.start(terms)) is not None)
     tried = sorted({start.terms: start for start in starts}.values(), key=lambda start: start.size)
