@@ -1,18 +1,10 @@
 """Sensors whose zeros differ from recording to recording: y = q + z. The recording of most samples is the reference.
 
 A model cannot follow such recordings together, though each of them alone: friction makes up for some of the difference,
-and nothing then asks for the zeros any more. Four steps avoid that:
-
-1. The reference is fitted alone: with terms of its own, for those of all recordings hide the difference, and where they
-   miss more than the noise, with those of all recordings. Where nobody asked for zeros, and the reference is missed no
-   less alone than with the others, nothing follows.
-2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
-3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations; z = 0 in
-   the reference.
-4. The same with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt: a zero that
-   the reference has itself makes such terms, which friction then distorts. It is kept where it misses no more.
-
-Whether the recordings are used as they are or with these zeros, free runs over held-out time decide (`rivals`).
+and nothing then asks for the zeros any more. The reference is therefore fitted alone. With that model held, z starts
+where the other recordings' steps are missed least; then parameters, states and z are fitted together (`WithZeros`),
+last with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt. The steps, with
+numbers, stand in `docs/measured.md`. Free runs over held-out time decide whether the zeros are used (`rivals`).
 """
 
 from __future__ import annotations
