@@ -48,20 +48,18 @@ def rounded(value: float, std: float) -> str:
 
 def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
     """Every entry of the physical parameters that was learned, those of a coordinate with its name."""
-    std, found, learned = posterior.standard_deviations(), [], posterior.problem.parameters.entries
-    for name, parameter in run.model.named_parameters():
-        if not (name.startswith(PHYSICAL) and parameter.numel()):
+    std, found = posterior.standard_deviations(), []
+    for name, i in posterior.problem.parameters.entries:
+        if not name.startswith(PHYSICAL):
             continue
-        values = parameter.detach().reshape(-1).double()
-        for i, (value, spread) in enumerate(zip(values.tolist(), std[name].reshape(-1).tolist(), strict=True)):
-            if (name, i) not in learned:
-                continue
-            words = WORDS.get(name, name)
-            words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
-            whose = f" of {run.data.names[i]}" if values.numel() == run.data.dof > 1 else ""
-            if name == INPUT_MAP and values.numel() > 1:
-                whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
-            found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
+        values = run.model.get_parameter(name).detach().reshape(-1)
+        words = WORDS.get(name, name)
+        words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
+        whose = f" of {run.data.names[i]}" if len(values) == run.data.dof > 1 else ""
+        if name == INPUT_MAP and len(values) > 1:
+            whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
+        spread = float(std[name].reshape(-1)[i])
+        found.append(Quantity(name, words + whose, _unit(name, run, i), float(values[i]), spread))
     return found
 
 
