@@ -17,7 +17,8 @@ from herglotz.report.html import as_html, as_markdown
 from herglotz.report.sections import Block, Code, Document, Picture, Section, Slider, Table
 from herglotz.threads import one_thread
 from herglotz.training import Laplace, Plan, Run, laplace, traded
-from herglotz.training.quantities import held_out_rms, quantities
+from herglotz.training.evaluate import unseen_errors
+from herglotz.training.quantities import quantities
 from herglotz.training.recorded_range import range_in_words, warning
 from herglotz.training.selection import step_cost
 from herglotz.training.summary import rows as summary_rows
@@ -169,7 +170,8 @@ def _plan(run: Run) -> tuple[Block, ...]:
 
 def _errors(run: Run) -> tuple[Block, ...]:
     data = run.data
-    each = [_of_each(run, dict(zip(data.names, row, strict=True))) for row in held_out_rms(run)]
+    errors = [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]  # NaN where none are held out
+    each = [_of_each(run, dict(zip(data.names, row, strict=True))) for row in errors]
     rows = [(f"{b}", *(value for _, value in row)) for b, row in enumerate(each)]
     table = Table(("trajectory", *(f"RMS {name}" for name in data.names)), tuple(rows[:20]))
     about = [row for row in summary_rows(run) if "RMS" in row[0]]

@@ -125,7 +125,7 @@ class DictionarySearch:
         if found is None:
             return None
         for simple in simpler:
-            other = self._grown(simple.terms, simple.values, 1, start)
+            other = self._grown(simple.terms, simple.values, start)
             other = None if other is None else self._finer(self._held(other))
             if other is not None and other.instead_of(found, self.floor):
                 return other
@@ -137,17 +137,14 @@ class DictionarySearch:
         if bare is not None and bare.whole and bare.rms <= self.precision:
             return self._finer(bare), []  # accelerations that are read off coarse samples mislead
         linear = starts_of(self.recorded, self.base, self.all, local)
-        grown = ((self._grown(of, x.values, 1, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
+        grown = ((self._grown(of, x.values, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
-        if bare is None and self._misled(found):
+        lost = found is None or (self.data.dof == 1 and found.coloured and found.rms > MISLED * self.precision)
+        if bare is None and lost:
             bare = self._bare(start)
         if bare is not None and bare.misses_less(found):
             found, linear = bare, []
         return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[at:])
-
-    def _misled(self, found: Found | None) -> bool:
-        """Whether the linear problem gave no model, or one coordinate's that misses far more than the noise."""
-        return found is None or (self.data.dof == 1 and found.coloured and found.rms > MISLED * self.precision)
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""
@@ -192,7 +189,7 @@ class DictionarySearch:
         return max(1, every // (found.config.substeps * 2**halvings))
 
     def _bare(self, start: Trajectories) -> Found | None:
-        return self._grown(*without_terms(self.all, self.base), 1, start)
+        return self._grown(*without_terms(self.all, self.base), start)
 
     def _braking(self, found: Found) -> Found:
         """Without its dry friction, which pushes: it makes up for another force, which may be a load."""
@@ -218,7 +215,7 @@ class DictionarySearch:
         values, config = {**found.values, EXCESS: (excess,) * self.data.dof}, replace(found.config, sticking=True)
         return self.refit(replace(found, values=values, config=config), found.terms)
 
-    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None = None) -> SegmentStages:
+    def _stages(self, terms: NamedTerms, values: dict, substeps: int, sticking: bool | None) -> SegmentStages:
         config = settings_of(terms, self.data, self.config, self.order, substeps)
         config = replace(config, sticking=bool(sticking) and terms.dry)
         base = started(self.base, self.data, values, config)
@@ -228,14 +225,14 @@ class DictionarySearch:
 
     def _found(self, terms: NamedTerms, stages: SegmentStages, fit: TrajectoryFit) -> Found:
         task = stages.task
-        values = values_of(fit.problem.parameters, fit.theta, task.config, self.data.angles)
+        values = values_of(fit.problem.parameters, fit.theta)
         whole = fit.problem.grid.segments == len(self.data) and fit.noise < self.spread
         base = started(task.base, self.data, values, task.config)
         return Found(terms, task.config, values, base, fit, whole, self.spread)
 
-    def _grown(self, terms: NamedTerms, values: dict, substeps: int, start: Trajectories) -> Found | None:
+    def _grown(self, terms: NamedTerms, values: dict, start: Trajectories) -> Found | None:
         """From the shortest segments to the longest that the model follows."""
-        stages = self._stages(terms, values, substeps, self.config.sticking)
+        stages = self._stages(terms, values, 1, self.config.sticking)
         stages.hurried = True
         sigma = max(min(self.precision, self.spread), self.floor)
         first = stages.fit(stages.lengths[0], sigma, self.freedom, None, begin=start)
@@ -295,8 +292,8 @@ class DictionarySearch:
         """With the subset of one coordinate's candidates that the criterion prefers, where residuals are noise."""
         if self.data.dof > 1 or not found.terms.names or (found.coloured and found.rms > self.floor):
             return found
-        stages, problem = self._problem(found, self.all, found.config.substeps)
-        for better in likelier(found, problem, self.all, stages.task.config, self.floor):
+        _, problem = self._problem(found, self.all, found.config.substeps)
+        for better in likelier(found, problem, self.all, self.floor):
             other = self.refit(replace(found, values=better.values), better.terms, states=better.states)
             if other is not None and not other.pushes and preferred(other, found, len(self.all.names), self.floor):
                 return self._likeliest(self._held(self._longer(other)))

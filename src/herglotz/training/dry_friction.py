@@ -27,14 +27,16 @@ def acceleration_terms(data: Trajectories) -> Differences:
     Each coordinate has its own second harmonics (angles) or powers (lengths), viscous and quadratic friction.
     """
     found = differences(data)
-    t, v, a, more = found.triples, found.v, found.a, []
-    for i, angle in enumerate(data.angles):
-        q, w = t.q1[:, i], v[:, i]
-        own = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
-        place = torch.zeros(data.dof, 1, dtype=a.dtype, device=a.device)
-        place[i] = 1
-        more.append(torch.stack([*own, w, w * w.abs()], -1)[:, None] * place)
-    return found._replace(columns=torch.cat([found.columns, *more], -1))
+    own = []
+    for q, w, angle in zip(found.triples.q1.T, found.v.T, data.angles, strict=True):
+        waves = [(2 * q).sin(), (2 * q).cos()] if angle else [q.square(), q**3]
+        own.append(torch.stack([*waves, w, w * w.abs()], -1))
+    return found._replace(columns=torch.cat([found.columns, for_each(torch.stack(own, 1))], -1))
+
+
+def for_each(own: Tensor) -> Tensor:
+    """Columns (T, n, k) of each coordinate in its own equation, with coefficients of its own, (T, n, n k)."""
+    return (torch.eye(own.shape[1]).to(own)[:, :, None] * own[:, None]).flatten(2)
 
 
 def friction_holds(train: Trajectories) -> tuple[bool, str]:

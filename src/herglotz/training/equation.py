@@ -100,17 +100,17 @@ def equation_of(run: FittedRun, covariance: Tensor | None = None) -> Equation:
 
     Standard deviations come from the `covariance`, (P, P), of the numbers that were fitted (`training.laplace`).
     """
-    spread, terms = covariance, []
+    terms = []
     at = {entry: k for k, entry in enumerate(ParameterVector(run.model).entries)}
     for left, what, unit, parts in _Reader(run).parts():
         value = sum(by * float(run.model.get_parameter(name).detach().reshape(-1)[i]) for name, i, by in parts)
         deviation = None
-        if spread is not None:
-            w = spread.new_zeros(len(spread))
+        if covariance is not None:
+            w = covariance.new_zeros(len(covariance))
             for name, i, by in parts:
                 if (name, i) in at:
                     w[at[name, i]] += by
-            deviation = math.sqrt(max(0.0, float(w @ spread @ w)))
+            deviation = math.sqrt(max(0.0, float(w @ covariance @ w)))
         if value != 0.0:
             terms.append(Term(left, what, value, deviation, unit))
     terms[:0] = [*_kinetic(run), *_relative_springs(run)]
@@ -180,8 +180,10 @@ class _Reader:
         for i in range(config.dof):
             yield from self._friction(i, self.lefts[i if self.newton else i + 1])
         for i, angle in enumerate(data.angles):
-            for power, place in self._springs(i, angle):
-                yield self._baseline(i, power, place)
+            for power, (parameter, entry, by) in self._springs(i, angle):
+                what, factor = own_term(data.names[i], angle, power, self.newton)
+                size = unit_of(data.units[i], 1 if angle else 2 - power, self.time, 2) if self.newton else ""
+                yield self.lefts[i] if self.newton else "L", what, size, [(parameter, entry, factor * by)]
         texts = expand(config.features, config.angles)
         offset = 2 * config.dof if baseline_is_named(config) else 0
         still = [text for text in texts if not parse(text, config.angles)[0].velocities]
@@ -231,13 +233,6 @@ class _Reader:
         zero = 0.0 if friction is None or friction.input_zero is None else float(friction.input_zero[j].detach())
         return f"({what} {'−' if zero > 0 else '+'} {abs(zero):.3g})" if zero else what
 
-    def _baseline(self, i: int, power: int, part: Part) -> Line:
-        """A term of the baseline's potential."""
-        angle, (parameter, entry, by) = self.data.angles[i], part
-        what, factor = own_term(self.data.names[i], angle, power, self.newton)
-        size = unit_of(self.data.units[i], 1 if angle else 2 - power, self.time, 2) if self.newton else ""
-        return self.lefts[i] if self.newton else "L", what, size, [(parameter, entry, factor * by)]
-
     def _feature(self, text: str, at: tuple[str, int]) -> Iterator[Line]:
         """A feature of the potential: its force on each coordinate, or its part of L."""
         names, units = self.data.names, self.data.units
@@ -272,7 +267,8 @@ def network_of(run: FittedRun) -> str | None:
             own = model.potential.departure(coordinates(rows, 1))
             whole = model.potential(rows, 1)
         assert own is not None
-        parts.append(f"a network in the potential, {_share(own.gradient, whole.gradient)} of the conservative force")
+        share = float((own.gradient.square().mean() / whole.gradient.square().mean()).sqrt())
+        parts.append(f"a network in the potential, {100 * share:.3g} % of the conservative force")
     if model.correction is not None:
         parts.append("a network that corrects the rule at this step")
     if config.mass_width:
@@ -280,7 +276,3 @@ def network_of(run: FittedRun) -> str | None:
     if config.level in ("affine", "full"):
         parts.append(f"damping of the level '{config.level}', which depends on the state")
     return ", ".join(parts) or None
-
-
-def _share(part: Tensor, whole: Tensor) -> str:
-    return f"{100 * float((part.square().mean() / whole.square().mean()).sqrt()):.3g} %"

@@ -110,8 +110,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     Z = ahead.grid.at_samples(ahead.sensitivities(theta, path)[..., : problem.n, :]) / spread[:, None]
     q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
-    runs = replace(runs, beyond=runs.beyond & inside)
-    return _summary(A.double(), Z.double(), problem, runs, absent)
+    return _summary(A.double(), Z.double(), problem, runs, absent, inside)
 
 
 @dataclass(frozen=True)
@@ -121,33 +120,32 @@ class _Ahead:
     data: Trajectories  # their positions are nothing
     rows: Tensor  # (N,) the same samples in all data; −1 beyond them
     segments: list[int]  # that they start from
-    beyond: Tensor  # (N,) bool: after the training part, and in the recorded range
-    unseen: Tensor  # (N,) bool: in the unseen part
+    beyond: Tensor  # (N,) bool: after the training part
     horizon: float
 
     @classmethod
     def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
         """Runs over the rest of the data, and on for two turns of the motion."""
-        owner, step, parts = problem.grid.start_trajectory(train), data.typical_step, []
+        owner, step, horizon = problem.grid.start_trajectory(train), data.typical_step, 0.0
+        segments, times, rows, recorded, beyond = [], [], [], [], []
         for b in torch.linspace(0, len(data) - 1, min(RUNS, len(data))).round().long().tolist():
             segment = int((owner == b).nonzero()[-1])
-            rows = torch.arange(data.offsets[b], data.offsets[b] + data.lengths[b])
-            t = data.t[rows].cpu()
+            every = torch.arange(data.offsets[b], data.offsets[b] + data.lengths[b])
+            t = data.t[every].cpu()
             last = float(train.t[train.offsets[b] + train.lengths[b] - 1])
             wanted = min(TURNS * turn, LONGEST * float(t[-1] - t[0]))
             more = max(0, math.ceil((last + wanted - float(t[-1])) / step))
-            own = rows[t >= float(train.t[problem.grid.start_sample[segment]])]
-            again = rows[torch.arange(more) % len(rows)]
-            times = torch.cat([data.t[own], data.t[own[-1]] + step * torch.arange(1, more + 1).to(data.t)])
-            u = None if data.u is None else torch.cat([data.u[own], data.u[again]])
-            unseen = (times > last) & (times <= data.t[own[-1]])
-            parts.append((times, u, segment, times > last, unseen, torch.cat([own, torch.full((more,), -1)])))
-        t, beyond, unseen, rows = (torch.cat([part[k] for part in parts]) for k in (0, 3, 4, 5))
-        u = None if data.u is None else torch.cat([part[1] for part in parts])
-        lengths = tuple(len(part[0]) for part in parts)
+            own = every[t >= float(train.t[problem.grid.start_sample[segment]])]
+            segments.append(segment)
+            times.append(torch.cat([data.t[own], data.t[own[-1]] + step * torch.arange(1, more + 1).to(data.t)]))
+            rows.append(torch.cat([own, torch.full((more,), -1)]))
+            recorded.append(torch.cat([own, every[torch.arange(more) % len(every)]]))
+            beyond.append(times[-1] > last)
+            horizon = max(horizon, float(times[-1][-1]) - last)
+        t, lengths = torch.cat(times), tuple(map(len, times))
+        u = None if data.u is None else data.u[torch.cat(recorded)]
         made = replace(data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths)
-        horizon = max(float(part[0][-1] - part[0][~part[3]][-1]) for part in parts)
-        return cls(made, rows, [part[2] for part in parts], beyond, unseen, horizon)
+        return cls(made, torch.cat(rows), segments, torch.cat(beyond), horizon)
 
     def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor | None:
         """States at all samples of these runs, known ones and those of the model's steps; None where a step fails.
@@ -186,13 +184,13 @@ def _with_absent_terms(
     every = _searched(task, own, parameters)
     if every is None or not set(own.names) <= set(every.names):
         return model, task.base, {}
-    values = values_of(parameters, parameters.get(), c, data.angles)
+    values = values_of(parameters, parameters.get())
     full = replace(settings_of(every, data, c, c.order, c.substeps), sticking=c.sticking)
     base = started(task.base, data, values, full)
     more = build_model(base, full, "none")
     more = with_sticking(more, excess=False) if full.sticking else more
     numbers = ParameterVector(more)
-    at = {name: where for name, where in places(numbers, every).items() if name not in own.names}
+    at = {name: where for name, where in places(numbers).items() if name not in own.names}
     return more, base, at | {name: [i] for i, name in enumerate(numbers.numbers) if name in c.absent}
 
 
@@ -208,8 +206,13 @@ def _searched(task: Task, own: NamedTerms, parameters: ParameterVector) -> Named
     return replace(every.joined(pushed), one_rate=every.one_rate and c.level == "linear")
 
 
-def _summary(A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]]) -> Foresight:
-    """The variances of free runs from A of all unknowns and their sensitivities Z, (N, n, P + d), over the spread."""
+def _summary(
+    A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absent: dict[str, list[int]], inside: Tensor
+) -> Foresight:
+    """The variances of free runs from A of all unknowns and their sensitivities Z, (N, n, P + d), over the spread.
+
+    Where runs leave the recorded range, and are not `inside`, (N,) bool, nothing is known.
+    """
     P, d = problem.P, problem.d
     names = [name for name, at in absent.items() for _ in at]
     C, follow = _open(A, absent, problem)
@@ -221,11 +224,12 @@ def _summary(A: Tensor, Z: Tensor, problem: ShootingProblem, runs: _Ahead, absen
         parameters.append(((z @ C[own][:, own]) * z).sum(-1).mean(-1))
         hidden.append((z @ follow[own]).square().mean(1))
     of_start, of_all, by_term = torch.cat(start), torch.cat(parameters), torch.cat(hidden)
-    told = runs.beyond & (of_start.sqrt() < UNCERTAIN)
+    told = runs.beyond & inside & (of_start.sqrt() < UNCERTAIN)
     by_term = by_term[told].sum(0) / max(1, int(told.sum()))
     worst = int(by_term.argmax()) if names else -1
+    unseen = runs.beyond & (runs.rows >= 0)
     return Foresight(
-        start=_root(of_start[runs.unseen]), parameters=_root(of_all[told]), horizon=runs.horizon, reached=True,
+        start=_root(of_start[unseen]), parameters=_root(of_all[told]), horizon=runs.horizon, reached=True,
         hidden=float(by_term[worst].sqrt()) if names else 0.0, name=names[worst] if names else "",
     )  # fmt: skip
 

@@ -75,7 +75,7 @@ class Found:
 
         The `simplest` go only where no other one can; misfits below `floor` are rounding.
         """
-        at = places(self.fit.problem.parameters, self.terms)
+        at = places(self.fit.problem.parameters)
         if not at:
             return self.terms
         x, A = self.information(floor)
@@ -173,9 +173,7 @@ class Found:
             return False
         S, slope = A[rest][:, rest] - A[rest][:, states] @ C[:, :-1], b[rest] - A[rest][:, states] @ C[:, -1]
         best = x[rest] - torch.linalg.pinv(S, hermitian=True) @ slope
-        terms = torch.tensor(
-            [i for own in places(problem.parameters, self.terms).values() for i in own], dtype=torch.long
-        )
+        terms = torch.tensor([i for own in places(problem.parameters).values() for i in own], dtype=torch.long)
         last = torch.arange(problem.P, len(rest))
         S = S * (problem.sigma / self.rms) ** 2
         kept, _ = prune(S, best, torch.cat([terms, last]), math.log(problem.data.q.numel()), simplest=last)

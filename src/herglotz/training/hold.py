@@ -24,7 +24,7 @@ from herglotz.data.splits import liveliest_rows
 from herglotz.data.windows import Triples
 from herglotz.least_squares import least_squares
 from herglotz.training.baseline import differences
-from herglotz.training.dry_friction import BLOCKS, acceleration_terms
+from herglotz.training.dry_friction import BLOCKS, acceleration_terms, for_each
 
 # The mean over blocks of log(mean square without / with). Measured: 0.36 to 3.9 for delays of 0.4 and 2.3 steps that
 # noise of 1 % lets see, up to 0.16 for errors of the linear model itself.
@@ -163,7 +163,8 @@ class Accelerations:
         columns = [terms.columns, *(torch.diag_embed(torch.tanh(slow / width)) for width in SMOOTHED)]
         self.still = (slow.abs() < STILL).to(q)
         if data.dof > 1:
-            columns.append(_for_each(torch.cat(list(_of_others(data.angles, q, terms.v)), -1), data.dof))
+            others = torch.cat(list(_of_others(data.angles, q, terms.v)), -1)
+            columns.append(for_each(others[:, None].expand(-1, data.dof, -1)))
         A = self._whitened(torch.cat(columns, -1))
         A = A / A.square().mean(0).sqrt().clamp_min(torch.finfo(A.dtype).tiny)
         U, S, _ = torch.linalg.svd(A, full_matrices=False)
@@ -175,7 +176,7 @@ class Accelerations:
         """Mean squares over blocks of time, (BLOCKS,), with these inputs of the steps, (N, m)."""
         each = (u[self.index] + u[self.index + 1]) / 2
         each = (each[:, :, None] * self.directions[:, None]).flatten(1)
-        A = _for_each(each, len(self.balance))
+        A = for_each(each[:, None].expand(-1, len(self.balance), -1))
         A = torch.cat([A, A * self.still[:, :, None]], -1)
         A = self._whitened(A)
         A = A - self.Q @ (self.Q.T @ A)
@@ -198,10 +199,9 @@ def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     omega = float((t.q2 - t.q0).div((t.h0 + t.h1)[:, None]).square().mean(0).div(t.q1.var(0)).max())  # squared
     h = data.typical_step
     longest = max(3, round((3**0.5 / (omega * h**0.5)) ** (2 / 3) / h)) if omega > 0 else 3
-    ends = torch.cat([(t.index.diff() != 1).nonzero()[:, 0] + 1, torch.tensor([len(t)])]).tolist()
-    begins = [0, *ends[:-1]]
-    longest = min(longest, LONGEST, min(b - a for a, b in zip(begins, ends, strict=True)))
-    starts = torch.cat([torch.arange(a, b - longest + 1, longest) for a, b in zip(begins, ends, strict=True)])
+    runs = torch.arange(len(t)).tensor_split((t.index.diff() != 1).nonzero()[:, 0] + 1)
+    longest = min(longest, LONGEST, *map(len, runs))
+    starts = torch.cat([run[: len(run) - longest + 1 : longest] for run in runs])
     rows = starts[:, None] + torch.arange(longest)
     h0, h1 = t.h0[rows], t.h1[rows]
     D = t.q0.new_zeros(len(rows), longest, longest + 2)
@@ -209,11 +209,6 @@ def _windows(t: Triples, data: Trajectories) -> tuple[Tensor, Tensor]:
     for k, value in enumerate((1 / h0, -1 / h0 - 1 / h1, 1 / h1)):
         D[:, each, each + k] = 2 * value / (h0 + h1)
     return rows, torch.linalg.cholesky(D @ D.mT)
-
-
-def _for_each(x: Tensor, n: int) -> Tensor:
-    """Columns (T, k) in the equation of each coordinate with coefficients of its own, (T, n, n k)."""
-    return (torch.eye(n, dtype=x.dtype)[None, :, :, None] * x[:, None, None]).flatten(2)
 
 
 def _of_others(angles: Sequence[bool], q: Tensor, v: Tensor) -> Iterable[Tensor]:

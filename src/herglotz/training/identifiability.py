@@ -102,10 +102,8 @@ def traded(posterior: Laplace) -> list[Trade]:
 
 def _within_equal(values: Tensor, vectors: Tensor) -> Tensor:
     """The eigenvectors, those of equal eigenvalues replaced by a sparse basis of their span; values ascend."""
-    last = torch.cat([values.diff() > EQUAL * values[-1], torch.ones(1, dtype=torch.bool)])  # of its group
-    ends = (last.nonzero()[:, 0] + 1).tolist()
-    groups = zip([0, *ends[:-1]], ends, strict=True)
-    return torch.cat([vectors[:, a:b] if b - a == 1 else sparse_basis(vectors[:, a:b]) for a, b in groups], 1)
+    groups = vectors.tensor_split((values.diff() > EQUAL * values[-1]).nonzero()[:, 0] + 1, 1)
+    return torch.cat([group if group.shape[1] == 1 else sparse_basis(group) for group in groups], 1)
 
 
 def sparse_basis(span: Tensor) -> Tensor:

@@ -37,19 +37,11 @@ from herglotz.training.parameter_vector import ParameterVector
 LINEAR = ("kinetic.sum.coefficient", "potential.stiffness", "potential.tilt", "potential.features.sum.coefficient",
           "friction.viscous", "coupling.viscous", "friction.coulomb", "friction.input_map",
           "drag.coefficient")  # fmt: skip
+MASS, SHARED = "mass", "mass of two"  # constant ones, of a coordinate and between two of them
 STEPS, ENDS = 40, 1e-4  # of the search from there, and the gain of a log-likelihood at which it ends
 AT_ONCE = 1_000_000  # numbers of J formed together: 8 MB
 LARGE = 2.0**30  # coefficient beside which the fixed masses, of size 1, are lost; a power of two divides out
 ROUNDS = 3  # of weights J_k: the unit matrix, then twice the J of the coefficients found
-
-
-@dataclass(frozen=True)
-class NamedForces:
-    """Forces that join the linear problem beside viscous friction."""
-
-    drag: tuple[str, ...] = ()  # see `herglotz.models.drag`
-    dry: tuple[float, ...] = ()  # typical speeds, (n,): dry friction at its starting widths; empty: none
-    u: Tensor | None = None  # (T, m) inputs, held over both steps of a triple
 
 
 @dataclass(frozen=True)
@@ -58,35 +50,34 @@ class LinearFit:
 
     R: Tensor  # (T, n, F) of each column of coefficient 1
     J: Tensor  # (T, n, n, F)
-    names: tuple[str, ...]  # (F,) parameter that each column belongs to; "mass" for the constant masses
+    names: tuple[str, ...]  # (F,) parameter that each column belongs to; `MASS` and `SHARED` come first
 
     @classmethod
     def of(
-        cls, angles: Sequence[bool], features: Sequence[str], t: Triples, balance: Tensor,
-        forces: NamedForces | None = None,
+        cls, angles: Sequence[bool], features: Sequence[str], t: Triples, balance: Tensor, *,
+        drag: tuple[str, ...] = (), dry: tuple[float, ...] = (), u: Tensor | None = None,
     ) -> LinearFit:  # fmt: skip
-        """The columns of a model of order 2 with these features, viscous friction and no other damping but `forces`.
+        """The columns of a model of order 2 with these features, viscous friction and no other damping but `drag`.
 
-        Friction between coordinates is a column where one of them is an angle.
-
-        Forces and positions are over the `balance` (n,) of the coordinates: the errors of all of them count alike.
+        With typical speeds `dry` (n,) there is dry friction at its starting widths, with u (T, m) inputs, held over
+        both steps of a triple. Friction between coordinates is a column where one of them is an angle. Forces and
+        positions are over the `balance` (n,) of the coordinates: the errors of all of them count alike.
         """
-        n, forces = len(angles), forces or NamedForces()
+        n = len(angles)
         zero = (0.0,) * n
         model = ContactLagrangian(
             ModelConfig(angles=tuple(angles), level="forced", coupled=any(angles), features=tuple(features),
-                        potential_width=0, stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=forces.dry or (1.0,) * n,
-                        rate=0.0, drag=forces.drag, coulomb=bool(forces.dry),
-                        inputs=0 if forces.u is None else forces.u.shape[1])
+                        potential_width=0, stiffness=zero, tilt=zero, scale=(1.0,) * n, speed=dry or (1.0,) * n,
+                        rate=0.0, drag=drag, coulomb=bool(dry), inputs=0 if u is None else u.shape[1])
         ).to(t.q0)  # fmt: skip
         parameters = ParameterVector(model)
         which = [name for name in LINEAR if name in parameters.names]
         columns = torch.cat([parameters.index(name) for name in which])
-        zero, u = torch.zeros_like(t.h0), () if forces.u is None else (forces.u,)
+        zero = torch.zeros_like(t.h0)
 
         def both(theta: Tensor) -> tuple[Tensor, Tensor]:
-            before = parameters.partials(theta, t.q0, t.q1, zero, t.h0, 2, *u)
-            after = parameters.partials(theta, t.q1, t.q2, zero, t.h1, 2, *u)
+            before = parameters.partials(theta, t.q0, t.q1, zero, t.h0, 2, u)
+            after = parameters.partials(theta, t.q1, t.q2, zero, t.h1, 2, u)
             p = momentum_plus(before)
             return momentum_residual(after, p), momentum_jacobian(after, p)
 
@@ -104,7 +95,8 @@ class LinearFit:
         own = -unit.movedim(1, 2) / t.h1[:, None, None, None]
         J = torch.cat([own, J], -1)
         R, J = R * balance[:, None], J * (balance[:, None] * balance)[..., None]
-        return cls(R, J, ("mass",) * len(i) + tuple(name for name in which for _ in parameters.index(name)))
+        masses = [MASS if alone else SHARED for alone in (i == j).tolist()]
+        return cls(R, J, (*masses, *(name for name in which for _ in parameters.index(name))))
 
     def rows(self, which: Tensor) -> LinearFit:
         """The same over some of the triples, (T,) bool."""

@@ -13,10 +13,9 @@ from torch import Tensor
 
 from herglotz.data import Trajectories
 from herglotz.data.smoothing import LocalPolynomials, smooth_triples
-from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.cross_validation import MARGIN
-from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.linear_start import SHARED, LinearFit
 from herglotz.training.named_terms import DRY, MOVING, STILL, NamedTerms, by_term, central, chains, holders, own_terms
 from herglotz.training.pruning import prune
 
@@ -42,24 +41,15 @@ class LinearStart(NamedTuple):
 
 
 def starts_of(data: Trajectories, base: Baseline, every: NamedTerms, local: LocalPolynomials) -> list[LinearStart]:
-    """`linear_starts` of all candidates, of the fewer terms of chains of joints, and of one power of the distance."""
-    families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
-    return linear_starts(data, base, families, local, central(data, every))
-
-
-def linear_starts(
-    data: Trajectories, base: Baseline, families: Sequence[NamedTerms], local: LocalPolynomials,
-    one_of: Sequence[NamedTerms] = (),
-) -> list[LinearStart]:  # fmt: skip
-    """The likeliest start, and those of fewer coefficients.
+    """The likeliest start of all candidates or of the fewer terms of chains of joints, and those of fewer coefficients.
 
     The Bayesian information criterion decides: of many candidates noise determines some so poorly that no mass fits,
     or that they stay for nothing. Those behind the first have fewer coefficients than it, the fewest first: their
-    errors may be noise, which whole trajectories tell. The best start `one_of` other families stands alone where it
-    errs less than the first, or as little with fewer of them.
+    errors may be noise, which whole trajectories tell. The best start with one power of the distance stands alone where
+    it errs less than the first, or as little with fewer coefficients.
     """
-    if not families:
-        return []
+    families = (every, *(replace(every.only(x.names), apart=x.apart) for x in chains(data)))
+    one_of = central(data, every)
     problem = LinearTerms(data, base, reduce(NamedTerms.joined, [*families, *one_of]), local)
     starts = (start for terms in families if (start := problem.start(terms)) is not None)
     tried = sorted({start.terms: start for start in starts}.values(), key=lambda start: start.size)
@@ -85,6 +75,8 @@ class LinearTerms:
         self.held = holders([x for x in every.features if x not in self.own], every.drag)
         self.overlap = max(1.0, local.width / 2)
         self.fit = self._problem(local)
+        terms = {parameter: iter(names) for parameter, names in self.held.items()}
+        self.names = [next(terms[x]) if x in terms else x for x in self.fit.names]  # of terms, or of parameters
         self.count = max(3, int(self.fit.R[..., 0].numel() / self.overlap))  # residuals that do not say the same
 
     def start(self, of: NamedTerms) -> LinearStart | None:
@@ -133,8 +125,8 @@ class LinearTerms:
         if len(t) > ROWS:
             rows = torch.linspace(0, len(t) - 1, ROWS).round().long()
             t, u = t.spread_out(ROWS), None if u is None else u[rows]
-        forces = NamedForces(self.all.drag, self.base.speed if self.all.dry else (), u)
-        return LinearFit.of(self.data.angles, (*self.held[STILL], *self.held[MOVING]), t, self.data.balance, forces)
+        features, dry = (*self.held[STILL], *self.held[MOVING]), self.base.speed if self.all.dry else ()
+        return LinearFit.of(self.data.angles, features, t, self.data.balance, drag=self.all.drag, dry=dry, u=u)
 
     def _pruned(self, of: NamedTerms, columns: Tensor, x: Tensor, r: Tensor) -> tuple[NamedTerms, Tensor, Tensor]:
         """The terms whose absence the errors r would show, their columns, and their coefficients without the others.
@@ -166,30 +158,21 @@ class LinearTerms:
 
     def _columns(self, of: NamedTerms) -> Tensor:
         """Columns of a family, and all masses, springs and friction of joints; none between lengths, or `apart`."""
-        i, j = pairs(self.data.dof, torch.device("cpu"))
         joints = any(self.data.angles) and not of.apart
-        diagonal = iter((i == j).tolist())
-        order = {parameter: iter(names) for parameter, names in self.held.items()}
 
         def used(name: str) -> bool:
-            if name == "mass":
-                return next(diagonal) or joints
-            if name in order:
-                return next(order[name]) in of.names
             if name in SPRINGS:
                 return of.springs
-            return of.dry if name == DRY else joints or name != "coupling.viscous"
+            return name in of.names if name in self.all.names else joints or name not in (SHARED, "coupling.viscous")
 
-        return torch.tensor([used(name) for name in self.fit.names])
+        return torch.tensor([used(name) for name in self.names])
 
     def _linear_places(self, columns: Tensor) -> dict[str, list[int]]:
         """Columns of each term among those that are used, the first mass not counted."""
-        order = {parameter: iter(names) for parameter, names in self.held.items()}
         own = {parameter: term for term, (parameter, _) in self.own.items()}
-        names = [next(order[x]) if x in order else own.get(x, x) for x in self.fit.names]
-        left = [name for name, used in zip(names, columns.tolist(), strict=True) if used][1:]
+        left = [own.get(self.names[k], self.names[k]) for k in columns.nonzero()[1:, 0].tolist()]
         at: dict[str, list[int]] = {}
         for i, name in enumerate(left):
-            if name in (*self.all.names, DRY):
+            if name in self.all.names:
                 at.setdefault(name, []).append(i)
         return at

@@ -258,22 +258,16 @@ def settings_of(terms: NamedTerms, data: Trajectories, config: FitConfig, order:
     )  # fmt: skip
 
 
-def started(
-    base: Baseline, data: Trajectories, values: Mapping[str, float | tuple[float, ...]], of: FitConfig
-) -> Baseline:
-    """The baseline with these values as starts, for a model of these settings."""
-    rest: dict[str, tuple[float, ...]] = {
-        name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")
-    }
-    rate = float(rest.pop("damping.rate", (0.0,))[0])
+def started(base: Baseline, data: Trajectories, values: dict, of: FitConfig) -> Baseline:
+    """The baseline with values by the name of a term or of a parameter as starts, for a model of these settings."""
+    rest = {name: x for name, x in values.items() if isinstance(x, tuple) and not name.startswith("potential.")}
+    rate = rest.pop("damping.rate", (0.0,))[0]
     if data.dof == 1 or of.level == "linear":  # viscous friction of the first mass, 1, is the rate
-        rate += float(rest.pop("friction.viscous", (0.0,))[0])
-    rest |= _coefficients(values, of)
-    zero, known = (0.0,) * data.dof, _parameters(of, any("v" in name for name in of.features))
-    rest = {own: x for name, x in rest.items() if x and (own := known(name))}
+        rate += rest.pop("friction.viscous", (0.0,))[0]
+    for parameter, names in holders(of.features, of.drag).items():
+        rest[parameter] = tuple(values.get(name, 0.0) for name in names)
+    zero, rest = (0.0,) * data.dof, {own: x for name, x in rest.items() if x and (own := _name_in(of, name))}
     stiffness, tilt = values.get("potential.stiffness", zero), values.get("potential.tilt", zero)
-    assert isinstance(stiffness, tuple)
-    assert isinstance(tilt, tuple)
     step = base.max_step if of.substeps == 1 else JITTER * data.typical_step / of.substeps
     return replace(base, stiffness=stiffness, tilt=tilt, rate=rate, start=rest, model_step=step)
 
@@ -292,36 +286,26 @@ def by_term(start: Mapping[str, Tensor], held: Mapping[str, Sequence[str]]) -> d
     return values
 
 
-def _coefficients(values: Mapping[str, float | tuple[float, ...]], of: FitConfig) -> dict[str, tuple[float, ...]]:
-    """Those of the terms of a model of these settings, by the parameter that holds them."""
-    kinds = holders(of.features, of.drag).items()
-    return {parameter: tuple(float(values.get(x, 0.0)) for x in names) for parameter, names in kinds}  # type: ignore[arg-type]
-
-
-def _parameters(of: FitConfig, moving: bool):
+def _name_in(of: FitConfig, name: str) -> str:
     """The name that a parameter has in a model of these settings; "" where it has none."""
-
-    def name_in(name: str) -> str:
-        if name.startswith("kinetic.") and name != MOVING:
-            name = name.replace("kinetic.base.", "kinetic.")
-            if of.diagonal and name == "kinetic.off_diagonal":
-                return ""
-            return name.replace("kinetic.", "kinetic.base.") if moving else name
-        if name.startswith("friction."):
-            dry = name.removeprefix("friction.") in ("coulomb", "breakaway", "log_smooth", "log_stribeck")
-            gone = of.level != "forced" or (dry and not of.coulomb) or (of.sticking and name == "friction.log_smooth")
-            return "" if gone else name
-        return "" if name == "coupling.viscous" and not of.coupled else name
-
-    return name_in
+    if name.startswith("kinetic.") and name != MOVING:
+        name = name.replace("kinetic.base.", "kinetic.")
+        if of.diagonal and name == "kinetic.off_diagonal":
+            return ""
+        return name.replace("kinetic.", "kinetic.base.") if any("v" in x for x in of.features) else name
+    if name.startswith("friction."):
+        dry = name.removeprefix("friction.") in ("coulomb", "breakaway", "log_smooth", "log_stribeck")
+        gone = of.level != "forced" or (dry and not of.coulomb) or (of.sticking and name == "friction.log_smooth")
+        return "" if gone else name
+    return "" if name == "coupling.viscous" and not of.coupled else name
 
 
-def values_of(parameters: ParameterVector, theta: Tensor, of: FitConfig, angles: Sequence[bool]):
+def values_of(parameters: ParameterVector, theta: Tensor) -> dict:
     """Values by the name of a term or, as a tuple, of a parameter."""
-    named, n = parameters.unflatten(theta), len(angles)
+    named, of = parameters.unflatten(theta), parameters.model.config
     if baseline_is_named(of):  # −k, b of each angle; k/2, b of the others
-        own, named[STILL] = named[STILL][: 2 * n], named[STILL][2 * n :]
-        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in angles])
+        own, named[STILL] = named[STILL][: 2 * of.dof], named[STILL][2 * of.dof :]
+        turn = own.new_tensor([-1.0 if angle else 2.0 for angle in of.angles])
         named |= {"potential.stiffness": own[::2] * turn, "potential.tilt": own[1::2]}
     return by_term(named, holders(of.features, of.drag))
 
@@ -331,11 +315,11 @@ def shapes_of_dry(parameters: ParameterVector) -> Tensor:
     return torch.cat([parameters.index(name) for name in ("friction.breakaway", "friction.log")])
 
 
-def places(parameters: ParameterVector, terms: NamedTerms) -> dict[str, list[int]]:
+def places(parameters: ParameterVector) -> dict[str, list[int]]:
     """Where in the vector of parameters the coefficients of each term stand; dry friction has one a coordinate."""
-    at: dict[str, list[int]] = {}
-    for parameter, names in holders(terms.features, terms.drag).items():
+    of, at = parameters.model.config, {}
+    for parameter, names in holders(of.features, of.drag).items():
         at |= zip(names, ([i] for i in parameters.index(parameter).tolist()), strict=True)
-    if terms.dry:
+    if of.coulomb:
         at[DRY] = parameters.index(DRY).tolist()
     return at

@@ -5,21 +5,21 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from herglotz.training.evaluate import unseen_errors
+from herglotz.training.equation_words import unit_of
 from herglotz.training.identifiability import PHYSICAL, WORDS
 from herglotz.training.run import Run
 from herglotz.training.uncertainty import Laplace
 
 INPUT_MAP = "friction.input_map"
-# Powers of the coordinate's unit and of time in each parameter's unit; the first coordinate's mass is 1.
+# Each parameter's unit is this power of the coordinate's unit over that of time; the first coordinate's mass is 1.
 DIMENSIONS = {
-    "potential.stiffness": (0, -2),
-    "potential.tilt": (1, -2),
-    "damping.rate": (0, -1),
-    "friction.viscous": (0, -1),
-    "friction.coulomb": (1, -2),
-    "friction.breakaway": (1, -2),
-    INPUT_MAP: (1, -2),  # per unit of the input
+    "potential.stiffness": (0, 2),
+    "potential.tilt": (1, 2),
+    "damping.rate": (0, 1),
+    "friction.viscous": (0, 1),
+    "friction.coulomb": (1, 2),
+    "friction.breakaway": (1, 2),
+    INPUT_MAP: (1, 2),  # per unit of the input
 }
 LOGARITHMS = ("kinetic.log", "friction.log")  # stored as logarithms: such a value has no unit
 
@@ -48,20 +48,18 @@ def rounded(value: float, std: float) -> str:
 
 def quantities(posterior: Laplace, run: Run) -> list[Quantity]:
     """Every entry of the physical parameters that was learned, those of a coordinate with its name."""
-    std, found, learned = posterior.standard_deviations(), [], posterior.problem.parameters.entries
-    for name, parameter in run.model.named_parameters():
-        if not (name.startswith(PHYSICAL) and parameter.numel()):
+    std, found = posterior.standard_deviations(), []
+    for name, i in posterior.problem.parameters.entries:
+        if not name.startswith(PHYSICAL):
             continue
-        values = parameter.detach().reshape(-1).double()
-        for i, (value, spread) in enumerate(zip(values.tolist(), std[name].reshape(-1).tolist(), strict=True)):
-            if (name, i) not in learned:
-                continue
-            words = WORDS.get(name, name)
-            words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
-            whose = f" of {run.data.names[i]}" if values.numel() == run.data.dof > 1 else ""
-            if name == INPUT_MAP and values.numel() > 1:
-                whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
-            found.append(Quantity(name, words + whose, _unit(name, run, i), value, spread))
+        values = run.model.get_parameter(name).detach().reshape(-1)
+        words = WORDS.get(name, name)
+        words = f"ln of {words}" if name.startswith(LOGARITHMS) else words
+        whose = f" of {run.data.names[i]}" if len(values) == run.data.dof > 1 else ""
+        if name == INPUT_MAP and len(values) > 1:
+            whose = f", from {_source(run, i)[0]} to {run.data.names[i // run.model.inputs]}"
+        spread = float(std[name].reshape(-1)[i])
+        found.append(Quantity(name, words + whose, _unit(name, run, i), float(values[i]), spread))
     return found
 
 
@@ -70,21 +68,14 @@ def _unit(name: str, run: Run, i: int) -> str:
         return run.data.input_labels[i][1]
     if name not in DIMENSIONS or run.data.time_unit in ("", "1"):
         return ""
-    length, time = DIMENSIONS[name]
     row, per = i, ""
     if name == INPUT_MAP:
         row, (of, unit) = i // run.model.inputs, _source(run, i)
         per = f" per {unit or of}"
-    own = run.data.units[min(row, run.data.dof - 1)]
-    above = own if length and own != "1" else "1"
-    return f"{above}/{run.data.time_unit}" + ("²" if time == -2 else "") + per
+    length, time = DIMENSIONS[name]
+    return unit_of(run.data.units[min(row, run.data.dof - 1)], length, run.data.time_unit, time) + per
 
 
 def _source(run: Run, i: int) -> tuple[str, str]:
     """Name and unit of the input that entry i of the map from inputs to forces, row by row, belongs to."""
     return run.data.input_labels[i % run.model.inputs]
-
-
-def held_out_rms(run: Run) -> list[list[float]]:
-    """RMS of the free run over the unseen samples, [trajectory][coordinate]; NaN where nothing was held out."""
-    return [error.square().mean(0).sqrt().tolist() for error in unseen_errors(run)]  # the mean of nothing is NaN

@@ -1,18 +1,10 @@
 """Sensors whose zeros differ from recording to recording: y = q + z. The recording of most samples is the reference.
 
 A model cannot follow such recordings together, though each of them alone: friction makes up for some of the difference,
-and nothing then asks for the zeros any more. Four steps avoid that:
-
-1. The reference is fitted alone: with terms of its own, for those of all recordings hide the difference, and where they
-   miss more than the noise, with those of all recordings. Where nobody asked for zeros, and the reference is missed no
-   less alone than with the others, nothing follows.
-2. That model held, one-step errors of the other recordings over a grid of z, and Gauss–Newton from the best point.
-3. Parameters, states and z together by multiple shooting (`WithZeros`), which gives z its standard deviations; z = 0 in
-   the reference.
-4. The same with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt: a zero that
-   the reference has itself makes such terms, which friction then distorts. It is kept where it misses no more.
-
-Whether the recordings are used as they are or with these zeros, free runs over held-out time decide (`rivals`).
+and nothing then asks for the zeros any more. The reference is therefore fitted alone. With that model held, z starts
+where the other recordings' steps are missed least; then parameters, states and z are fitted together (`WithZeros`),
+last with a z of the reference too, in place of all terms that q → −q turns round, such as a tilt. The steps, with
+numbers, stand in `docs/measured.md`. Free runs over held-out time decide whether the zeros are used (`rivals`).
 """
 
 from __future__ import annotations
@@ -37,7 +29,7 @@ from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.look import Look, look
-from herglotz.training.named_terms import NamedTerms, places
+from herglotz.training.named_terms import places
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.one_step import ResidualProblem
@@ -159,17 +151,16 @@ def zeros_of_one(model: ContactLagrangian, data: Trajectories, sigma: float, max
 def _of_parts(model: ContactLagrangian, data: Trajectories, sigma: float, max_step: float) -> tuple[float, ...] | None:
     """By all of these parts; None where the model cannot follow one."""
     problem = ShootingProblem(model, data, segment_grid(data, data.samples, max_step), sigma=sigma, freedom=FREEDOM)
-    theta, n = problem.parameters.get(), data.dof
-    problem.guess_from_states(states_of_pairs(model, data))
-    x = torch.cat([problem.pack(theta, first_states(problem, theta, data)), theta.new_zeros(n)])
     target = WithZeros(problem, torch.arange(problem.P), shared=True)
-    found = _fitted(target, x)
+    found = _fitted(target, problem.parameters.get(), data)
     return None if found is None else tuple(clearly(found).z.tolist())
 
 
-def _fitted(target: WithZeros, x: Tensor) -> FoundZeros | None:
-    """The zeros as a vector, from these unknowns; None where the model cannot follow the recordings."""
+def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros | None:
+    """The zeros as a vector, from 0 with these parameters, and states read off `begin`; None where nothing follows."""
     problem = target.problem
+    problem.guess_from_states(states_of_pairs(problem.parameters.model, begin))
+    x = torch.cat([problem.pack(theta, first_states(problem, theta, begin)), theta.new_zeros(target.count)])
     result = levenberg_marquardt(target, x, max_iterations=STAGE, rtol=1e-4, patience=3)
     if not math.isfinite(result.cost):
         return None
@@ -219,7 +210,7 @@ class ZerosOf:
 
     def symmetric(self, model: ContactLagrangian, found: FoundZeros) -> FoundZeros:
         """With zeros of all recordings in place of terms that q → −q turns round, where these miss no more."""
-        other = clearly(self.moved(model, found.z, odd(model, self.task.config)))
+        other = clearly(self.moved(model, found.z, odd(model)))
         if not other.rms <= MARGIN * found.rms:
             return found
         if not other.z[self.reference].any():
@@ -232,30 +223,27 @@ class ZerosOf:
         Parameters that are `held` are 0, and the reference has zeros too. The misfit is infinite where the model cannot
         follow the recordings.
         """
-        data, n, base = measured(self.data, start.flatten().tolist()), self.data.dof, self.task.base
+        data, base = measured(self.data, start.flatten().tolist()), self.task.base
         rows = [b for b in range(len(data)) if b != self.reference or held is not None]
-        count = len(rows)
         problem = ShootingProblem(
             model, data, segment_grid(data, FIRST_SEGMENT, base.model_step), sigma=self.sigma,
             prior=prior_of(model, base, None), freedom=self.freedom,
         )  # fmt: skip
-        theta, smooth = problem.parameters.get(), smoothed(data)
+        theta = problem.parameters.get()
         theta[[] if held is None else held] = 0.0
-        problem.guess_from_states(states_of_pairs(model, smooth))
-        x = torch.cat([problem.pack(theta, first_states(problem, theta, smooth)), theta.new_zeros(count * n)])
-        found = _fitted(WithZeros(problem, held), x)
+        found = _fitted(WithZeros(problem, held), theta, smoothed(data))
         if found is None:
             return FoundZeros(start, torch.zeros_like(start), math.inf)
         z, deviations = start.clone(), torch.zeros_like(start)
-        z[rows] += found.z.reshape(count, n)
-        deviations[rows] = found.deviations.reshape(count, n)
+        z[rows] += found.z.reshape(-1, data.dof)
+        deviations[rows] = found.deviations.reshape(-1, data.dof)
         return FoundZeros(z, deviations, found.rms)
 
 
-def odd(model: ContactLagrangian, config: FitConfig) -> Tensor:
+def odd(model: ContactLagrangian) -> Tensor:
     """Places of the parameters of terms that q → −q, v → −v turns round: tilts, loads, sin(q1), q1^3, friction q v."""
-    parameters, angles = ParameterVector(model), model.config.angles
-    at = places(parameters, NamedTerms(config.features, config.drag))
+    parameters, config, angles = ParameterVector(model), model.config, model.config.angles
+    at = places(parameters)
     turned = [name for name in config.features if any(_turned(f) for f in parse(name, angles))]
     turned += [name for name in config.drag if _pushes_on(parse_drag(name, angles))]
     tilt = parameters.index("potential.tilt").tolist()

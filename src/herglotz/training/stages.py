@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any, Literal, TypedDict
@@ -36,19 +37,16 @@ class _Stored(TypedDict):
     kept: dict[str, dict[str, Any]]
 
 
+@dataclass
 class Callback:
     """What a stage's optimiser reports to; it shows progress and stores the search."""
 
-    def __init__(
-        self,
-        bar: Any,
-        store: Callable[[dict[str, Any]], None],
-        resumed: dict[str, Any] | None,
-        named: str = "",  # begins a line on stderr for every iteration; "": no lines
-        log: Callable[[int, float], None] | None = None,  # is told every iteration and its cost
-    ):
-        self.bar, self.store, self.resumed, self.named, self.log = bar, store, resumed, named, log
-        self.start: float | None = None  # the first cost
+    bar: Any
+    store: Callable[[dict[str, Any]], None]
+    resumed: dict[str, Any] | None
+    named: str = ""  # begins a line on stderr for every iteration; "": no lines
+    log: Callable[[int, float], None] | None = None  # is told every iteration and its cost
+    start: float | None = None  # the first cost
 
     def __call__(self, iteration: int, cost: float, x: Tensor, search: Callable[[], dict[str, Any]]) -> None:  # noqa: ARG002
         """See `levenberg_marquardt.Progress`."""

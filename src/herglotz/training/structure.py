@@ -23,15 +23,14 @@ from herglotz.data.roughness import AT_THE_NOISE, precision, roughness
 from herglotz.data.units import common_unit, size
 from herglotz.models.feature_potential import baseline_features
 from herglotz.models.features import expand, lengths, revolute
-from herglotz.models.jet import pairs
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import FOLDS, simplest_not_beaten
 from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.distributed import of_first
 from herglotz.training.found_terms import Found
-from herglotz.training.linear_start import LinearFit
-from herglotz.training.named_terms import MOVING, NamedTerms, by_term, distances, holders, places, started, values_of
+from herglotz.training.linear_start import SHARED, LinearFit
+from herglotz.training.named_terms import MOVING, by_term, distances, holders, places, started, values_of
 from herglotz.training.one_step_fit import NOISE_OF_R, ROWS
 from herglotz.training.problems.one_step import ResidualProblem
 from herglotz.training.problems.prior import prior_of
@@ -52,7 +51,6 @@ EXACT_ENOUGH = 1e-5  # of the spread: what named terms have to reach for no othe
 # Settings that name a term of the model.
 NAMED = ("features", "known", "terms", "alike", "diagonal", "mass_width", "coulomb", "sticking", "drag", "translations",
          "coupled", "absent")  # fmt: skip
-TOLD = ("reason", "sigma", "doubt", "apart", "every", "hold")  # of `Structure`, as a checkpoint has it
 
 VISCOUS = "friction.viscous"
 
@@ -91,23 +89,17 @@ def _nothing_named(c: FitConfig) -> bool:
     return plain and not any(getattr(c, name) for name in NAMED)
 
 
-def dictionary(data: Trajectories) -> tuple[str, ...]:
-    """The features that these coordinates are tried with."""
-    if any(data.angles):
-        return tuple(revolute(data.angles))
-    away = distances(data)
-    return tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
-
-
 def dictionaries(data: Trajectories) -> list[tuple[str, ...]]:
-    """The dictionary and, of coordinates without an angle, the springs between them alone, which need fewer samples.
+    """All features and, of coordinates without an angle, the springs between them alone, which need fewer samples.
 
     A dictionary takes part where the samples suffice for its coefficients and their derivatives take no more than
     `NUMBERS`: at 200 samples the whole one up to 14 coordinates, springs up to 22.
     """
-    names = dictionary(data)
-    springs = tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))
-    return [names] if any(data.angles) else [names, springs]
+    if any(data.angles):
+        return [tuple(revolute(data.angles))]
+    away = distances(data)
+    names = tuple(name for name in lengths(data.angles) if name in away or not name.startswith("r^"))
+    return [names, tuple(name for name in names if name.startswith("(") and name.endswith(")^2"))]
 
 
 def kept_structure(
@@ -119,12 +111,11 @@ def kept_structure(
     def search() -> dict[str, Any]:
         found = find()
         start = {name: getattr(found.base, name) for name in numbers}
-        rest = {name: getattr(found, name) for name in TOLD}
-        return {"config": found.config.to_dict(), "base": start, **rest}
+        return found._asdict() | {"config": found.config.to_dict(), "base": start}
 
     kept = stages.keep(name, search)
-    found = replace(FitConfig.from_dict(kept["config"]), device=config.device)
-    return Structure(found, replace(base, **kept["base"]), **{name: kept[name] for name in TOLD})
+    settings = replace(FitConfig.from_dict(kept["config"]), device=config.device)
+    return Structure(**kept | {"config": settings, "base": replace(base, **kept["base"])})
 
 
 def search(
@@ -165,7 +156,8 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
     def without(reason: str) -> Structure:
         return Structure(config, base, f"no dictionary of features: {reason}")
 
-    names, linear = _largest(data, base)
+    tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
+    names, linear = next(((names, found) for names, found in tried if found), ((), None))
     if linear is None:
         return without("too few samples for its coefficients")
     every, fit, x = linear
@@ -191,12 +183,6 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
     return Structure(replace(rich, objective=objective), found, f"{words}: exact")
-
-
-def _largest(data: Trajectories, base: Baseline) -> tuple[tuple[str, ...], tuple[int, LinearFit, Tensor] | None]:
-    """The largest dictionary that the samples suffice for, and its linear problem; none of either where none does."""
-    tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
-    return next(((names, found) for names, found in tried if found), ((), None))
 
 
 def explains_steps(order4: float, order2: float, size: float) -> bool:
@@ -238,25 +224,15 @@ def _linear(data: Trajectories, base: Baseline, names: tuple[str, ...]) -> tuple
         if len(t) * n < ENOUGH * coefficients:
             break
         fit = LinearFit.of(data.angles, names, t, data.balance)
-        (x,) = of_first(fit.solve(_columns(fit, data.angles)))
+        # A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has
+        # masses between all coordinates and no springs; of its diagonal masses one set alone will do.
+        columns = [any(data.angles) or name != SHARED for name in fit.names]
+        (x,) = of_first(fit.solve(torch.tensor(columns)))
         moved = (t.q2 - t.q1 - (t.h1 / t.h0)[:, None] * (t.q1 - t.q0)) / data.balance
         score = float(of_first(fit.errors(x).square().mean() / moved.square().mean())[0])
         if best is None or score < best[0]:
             best = score, every, fit, x
     return None if best is None else best[1:]
-
-
-def _columns(fit: LinearFit, angles: Sequence[bool]) -> Tensor:
-    """The columns that these coordinates may have, (F,) bool: joints all, others no mass between them.
-
-    A linear system of n coordinates has n Lagrangians that are not multiples of one another, one of which has masses
-    between all coordinates and no springs; of its diagonal masses one set alone will do.
-    """
-    if any(angles):
-        return torch.ones(len(fit.names), dtype=torch.bool)
-    i, j = pairs(len(angles), torch.device("cpu"))
-    diagonal = iter((i == j).tolist())
-    return torch.tensor([next(diagonal) if name == "mass" else True for name in fit.names])
 
 
 def _mass_turns(fit: LinearFit) -> bool:
@@ -284,8 +260,8 @@ def _short_fit(
     result = levenberg_marquardt(problem, problem.start(), max_iterations=40, rtol=1e-3, patience=3)
     r = problem.residuals(result.x)
     _, A, _ = problem.normal_equations(result.x)
-    named = {i: name for name, (i,) in places(problem.parameters, NamedTerms(config.features)).items()}
+    named = {i: name for name, (i,) in places(problem.parameters).items()}
     relative = A * problem.sigma**2 / r.square().mean().clamp_min((EXACT["float64"] * max(base.scale)) ** 2)
     kept, x = prune(relative, result.x, torch.tensor(list(named)), math.log(r.numel()))
-    values = values_of(problem.parameters, x, config, data.angles)
+    values = values_of(problem.parameters, x)
     return values, tuple(named[i] for i in kept.tolist()), float(r.square().mean().sqrt())

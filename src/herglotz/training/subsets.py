@@ -14,7 +14,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from herglotz.training.config import FitConfig
 from herglotz.training.found_terms import Found, gain
 from herglotz.training.named_terms import DRY, NamedTerms, places, shapes_of_dry, values_of
 from herglotz.training.problems.shooting import ShootingProblem
@@ -44,7 +43,7 @@ def missing(found: Found, problem: ShootingProblem, every: NamedTerms) -> str | 
     The problem stands at the fit, its absent terms at 0.
     """
     names = [name for name in every.names if name not in found.terms.names]
-    at = places(problem.parameters, every)
+    at = places(problem.parameters)
     x = problem.pack(problem.parameters.get(), found.fit.path.x[:, 0, : problem.d])
     cost, A, b = problem.normal_equations(x)
     if not bool(cost.isfinite()):
@@ -66,15 +65,13 @@ class Better(NamedTuple):
     states: Tensor  # (S, d) at the start of every segment
 
 
-def likelier(
-    found: Found, problem: ShootingProblem, every: NamedTerms, config: FitConfig, floor: float
-) -> list[Better]:
+def likelier(found: Found, problem: ShootingProblem, every: NamedTerms, floor: float) -> list[Better]:
     """Subsets of the terms `every` of `problem` that are likelier than those of `found`, the likeliest first.
 
     The problem stands at the fit, its absent terms at 0; misfits below `floor` are rounding.
     """
     parameters, held = problem.parameters, torch.tensor([], dtype=torch.long)
-    at = places(parameters, every)
+    at = places(parameters)
     if DRY in found.terms.names:
         at[DRY] += parameters.index("friction.breakaway").tolist()
     elif DRY in at:  # what shapes a force of 0 has no effect yet
@@ -90,7 +87,7 @@ def likelier(
         if terms == found.terms:
             break
         theta, states = problem.unpack(subset.x.to(x))
-        better.append(Better(terms, values_of(problem.parameters, theta, config, problem.data.angles), states))
+        better.append(Better(terms, values_of(parameters, theta), states))
     return better
 
 

@@ -142,7 +142,8 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
     error = max(worst, free)
     if error <= AT_THE_NOISE * errors.limit:
         return f"{FITS}: {errors}"
-    apart = f". {_one_by_one(metrics['apart'])}" if metrics.get("apart") else ""
+    apart = metrics.get("apart")
+    apart = f". The recordings may differ: {apart}. Try each by itself, or --sensor-zeros" if apart else ""
     return f"{WORSE} by a factor of {error / errors.limit:.2g}: {errors}{apart}"
 
 
@@ -154,15 +155,8 @@ def _left_open(ahead: Foresight) -> str:
     what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
         what, share = "the uncertainty of the parameters", ahead.parameters
-    return (
-        f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread. Try a longer "
-        + ("recording, or several from other starts")
-    )
-
-
-def _one_by_one(apart: str) -> str:
-    """What to do about recordings that differ."""
-    return f"The recordings may differ: {apart}. Try each by itself, or --sensor-zeros"
+    changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
+    return f"{changes}. Try a longer recording, or several from other starts"
 
 
 def _remedy(metrics: dict[str, Any], training: bool) -> str:

@@ -13,7 +13,7 @@ from herglotz.scenes import scene
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.dictionary_search import DictionarySearch
-from herglotz.training.linear_terms import linear_starts
+from herglotz.training.linear_terms import LinearTerms, starts_of
 from herglotz.training.named_terms import candidates, chains
 
 STEP, PARTS = 0.008, 4
@@ -54,7 +54,7 @@ def test_an_arm_with_motors_starts_from_its_own_terms(seed):
     data = arm(seed, noise=2e-3)
     local = local_polynomials(data)
     assert local is not None
-    start = linear_starts(data, estimate_baseline(data), (candidates(data), *chains(data)), local)[0]
+    start = starts_of(data, estimate_baseline(data), candidates(data), local)[0]
     assert set(start.terms.names) == {"cos(q1 + q2)", "cos(q2) v1 v1", "cos(q2) v1 v2"}
     # over four seeds: 0.323 to 0.341, 0.314 to 0.341, and 9.2 to 10.3 with at most 0.36 between the joints
     assert start.values["cos(q2) v1 v1"] == pytest.approx(0.34, rel=0.15)
@@ -110,8 +110,9 @@ def test_of_starts_that_are_as_good_the_simpler_ones_follow():
     local, base = local_polynomials(data), estimate_baseline(data)
     assert local is not None
     families = (candidates(data), *chains(data))
-    alone = [start for family in families for start in linear_starts(data, base, (family,), local)]
-    first, *rest = linear_starts(data, base, families, local)
+    each = (LinearTerms(data, base, family, local).start(family) for family in families)
+    alone = [start for start in each if start is not None]
+    first, *rest = starts_of(data, base, candidates(data), local)
     counts = [len(start.terms.names) for start in rest]
     assert counts == sorted(counts)
     assert all(count < len(first.terms.names) for count in counts)

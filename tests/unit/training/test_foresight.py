@@ -26,7 +26,7 @@ def test_runs_that_go_on_by_one_sample_are_followed():
     model = ContactLagrangian(ModelConfig((True,), "linear", (1.0,), (1.0,), (1.0,), (0.0,), potential_width=0))
     t = 0.1 * torch.arange(5, dtype=torch.float64)
     made = Trajectories.of(t, 0 * t, angles=(True,))
-    runs = _Ahead(made, torch.tensor([0, 1, 2, 3, -1]), [0], t > 0.15, t > 9, 0.3)
+    runs = _Ahead(made, torch.tensor([0, 1, 2, 3, -1]), [0], t > 0.15, 0.3)
     with torch.no_grad():
         out = Stepper(model).rollout(*torch.tensor([[0.5], [0.1]], dtype=torch.float64), h=0.1, steps=4)
     states = torch.cat([out.q, out.p, out.s[:, None]], -1)

@@ -7,7 +7,7 @@ import torch
 
 from herglotz.data.windows import Triples
 from herglotz.training import linear_start
-from herglotz.training.linear_start import LinearFit, NamedForces
+from herglotz.training.linear_start import LinearFit
 
 NAMES = ("mass", "mass", "potential.stiffness", "potential.stiffness", "potential.features.sum.coefficient")
 
@@ -70,10 +70,11 @@ def test_columns_are_derivatives(monkeypatch, angles, names, large):
     q0, q1, q2, u = torch.randn(4, 7, 2, generator=make, dtype=torch.float64)
     h0, h1 = 0.1 + torch.rand(2, 7, generator=make, dtype=torch.float64)
     t, rows = Triples(q0, q1, q2, h0, h1, torch.zeros(7, dtype=torch.long), torch.arange(7)), []
-    forces = NamedForces(drag=("|v1| v1" if all(angles) else "q1^2 v1",), dry=(1.0, 1.0), u=u)
+    drag = ("|v1| v1" if all(angles) else "q1^2 v1",)
     for size in (linear_start.LARGE, large):
         monkeypatch.setattr(linear_start, "LARGE", size)
-        rows.append(LinearFit.of(angles, names, t, torch.ones(2, dtype=torch.float64), forces))
+        balance = torch.ones(2, dtype=torch.float64)
+        rows.append(LinearFit.of(angles, names, t, balance, drag=drag, dry=(1.0, 1.0), u=u))
     assert set(rows[0].names) >= {"drag.coefficient", "friction.coulomb", "friction.input_map", "friction.viscous"}
     torch.testing.assert_close(rows[0].R, rows[1].R, rtol=1e-10, atol=1e-10)
     torch.testing.assert_close(rows[0].J, rows[1].J, rtol=1e-10, atol=1e-10)

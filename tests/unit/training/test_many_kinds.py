@@ -76,7 +76,7 @@ def test_other_terms_are_fitted_over_the_same_segments():
     data = Trajectories.of((torch.arange(101).double() * 0.1)[stay], q[stay], angles=(True,))
     search = DictionarySearch(data, estimate_baseline(data, outliers=False, drag=False), FitConfig().resolved(data))
     terms, values = without_terms(search.all, search.base)
-    stages = search._stages(terms, values, 1)
+    stages = search._stages(terms, values, 1, None)
     fitted = stages.fit(20, 0.003, None, None)
     assert fitted is not None
     assert fitted.problem.grid.segments == 4

@@ -23,8 +23,8 @@ from herglotz.training.equation_words import number
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.fit import _equation
 from herglotz.training.found_terms import Found
-from herglotz.training.linear_terms import linear_starts
-from herglotz.training.named_terms import NamedTerms, candidates, central, loads, offered, turns_one_way
+from herglotz.training.linear_terms import starts_of
+from herglotz.training.named_terms import NamedTerms, candidates, loads, offered, turns_one_way
 from herglotz.training.pruning import joining
 from herglotz.training.solvers.lifted_newton import linear_recurrence
 
@@ -312,7 +312,7 @@ def test_a_distance_is_found_where_it_matters():
         data = simulate(scene(system, **settings), trajectories=3, steps=50, h=0.1, noise=noise, seed=1)
         local, every = local_polynomials(data), candidates(data)
         assert local is not None
-        starts = linear_starts(data, estimate_baseline(data), [every], local, central(data, every))
+        starts = starts_of(data, estimate_baseline(data), every, local)
         names[system, noise] = {name for name in starts[0].terms.features if name.startswith("r")}
         assert not any(name.startswith("r^") for name in every.names)
         assert ("r^-1" in offered(data, every, starts[0].terms, lacks=False).names) is (system == "kepler")

@@ -210,7 +210,7 @@ def test_a_start_that_follows_nothing_is_none(noise, kept):
     search.config, search.precision, search.spread, search.floor, search.freedom = FitConfig(), 0.1, 1.0, 0.0, None
     search._stages = lambda *_: stages
     search._found = lambda terms, stages, fit: fit  # noqa: ARG005
-    assert search._grown(NamedTerms(()), {}, 1, None) is (first if kept else None)
+    assert search._grown(NamedTerms(()), {}, None) is (first if kept else None)
 
 
 def test_a_start_is_stepped_in_each_of_its_ways(monkeypatch):

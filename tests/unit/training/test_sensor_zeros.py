@@ -144,7 +144,7 @@ def test_terms_that_turn_round_with_the_motion_are_held():
     model = build_model(replace(base, stiffness=(1.0, 1.0), tilt=(0.0, 0.0), start={}), settings, "none")
     parameters = ParameterVector(model)
     turned = torch.zeros(len(parameters.get()), dtype=torch.bool)
-    turned[odd(model, settings)] = True
+    turned[odd(model)] = True
     named = {name: x.flatten().tolist() for name, x in parameters.unflatten(turned).items()}
     assert named["potential.tilt"] == [True, True]
     assert named["potential.features.sum.coefficient"] == [False, True, False, True]
@@ -160,7 +160,7 @@ def test_the_tilts_of_the_baseline_are_held_at_both_orders(order):
     base = replace(seen().base, angles=(False, True), scale=(1.0, 1.0), speed=(1.0, 1.0), start={})
     model = build_model(replace(base, stiffness=(2.0, 3.0), tilt=(0.5, 0.7)), settings, "none")
     parameters = ParameterVector(model)
-    held = parameters.get()[odd(model, settings)].tolist()
+    held = parameters.get()[odd(model)].tolist()
     assert held == pytest.approx([0.5, 0.7])
 
 
