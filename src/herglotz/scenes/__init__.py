@@ -9,6 +9,7 @@ from herglotz.scenes.exact import (
     Reason as Reason,
     exact_discrete_lagrangian as exact_discrete_lagrangian,
 )
+from herglotz.scenes.forced_oscillator import ExactForcedOscillator as ExactForcedOscillator
 from herglotz.scenes.kepler import kepler as kepler
 from herglotz.scenes.linear_drag import ExactLinearDrag as ExactLinearDrag, linear_drag as linear_drag
 from herglotz.scenes.motion import herglotz_motion as herglotz_motion

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from tests.forced_oscillator import ExactForcedOscillator
 
 from herglotz.errors import InputError
+from herglotz.scenes import ExactForcedOscillator
 from herglotz.stepping import State
 from herglotz.theory import TimeDependent, energies
 

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from tests.forced_oscillator import ExactForcedOscillator
 
 from herglotz.errors import InputError
+from herglotz.scenes import ExactForcedOscillator
 from herglotz.stepping import State, Stepper
 from herglotz.theory import Propagated, TimeDependent, check, energies, hopf_lax, time_defect
 

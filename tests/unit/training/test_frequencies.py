@@ -4,10 +4,10 @@ import math
 
 import pytest
 import torch
-from tests.forced_oscillator import ExactForcedOscillator
 
 import herglotz as hz
 from herglotz.data import Trajectories
+from herglotz.scenes import ExactForcedOscillator
 
 F64 = torch.float64
 TRUE = ExactForcedOscillator(0.9, 1.7, 0.6, omega0=1.3, gamma=0.4)

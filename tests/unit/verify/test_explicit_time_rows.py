@@ -2,8 +2,8 @@
 
 import pytest
 import torch
-from tests.forced_oscillator import ExactForcedOscillator
 
+from herglotz.scenes import ExactForcedOscillator
 from herglotz.theory import TimeDependent
 from herglotz.verify import verify
 
