@@ -29,7 +29,6 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import harness
 from benchmarks.peers import PEERS, networks
-from benchmarks.peers.known_equation import train_known_equation
 from benchmarks.peers.problems import PROBLEMS, Problem
 from benchmarks.peers.report import draw, table
 from herglotz.errors import InputError
@@ -55,10 +54,7 @@ def cell(problem: Problem, name: str, given: str, seed: int, budget: float) -> d
             return out | found | {"seconds": time.process_time() - began}
         samples = problem.samples(seed, exact)
         began = time.process_time()  # simulating the data is not training
-        if peer.train is train_known_equation:
-            model = train_known_equation(samples, seed, budget, relative=problem.relative)
-        else:
-            model = peer.train(samples, seed, budget)
+        model = peer.train(samples, seed, budget)
         out |= {"seconds": time.process_time() - began, "parameters": model.parameters}
         return out | problem.judge(model, exact)
     except TimeoutError:

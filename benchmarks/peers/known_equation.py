@@ -62,12 +62,12 @@ class Equation:
         return torch.cat([v, self.acceleration(q, v, theta.expand(len(y), -1))], -1)
 
 
-def train_known_equation(samples: Samples, seed: int, budget: float, *, relative: bool = False) -> Flow:  # noqa: ARG001
+def train_known_equation(samples: Samples, seed: int, budget: float) -> Flow:  # noqa: ARG001
     """Least squares of the positions of windows, short ones first, from a linear fit of differences.
 
     One joint: at last every trajectory whole, gaps included. Two joints are chaotic: windows of 41 samples are last.
     """
-    n, h, equation, m = samples.dof, samples.h, Equation(relative), samples.motion()
+    n, h, equation, m = samples.dof, samples.h, Equation(samples.relative), samples.motion()
     fastest = float((m.a.square().mean() / m.v.square().mean()).sqrt())
     parts = max(1, math.ceil(h * fastest / STEP))
     longest = max(len(q) for q in samples.q)

@@ -39,7 +39,6 @@ class Problem:
     samples: Callable[[int, bool], Samples]  # (seed, exact) → what a peer is given
     judge: Callable[[Predictor, bool], Metrics]  # (predictor, exact) → `rms`, `median`, `failures`, …
     simulated: bool = True  # whether exact velocities exist
-    relative: bool = False  # whether the second coordinate of a double pendulum is the angle between its arms
     # Seed → metrics and parameters of ours, where it is judged by the free run from its own fitted states.
     own: Callable[[int], tuple[Metrics, int]] | None = None
 
@@ -181,7 +180,7 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
     def samples(seed: int, exact: bool) -> Samples:
         q, v = runs(seed, 100)
         if not exact:
-            return Samples(tuple(q), h, (True, True))
+            return Samples(tuple(q), h, (True, True), relative=True)
         flat_q, flat_v = (x.reshape(-1, 2).requires_grad_() for x in (q, v))
         p = double_momentum(flat_q, flat_v)
         with torch.no_grad():
@@ -189,7 +188,8 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
         slopes = [torch.autograd.grad(p[:, i].sum(), (flat_q, flat_v), retain_graph=True) for i in (0, 1)]
         f = torch.stack([(p_q * flat_v + p_v * a).sum(-1) for p_q, p_v in slopes], -1)  # ṗ by the chain rule
         parts = (x.detach().reshape(q.shape) for x in (flat_q, flat_v, p, a, f))
-        return Samples(tuple(q), h, (True, True), False, tuple(Motion(*x) for x in zip(*parts, strict=True)))
+        motion = tuple(Motion(*x) for x in zip(*parts, strict=True))
+        return Samples(tuple(q), h, (True, True), False, motion, relative=True)
 
     def energy(q: Tensor) -> Tensor:
         (q, v), s = (x.cumsum(-1) for x in _middle(q, h)), torch.zeros((), dtype=q.dtype)
@@ -202,7 +202,7 @@ def double_pendulum(h: float = 0.02, steps: int = 50) -> Problem:
         return errors(model.rollout(q[:, 0], q[:, 1], steps, state), q, energy)
 
     title = f"double pendulum, friction at both joints, 100 × 100 positions, h = {h:g}; {steps} steps from 100 releases"
-    return Problem(title, samples, judge, relative=True)
+    return Problem(title, samples, judge)
 
 
 def on_grid(index: Tensor, q: Tensor) -> Tensor:

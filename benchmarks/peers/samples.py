@@ -35,6 +35,7 @@ class Samples:
     angles: tuple[bool, ...]  # which coordinates are 2π-periodic
     noisy: bool = False  # whether the positions carry noise: differences are then taken of a smoothed motion
     exact: tuple[Motion, ...] | None = None  # at the samples of each trajectory; None where positions only are given
+    relative: bool = False  # whether the second coordinate of a double pendulum is the angle between its arms
     gaps: Tensor | None = None  # (K, n) where trajectories were cut: the recording on one grid, NaN where missing
 
     @property

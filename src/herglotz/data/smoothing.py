@@ -26,7 +26,6 @@ class LocalPolynomials:
     """The polynomial of each sample, in x = (t − t_k) / half."""
 
     width: int
-    degree: int
     coefficients: Tensor  # (N, degree + 1, n)
     half: Tensor  # (N,) half the time that the window spans
     centred: Tensor  # (N,) bool: the window has as many samples before t_k as behind
@@ -35,7 +34,7 @@ class LocalPolynomials:
     def at(self, x: Tensor | float) -> Tensor:
         """Positions at x of every window, (N, n)."""
         x = torch.as_tensor(x, dtype=self.half.dtype).expand_as(self.half)
-        powers = torch.stack([x**k for k in range(self.degree + 1)], -1)
+        powers = torch.stack([x**k for k in range(self.coefficients.shape[1])], -1)
         return (powers[..., None] * self.coefficients).sum(1)
 
 
@@ -58,7 +57,7 @@ def local_polynomials(data: Trajectories) -> LocalPolynomials | None:
     half, A = _design(data, rows, degree)
     coefficients = _inverse(A) @ data.q[rows].double()
     middle = rows[:, width // 2] == torch.arange(data.samples)
-    return LocalPolynomials(width, degree, coefficients, half, middle, rows)
+    return LocalPolynomials(width, coefficients, half, middle, rows)
 
 
 def smoothed(data: Trajectories, local: LocalPolynomials | None = None) -> Trajectories:
@@ -81,7 +80,7 @@ def smooth_triples(data: Trajectories, local: LocalPolynomials) -> tuple[Triples
         u = (weight[..., None] * data.u[rows[:, :-1]].double()).sum(1) / weight.sum(1, keepdim=True)
     like = data.q
     q0, q1, q2, h = (x.to(like) for x in (q0, q1, q2, h))
-    found = Triples(q0, q1, q2, h, h, data.trajectory[every], every)
+    found = Triples(q0, q1, q2, h, h, every)
     return found, None if u is None else u.to(like)
 
 

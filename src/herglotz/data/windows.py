@@ -31,7 +31,6 @@ class Triples:
     q2: Tensor  # (T, n)
     h0: Tensor  # (T,) from q0 to q1
     h1: Tensor  # (T,) from q1 to q2
-    trajectory: Tensor  # (T,) long
     index: Tensor  # (T,) long, row of q0 in the concatenation
 
     def __len__(self) -> int:
@@ -58,7 +57,7 @@ def triples(
         check_positive("max_step", max_step)
         keep = (h0 <= max_step) & (h1 <= max_step)
         index, h0, h1 = index[keep], h0[keep], h1[keep]
-    return Triples(q[index], q[index + 1], q[index + 2], h0, h1, trajectory[index], index)
+    return Triples(q[index], q[index + 1], q[index + 2], h0, h1, index)
 
 
 def join(first: Triples, second: Triples) -> Triples:

@@ -45,7 +45,7 @@ class BaselineMotion:
         like = torch.arange(count, device=q1.device) * len(recorded) // max(count, 1)
         h0, h1 = recorded.h0[like], recorded.h1[like]
         q0, q2 = (self._flow(q1, v1, h)[0] for h in (-h0, h1))
-        return Triples(q0, q1, q2, h0, h1, recorded.trajectory[like], recorded.index[like])
+        return Triples(q0, q1, q2, h0, h1, recorded.index[like])
 
     def _states(self, i: int, recorded: Triples) -> tuple[Tensor, Tensor]:
         """Return positions and velocities of coordinate i with at most `BEYOND` times the energy of the data."""

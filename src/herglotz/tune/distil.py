@@ -39,10 +39,6 @@ class FlowProblem:
         low, high = before.q.amin(0), before.q.amax(0)
         self.prior = Prior(model, low, high, departure=None)
 
-    def start(self) -> Tensor:
-        """Return the parameters, (P,)."""
-        return self.parameters.get()
-
     def residuals(self, theta: Tensor) -> Tensor:
         """Return the residuals, (T, 2n + 1), in units of q."""
         with torch.no_grad():
@@ -95,7 +91,7 @@ def distil(
 ) -> tuple[ContactLagrangian, float]:
     """A model whose parameters are fitted, from those it has, to a flow map over h; and its one-step RMS, as q is."""
     problem = FlowProblem(model, before, after, h)
-    result = levenberg_marquardt(problem, problem.start(), max_iterations=iterations, rtol=1e-3)
+    result = levenberg_marquardt(problem, problem.parameters.get(), max_iterations=iterations, rtol=1e-3)
     new = ContactLagrangian(model.config).to(next(model.parameters()).dtype)
     ParameterVector(new).set(result.x)
     return new, float(problem.residuals(result.x).square().mean().sqrt())

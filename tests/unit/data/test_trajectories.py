@@ -145,7 +145,6 @@ def test_triples():  # fails if a window crosses a border, if h0 and h1 are exch
     data = ragged()
     triples = data.triples()
     assert triples.index.tolist() == [0, 1, 4, 7, 8, 9, 10]
-    assert triples.trajectory.tolist() == [0, 0, 1, 2, 2, 2, 2]
     assert triples.q0[:, 0].tolist() == [0, 1, 10, 20, 21, 22, 23]
     assert triples.q1[:, 0].tolist() == [1, 2, 11, 21, 22, 23, 24]
     assert triples.q2[:, 1].tolist() == [-2, -3, -2, -2, -3, -4, -5]

@@ -69,7 +69,7 @@ def test_columns_are_derivatives(monkeypatch, angles, names, large):
     make = torch.Generator().manual_seed(0)
     q0, q1, q2, u = torch.randn(4, 7, 2, generator=make, dtype=torch.float64)
     h0, h1 = 0.1 + torch.rand(2, 7, generator=make, dtype=torch.float64)
-    t, rows = Triples(q0, q1, q2, h0, h1, torch.zeros(7, dtype=torch.long), torch.arange(7)), []
+    t, rows = Triples(q0, q1, q2, h0, h1, torch.arange(7)), []
     drag = ("|v1| v1" if all(angles) else "q1^2 v1",)
     for size in (linear_start.LARGE, large):
         monkeypatch.setattr(linear_start, "LARGE", size)

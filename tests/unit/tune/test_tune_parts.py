@@ -149,8 +149,8 @@ def test_a_flow_of_the_model_itself_has_no_residual(level):
     run = run_of(level)
     motions = record(run, draw_starts(run, 8, 0), 2.4)
     problem = FlowProblem(run.model, *pairs_of(motions.states, 1, 40, 0), H)
-    assert float(problem.residuals(problem.start()).abs().max()) < 1e-13
-    moved = problem.start() + 1e-3
+    assert float(problem.residuals(problem.parameters.get()).abs().max()) < 1e-13
+    moved = problem.parameters.get() + 1e-3
     assert float(problem.residuals(moved).abs().max()) > 1e-5
 
 
@@ -162,7 +162,7 @@ def test_each_part_of_the_state_has_its_residual(part, column):
     before, after = pairs_of(motions.states, 1, 20, 0)
     wrong = State(*(x + 1e-3 * (k == part) for k, x in enumerate(after)))
     problem = FlowProblem(run.model, before, wrong, H)
-    found = problem.residuals(problem.start()).abs().amin(0) > 1e-5
+    found = problem.residuals(problem.parameters.get()).abs().amin(0) > 1e-5
     assert found.tolist() == [k == column for k in range(3)]
 
 
