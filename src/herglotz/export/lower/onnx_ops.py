@@ -247,14 +247,10 @@ def write_reduced(kind: str) -> Callable[[Writer, Any], str]:
     return write
 
 
-def write_truth(kind: str) -> Callable[[Writer, Any], str]:
-    """Whether all (ReduceMin) or any (ReduceMax) entries are true."""
-
-    def write(w: Writer, node: Any) -> str:
-        axes = [w.integers(axis_of(node.args[1], node.args[0]))] if len(node.args) > 1 else []
-        return w.emit(kind, w.name(node.args[0]), *axes, keepdims=0)
-
-    return write
+def write_all(w: Writer, node: Any) -> str:
+    """Whether all entries are true."""
+    axes = [w.integers(axis_of(node.args[1], node.args[0]))] if len(node.args) > 1 else []
+    return w.emit("ReduceMin", w.name(node.args[0]), *axes, keepdims=0)
 
 
 def write_addmm(w: Writer, node: Any) -> str:
