@@ -173,7 +173,7 @@ def c_source(model: ContactLagrangian, entries: Mapping[str, Any], file: str, *,
     """
     derivatives = derivatives and entries["dof"] <= MAX_DERIVATIVES
     equations = Equations.of(pushed(copy.deepcopy(model).double()))  # rounded once, when the numbers are written
-    step = StepInC(equations, model.capabilities.explicit)
+    step = StepInC(equations)
     emitted = model_source(step, equations, derivatives)
     types, number_tests, functions, products, checks, one_step, run, api = map(runtime, RUNTIME)
     dtype = entries["dtype"]

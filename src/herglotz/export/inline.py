@@ -109,5 +109,4 @@ def _sized(sizes: tuple[int, ...], graph: Graph, batch: Any) -> list[Any]:
 
 
 def _results(graph: Graph) -> tuple[fx.Node, ...]:
-    (output,) = (x for x in graph.code.graph.nodes if x.op == "output")
-    return output.args[0]  # pyright: ignore[reportReturnType]
+    return graph.code.graph.output_node().args[0]  # pyright: ignore[reportReturnType]

@@ -31,12 +31,12 @@ Ends = tuple[Field, Field]  # the potential at q0 and q1
 Parts = tuple[Tensor, ...]  # what `StepParts` gives
 
 
-def step_parts(model: ContactLagrangian, explicit: bool) -> Graph:
+def step_parts(model: ContactLagrangian) -> Graph:
     """`StepParts`, traced."""
     q, p, s, h, *u = example(model, 0.1)
     V, slope = field_like(q)
     more = (V, slope, 0.1 * p, 0.2 * p, V + 1, slope + 1)
-    return traced(StepParts(model, explicit), (q, p, s, h, *more, *u))
+    return traced(StepParts(model), (q, p, s, h, *more, *u))
 
 
 def pushed(model: ContactLagrangian) -> ContactLagrangian:
@@ -72,11 +72,11 @@ class GivenPotential(nn.Module):
 class StepParts:
     """Everything that a step is made of, for a format that cuts it into pieces itself (`herglotz.export.lower.c`).
 
-    Where the step is `explicit`, the guess is the solution, and J is not known.
+    Where the step is explicit, the guess is the solution, and J is not known.
     """
 
-    def __init__(self, model: ContactLagrangian, explicit: bool):
-        self.model, self.explicit = model, explicit
+    def __init__(self, model: ContactLagrangian):
+        self.model = model
 
     def __call__(self, *arguments: Tensor) -> tuple[Tensor, ...]:
         """The guess of Δ, F and J at the trial, and p1 − p0, s1 − s0 and c − 1.
@@ -87,10 +87,9 @@ class StepParts:
         """
         (q, p, s, h, V0, slope0, delta, x, V1, slope1), u = arguments[:10], arguments[10:]
         ends = Field(V0, slope0), Field(V1, slope1)
-        form = self._explicit if self.explicit else self._by_jets
-        if not self.explicit and model_equation(self.model) is not None:
-            form = self._by_terms
-        if self.model.capabilities.sticking:
+        made_of = self.model.capabilities
+        form = self._explicit if made_of.explicit else self._by_terms if made_of.by_terms else self._by_jets
+        if made_of.sticking:
             form = self._by_sticking
         guess, F, J, dp, L, E, *bound = form(State(q, p, s), h, ends, delta, x, u[0] if u else None)
         return *(y.clone() for y in (guess, F, J, dp, L)), E.expand(s.shape).clone(), *bound

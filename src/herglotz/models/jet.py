@@ -90,9 +90,9 @@ class Jet:
     def _with(self, *rows: Tensor) -> Jet:
         return Jet(torch.cat(rows), self.tangents, self.order)
 
-    def map(self, f0: Tensor, f1: Tensor | None, f2: Tensor | None) -> Jet:
-        """Chain rule for f(self), given f and, as far as the order goes, f′ and f″ at the value."""
-        if f1 is None or not self.order:
+    def map(self, f0: Tensor, f1: Tensor, f2: Tensor | None) -> Jet:
+        """Chain rule for f(self), given f, f′ and, at order 2, f″ at the value."""
+        if not self.order:
             return self._with(f0[None])
         g = self.gradient
         if f2 is None or self.order == 1:

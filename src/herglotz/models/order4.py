@@ -11,8 +11,6 @@ this is the force-gradient action of M. Takahashi and M. Imada, J. Phys. Soc. Jp
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from torch import Tensor
 
@@ -32,11 +30,11 @@ class Slope:
         base = kinetic.base if isinstance(kinetic, FeatureKinetic) else kinetic
         assert isinstance(base, Kinetic)  # ModelConfig checked
         self.constant = base.mass()
-        self.e = self._force()
+        e = self._force()
         self.mass = self.constant.expand(*phase.q0.shape, phase.q0.shape[-1])
         if self.features is not None:
             self.mass = self.mass + self.features.mass(phase.mean.value)
-        self.y = solve(self.mass, self.e)
+        self.y = solve(self.mass, e)
 
     def gain(self) -> Jet:
         """The jet of eᵀM⁻¹e = max_y 2yᵀe − yᵀMy.
@@ -44,9 +42,9 @@ class Slope:
         With y = M⁻¹e held, its second derivative is (2yᵀe − yᵀMy)″ + 2 EᵀM⁻¹E, E the columns ∂_i(e − My): nothing
         beyond the features' derivatives along y is needed.
         """
-        y, order = self.y, self.phase.order
-        out = self.along(y, y / 2, order) * 2.0
-        if order == 1:
+        y = self.y
+        out = self._along(self.phase, y, y / 2) * 2.0
+        if out.order == 1:
             return out
         E = self._slope(y)
         bend = 2 * E.transpose(-1, -2) @ solve(self.mass, E)
@@ -54,11 +52,8 @@ class Slope:
         more = bend.flatten(-2)[..., i * out.tangents + j].movedim(-1, 0)
         return Jet(torch.cat([out.data[: 1 + out.tangents], out.data[1 + out.tangents :] + more]), out.tangents, 2)
 
-    def along(self, b: Tensor, y: Tensor, order: int) -> Jet:
-        """The scalar bᵀ(e − M y) as a jet over (q0, q1), for constant b and y, (..., n)."""
-        return self._along(replace(self.phase, order=order), b, y)
-
     def _along(self, phase: Phase, b: Tensor, y: Tensor) -> Jet:
+        """The scalar bᵀ(e − M y) as a jet over (q0, q1), for constant b and y, (..., n)."""
         push = b @ self.constant
         out = -of_mean(self.potential(phase.mean.value, phase.order, b))
         out = out - (phase.velocity * push).sum() * self.rate - (push * y).sum(-1)

@@ -32,8 +32,8 @@ Outputs = Mapping[str, Any]  # the place written to → its number, or the list 
 class StepInC:
     """The C functions of one model's step, in float64: numbers are rounded when they are written."""
 
-    def __init__(self, equations: Equations, explicit: bool):
-        self.explicit = explicit
+    def __init__(self, equations: Equations):
+        self.explicit = equations.model.capabilities.explicit
         self.program = Program()
         self.n, self.m = n, m = equations.model.dof, equations.model.inputs
         names = {
@@ -41,7 +41,7 @@ class StepInC:
             "V1->value": 0, "V1->slope": n, **({"P->push": m} if m else {}),
         }  # fmt: skip
         given = {name: self.program.given(name, size) for name, size in names.items()}
-        graph = step_parts(equations.model, explicit)
+        graph = step_parts(equations.model)
         arrays = interpret(self.program, graph, list(given.values()))
         guess, F, J, dp, ds, E, *bound = (list(x.ravel()) for x in arrays)
         self.sticks = bool(bound)
@@ -49,7 +49,7 @@ class StepInC:
         self.outputs = {
             "begin": {"move": guess, **({"P->bound": bound[0]} if bound else {})},
             "evaluate_first": {"t->F": F},
-            **({} if explicit else {"evaluate": {"t->F": F, "t->J": J}}),
+            **({} if self.explicit else {"evaluate": {"t->F": F, "t->J": J}}),
             "gains": {"dp": dp, "*ds": ds[0], "*E": E[0]},
         }
 
@@ -112,30 +112,28 @@ class StepInC:
 
     def source(self) -> str:
         """The functions, as a text of `REAL` and `FN_`, which stand for one sample or for a register of them."""
-        problem, terms = "FN_problem *P", "FN_terms *t"
-        heads = {
-            "prepare": f"prepare({problem})",
-            "begin": f"begin({problem}, REAL move[hz_N])",
-            "evaluate_first": f"evaluate_first(const {problem}, {terms})",
-        }
-        if not self.explicit:
-            heads["evaluate"] = f"evaluate(const {problem}, {terms})"
-        heads["gains"] = f"gains(const {problem}, const {terms}, const REAL x[hz_N], const FN_potential_t *V1,\n    "
-        heads["gains"] += "REAL dp[hz_N], REAL *ds, REAL *E)"
         parts = []
-        for name, head in heads.items():
-            comment = COMMENTS[name]
-            head = f"{comment}static inline void FN_{head}"
+        for name, (comment, arguments) in FUNCTIONS.items():
+            if name == "evaluate" and self.explicit:
+                continue
+            head = f"\n/* {comment} */\nstatic inline void FN_{name}({arguments})"
             parts.append(function(self.program, head, self.runs[name], self.outputs.get(name, {}), self.handed_on))
         return "".join(parts)
 
 
-COMMENTS = {
-    "prepare": "\n/* What depends on h alone. */\n",
-    "begin": "\n/* What depends on the start of the step, and the step without what couples q1, as a guess. */\n",
-    "evaluate_first": "\n/* F at q1 = q0 + t->move. */\n",
-    "evaluate": "\n/* F and J = dF/dq1. */\n",
-    "gains": "\n/* p1 - p0, s1 - s0 and c - 1 of the solved step: x is the move, t->move where F was evaluated. */\n",
+FUNCTIONS = {
+    "prepare": ("What depends on h alone.", "FN_problem *P"),
+    "begin": (
+        "What depends on the start of the step, and the step without what couples q1, as a guess.",
+        "FN_problem *P, REAL move[hz_N]",
+    ),
+    "evaluate_first": ("F at q1 = q0 + t->move.", "const FN_problem *P, FN_terms *t"),
+    "evaluate": ("F and J = dF/dq1.", "const FN_problem *P, FN_terms *t"),
+    "gains": (
+        "p1 - p0, s1 - s0 and c - 1 of the solved step: x is the move, t->move where F was evaluated.",
+        "const FN_problem *P, const FN_terms *t, const REAL x[hz_N], const FN_potential_t *V1,\n"
+        "    REAL dp[hz_N], REAL *ds, REAL *E",
+    ),
 }
 
 

@@ -74,6 +74,8 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.div.Tensor: c.divide, aten.div.Scalar: c.divide,
         aten.addcmul.default: c.add_product,
         aten.neg.default: lambda x: c.multiply(x, -1.0),
+        aten.relu.default: lambda x: c.choose(c.greater(x, 0.0), x, 0.0),
+        aten.threshold_backward.default: lambda g, x, least: c.choose(c.greater(x, float(least)), g, 0.0),
         aten.reciprocal.default: lambda x: c.divide(1.0, x),
         aten.pow.Tensor_Scalar: c.power,
         aten.pow.Tensor_Tensor: c.powers,

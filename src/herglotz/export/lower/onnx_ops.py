@@ -36,9 +36,9 @@ def write_slice(w: Writer, node: Any) -> str:
 
 
 def write_select(w: Writer, node: Any) -> str:
-    """One entry of an axis, which goes."""
+    """Entries of one axis by their numbers, or one entry, whose axis goes."""
     x, axis, index = node.args
-    return w.emit("Gather", w.name(x), w.constant(index, np.int64), axis=axis_of(axis, x))
+    return w.emit("Gather", w.name(x), w.name(index, torch.int64), axis=axis_of(axis, x))
 
 
 def write_item(w: Writer, node: Any) -> str:
@@ -136,12 +136,6 @@ def write_repeated(w: Writer, node: Any) -> str:
 def write_unsqueezed(w: Writer, node: Any) -> str:
     """Another axis of one entry."""
     return w.emit("Unsqueeze", w.name(node.args[0]), w.integers(axis_of(node.args[1], node)))
-
-
-def write_selected(w: Writer, node: Any) -> str:
-    """Entries of one axis, by their numbers."""
-    x, axis, index = node.args
-    return w.emit("Gather", w.name(x), w.name(index), axis=axis_of(axis, x))
 
 
 def write_size(w: Writer, node: Any) -> str:
@@ -253,14 +247,10 @@ def write_reduced(kind: str) -> Callable[[Writer, Any], str]:
     return write
 
 
-def write_truth(kind: str) -> Callable[[Writer, Any], str]:
-    """Whether all (ReduceMin) or any (ReduceMax) entries are true."""
-
-    def write(w: Writer, node: Any) -> str:
-        axes = [w.integers(axis_of(node.args[1], node.args[0]))] if len(node.args) > 1 else []
-        return w.emit(kind, w.name(node.args[0]), *axes, keepdims=0)
-
-    return write
+def write_all(w: Writer, node: Any) -> str:
+    """Whether all entries are true."""
+    axes = [w.integers(axis_of(node.args[1], node.args[0]))] if len(node.args) > 1 else []
+    return w.emit("ReduceMin", w.name(node.args[0]), *axes, keepdims=0)
 
 
 def write_addmm(w: Writer, node: Any) -> str:
