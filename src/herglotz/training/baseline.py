@@ -69,12 +69,13 @@ def estimate_baseline(data: Trajectories, *, outliers: bool = False, drag: bool 
     t, v, a, columns, max_step = differences(data, drag)
     n = data.dof
     m = 0 if data.u is None else data.u.shape[1]
-    q = data.q
+    q, rows, right = data.q, columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
+    found = robust_fit(rows, right) if outliers else least_squares(rows, right)
     if outliers:
-        x, good = _robust(columns.cpu(), a.cpu())
-        q, v = t.q1[good.to(q.device)], v[good.to(q.device)]
-    else:
-        x = least_squares(columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu())[:, 0].tolist()
+        r = rows @ found - right
+        good = (r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)).to(q.device)
+        q, v = t.q1[good], v[good]
+    x = found[:, 0].tolist()
     # The size of an angle that turns over and over is half a turn.
     scale = [min(x, math.pi) if angle else x for x, angle in zip(q.abs().amax(0).tolist(), data.angles, strict=True)]
     speed = [float(s) for s in v.abs().amax(0)]
@@ -127,7 +128,7 @@ def outliers_pull(data: Trajectories, *, drag: bool = False) -> bool:
         return False
     rows, right = columns.flatten(0, 1).cpu(), a.reshape(-1, 1).cpu()
     plain = scale_of(rows @ least_squares(rows, right) - right)
-    robust = scale_of(rows @ rows.new_tensor(_robust(columns.cpu(), a.cpu())[0])[:, None] - right)
+    robust = scale_of(rows @ robust_fit(rows, right) - right)
     return plain > max(PULLED * robust, NEGLIGIBLE * size)
 
 
@@ -163,11 +164,3 @@ def differences(data: Trajectories, drag: bool = False) -> Differences:
         half = torch.diag_embed(v.square().sum(-1, keepdim=True).expand(-1, n)) / 2
         columns = torch.cat([columns, v[:, :, None] * v[:, None] - half], -1)
     return Differences(t, v, a, columns, max_step)
-
-
-def _robust(A: Tensor, a: Tensor) -> tuple[list[float], Tensor]:
-    """Return the solution of a (T, n) ≈ A (T, n, k) x by Student's t, and which rows are no outliers, (T,) bool."""
-    rows, right = A.reshape(-1, A.shape[-1]), a.reshape(-1, 1)
-    x = robust_fit(rows, right)
-    r = rows @ x - right
-    return x[:, 0].tolist(), r.abs().reshape(a.shape).amax(1) <= GROSS * scale_of(r)
