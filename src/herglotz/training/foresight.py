@@ -166,7 +166,7 @@ class _Ahead:
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
         out = continued(model, x, grid.h, step_inputs(model, rest, grid))
-        known[at[grid.sample]] = out.flatten(0, 1)[grid.node]  # not what pads the shorter runs
+        known[at] = grid.at_samples(out)  # not what pads the shorter runs
         return known if bool(torch.isfinite(known).all()) else None
 
 

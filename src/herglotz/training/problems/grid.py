@@ -24,8 +24,7 @@ class SegmentGrid:
     """
 
     h: Tensor  # (S, K) model steps
-    node: Tensor  # (N',) flat index s·(K+1) + k of every observed node
-    sample: Tensor  # (N',) row of the data observed there
+    node: Tensor  # (N,) flat index s·(K+1) + k of the node that each sample observes
     start_sample: Tensor  # (S,) row of the data at the start of each segment
     joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
     end: Tensor  # (S,) last node of each segment
@@ -50,7 +49,7 @@ class SegmentGrid:
 
     def at_samples(self, x: Tensor) -> Tensor:
         """Values at the samples, (N, …) in their order, from those at every node, (S, K + 1, …)."""
-        return x.flatten(0, 1)[self.node[self.sample.argsort()]]
+        return x.flatten(0, 1)[self.node]
 
     def start_trajectory(self, data: Trajectories) -> Tensor:
         """Trajectory of every segment, (S,)."""
@@ -99,7 +98,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     recorded = data.t.double().diff()
     counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()  # model steps; a hair for rounded time stamps
     lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
-    seen: list[tuple[Tensor, Tensor]] = []  # its observed nodes, and their samples
+    seen: list[Tensor] = []  # its observed nodes
     starts: list[int] = []
     joined: list[int] = []
     for first, count in zip(data.offsets, data.lengths, strict=True):
@@ -108,12 +107,11 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         for i, (a, b) in enumerate(pairwise(bounds)):
             joined.append(-1 if i == 0 else len(starts) - 1)
             starts.append(a)
-            sample = torch.arange(a, b + 1, device=counts.device)
             node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
-            row = sample[:-1].repeat_interleave(counts[a:b])
+            row = torch.arange(a, b, device=node.device).repeat_interleave(counts[a:b])
             before = torch.arange(len(row), device=row.device) - node[row - a]
             lines.append((recorded[row] / counts[row], row, (before.double() + 0.5) / counts[row]))
-            seen.append((node[i > 0 :], sample[i > 0 :]))
+            seen.append(node[i > 0 :])
     end = torch.tensor([len(row) for _, row, _ in lines], device=counts.device)
     K = int(end.max())
     padding = torch.arange(K, device=end.device).minimum(end[:, None] - 1)  # the last model step again
@@ -122,8 +120,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     )
     return SegmentGrid(
         h=h.to(data.t),
-        node=torch.cat([s * (K + 1) + node for s, (node, _) in enumerate(seen)]),
-        sample=torch.cat([sample for _, sample in seen]),
+        node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]),
         start_sample=torch.tensor(starts, device=end.device),
         joined_to=torch.tensor(joined, device=end.device),
         end=end,

@@ -46,7 +46,7 @@ class ShootingProblem(StatesProblem):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
         self.better = self._known_better()  # (N, n)
-        self.weight = (self.used.to(data.q)[:, None] * self.better)[grid.sample]  # (N', n)
+        self.weight = self.used.to(data.q)[:, None] * self.better  # (N, n)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
@@ -160,7 +160,7 @@ class ShootingProblem(StatesProblem):
         S = grid.segments
         A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
         segment = grid.node // (grid.h.shape[1] + 1)
-        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N', n, P + d)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N, n, P + d)
         for k in range(S):
             own = segment == k
             self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
@@ -186,8 +186,7 @@ class ShootingProblem(StatesProblem):
         At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
         later one, because the end of the earlier is somewhere else.
         """
-        rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
-        rows[self.grid.sample] = self.grid.node
+        rows = self.grid.node.clone()
         if self.freedom is not None:
             first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
             rows[self.grid.start_sample] = first
@@ -229,11 +228,11 @@ class ShootingProblem(StatesProblem):
         self.path = Path(x, x[..., None])
 
     def misfit(self, path: Path) -> Tensor:
-        """q_model − q_data over the balance of the coordinates at every sample, (N', n)."""
+        """q_model − q_data over the balance of the coordinates at every sample, (N, n)."""
         return self._missed(path.x) / self.data.balance
 
     def _missed(self, x: Tensor) -> Tensor:
-        return x[..., : self.n].flatten(0, 1)[self.grid.node] - (self.data.q - self.zeros)[self.grid.sample]
+        return self.grid.at_samples(x[..., : self.n]) - (self.data.q - self.zeros)
 
     def by_zeros(self, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
@@ -242,10 +241,10 @@ class ShootingProblem(StatesProblem):
         """
         assert self.path is not None
         assert self._slopes is not None
-        count, which = int(which.max()) + 1, which[self.grid.sample]
+        count = int(which.max()) + 1
         fit, _ = self._residuals(self.path.x)
         by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
-        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N', n, P + d)
+        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N, n, P + d)
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         columns = rows.new_zeros(self.P + self.grid.segments * self.d, count, self.n)
         for k in range(self.grid.segments):
@@ -263,7 +262,7 @@ class ShootingProblem(StatesProblem):
         return self._residuals(path.x)[1]
 
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
+        """Data residuals and their Jacobian, (N·n,) and (N·n, unknowns), over σ and in the order of the samples.
 
         Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
         samples that are not used.
@@ -272,16 +271,15 @@ class ShootingProblem(StatesProblem):
         by = self.weight * self.root_weights(self.weight * r)
         Z = self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
         Z = Z * (by / self.deviations)[..., None]
-        order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
-        J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
+        J = Z.new_zeros(len(Z), self.n, self.P + self.grid.segments * self.d)
         J[..., : self.P] = Z[..., : self.P]
         for i in range(self.d):
-            J[torch.arange(len(order)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
-        return (by * r)[order].flatten(), J[order].flatten(0, 1)
+            J[torch.arange(len(Z)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
+        return (by * r).flatten(), J.flatten(0, 1)
 
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
+        """Data residuals (N, n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
         fit = self.weight * self._missed(x) / self.deviations
         before = self.grid.joined_to.clamp_min(0)
         ends = x[before, self.grid.end[before], : self.d]
