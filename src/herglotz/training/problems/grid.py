@@ -26,7 +26,7 @@ class SegmentGrid:
     h: Tensor  # (S, K) model steps
     node: Tensor  # (N,) flat index s·(K+1) + k of the node that each sample observes
     start_sample: Tensor  # (S,) row of the data at the start of each segment
-    joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
+    joined: Tensor  # (S,) bool, whether it starts where the segment before ends; else a trajectory starts there
     end: Tensor  # (S,) last node of each segment
     row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
     part: Tensor  # (S, K) where in this recorded step the middle of the model step is, from 0 to 1
@@ -100,12 +100,12 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
     seen: list[Tensor] = []  # its observed nodes
     starts: list[int] = []
-    joined: list[int] = []
+    joined: list[bool] = []
     for first, count in zip(data.offsets, data.lengths, strict=True):
         pieces = max(1, round((count - 1) / length))
         bounds = [first + round(i * (count - 1) / pieces) for i in range(pieces + 1)]
         for i, (a, b) in enumerate(pairwise(bounds)):
-            joined.append(-1 if i == 0 else len(starts) - 1)
+            joined.append(i > 0)
             starts.append(a)
             node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
             row = torch.arange(a, b, device=node.device).repeat_interleave(counts[a:b])
@@ -122,7 +122,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
         h=h.to(data.t),
         node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]),
         start_sample=torch.tensor(starts, device=end.device),
-        joined_to=torch.tensor(joined, device=end.device),
+        joined=torch.tensor(joined, device=end.device),
         end=end,
         row=row,
         part=part.to(data.t),

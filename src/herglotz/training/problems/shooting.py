@@ -164,10 +164,9 @@ class ShootingProblem(StatesProblem):
         for k in range(S):
             own = segment == k
             self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
-        for k in (grid.joined_to >= 0).nonzero()[:, 0].tolist():
-            before = int(grid.joined_to[k])
-            J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
-            columns = torch.cat([self._columns(before, P), self._columns(k, P)[P:]])
+        for k in grid.joined.nonzero()[:, 0].tolist():
+            J = torch.cat([Z[k - 1, grid.end[k - 1]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
+            columns = torch.cat([self._columns(k - 1, P), self._columns(k, P)[P:]])
             self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
         anchored, anchor = self._anchored() - self.P + P, self._anchor(x)
         A[anchored, anchored] += 1 / self._anchor_weight**2
@@ -281,10 +280,9 @@ class ShootingProblem(StatesProblem):
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Data residuals (N, n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
         fit = self.weight * self._missed(x) / self.deviations
-        before = self.grid.joined_to.clamp_min(0)
-        ends = x[before, self.grid.end[before], : self.d]
-        joints = (ends - x[:, 0, : self.d]) / self.joint_weight
-        return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+        ends = x[torch.arange(len(x), device=x.device), self.grid.end, : self.d]
+        joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / self.joint_weight
+        return fit, torch.where(self.grid.joined[:, None], joints, 0.0)
 
     @property
     def _anchor_weight(self) -> float:
@@ -295,12 +293,12 @@ class ShootingProblem(StatesProblem):
         """Residuals of the first s of each trajectory."""
         first = x[self._anchored()]
         if self.s is not None and len(first):
-            first = first - self.s[self.grid.start_sample[self.grid.joined_to < 0]]
+            first = first - self.s[self.grid.start_sample[~self.grid.joined]]
         return first / self._anchor_weight
 
     def _anchored(self) -> Tensor:
         """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
-        first = (self.grid.joined_to < 0).nonzero()[:, 0]
+        first = (~self.grid.joined).nonzero()[:, 0]
         return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
     def _columns(self, segment: int, P: int) -> Tensor:
