@@ -128,7 +128,7 @@ class _Ahead:
     @classmethod
     def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
         """Runs over the rest of the data, and on for two turns of the motion."""
-        owner, step, parts = problem.grid.start_trajectory(train), data.typical_step, []
+        owner, step, parts = train.trajectory[problem.grid.start_sample], data.typical_step, []
         for b in torch.linspace(0, len(data) - 1, min(RUNS, len(data))).round().long().tolist():
             segment = int((owner == b).nonzero()[-1])
             rows = torch.arange(data.offsets[b], data.offsets[b] + data.lengths[b])

@@ -51,10 +51,6 @@ class SegmentGrid:
         """Values at the samples, (N, …) in their order, from those at every node, (S, K + 1, …)."""
         return x.flatten(0, 1)[self.node]
 
-    def start_trajectory(self, data: Trajectories) -> Tensor:
-        """Trajectory of every segment, (S,)."""
-        return data.trajectory[self.start_sample]
-
 
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
     """Inputs of the steps that start at each sample, (N, m), or of the model steps of a grid, (S, K, m).

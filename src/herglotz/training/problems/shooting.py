@@ -198,7 +198,7 @@ class ShootingProblem(StatesProblem):
         """
         old, new = other.grid.times(other.data), self.grid.times(self.data)
         values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])
-        trajectories = [problem.grid.start_trajectory(problem.data) for problem in (other, self)]
+        trajectories = [problem.data.trajectory[problem.grid.start_sample] for problem in (other, self)]
         for b in range(len(self.data)):
             rows, own = (trajectories[0] == b).nonzero()[:, 0], (trajectories[1] == b).nonzero()[:, 0]
             inside = torch.arange(old.shape[1], device=old.device) <= other.grid.end[rows, None]
@@ -215,7 +215,7 @@ class ShootingProblem(StatesProblem):
     def guess_from_states(self, states: Tensor) -> None:
         """Start the next solve from states (N, 2n+1) at the samples, with cubics between them (Hermite's)."""
         data, times = self.data, self.grid.times(self.data)
-        owner, x = self.grid.start_trajectory(data), states.new_empty(*times.shape, states.shape[-1])
+        owner, x = data.trajectory[self.grid.start_sample], states.new_empty(*times.shape, states.shape[-1])
         for b, (first, length) in enumerate(zip(data.offsets, data.lengths, strict=True)):
             t, known, own = data.t[first : first + length].contiguous(), states[first : first + length], owner == b
             at = torch.searchsorted(t, times[own].contiguous()).clamp(1, length - 1)

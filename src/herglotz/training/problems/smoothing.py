@@ -71,11 +71,8 @@ class SmoothingProblem(StatesProblem):
             x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
         with torch.no_grad():
             _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
-        x[:, :-1, n : 2 * n] = p
-        last = (grid.end - 1)[:, None].clamp_min(0)
-        after = torch.arange(K + 1, device=p.device) >= grid.end[:, None]  # the last node, and padding, as before it
-        held = p.gather(1, last[..., None].expand(-1, -1, n)).expand(-1, K + 1, -1)
-        x[..., n : 2 * n] = torch.where(after[..., None], held, x[..., n : 2 * n])
+        step = torch.arange(K + 1, device=p.device).minimum(grid.end[:, None] - 1)  # last nodes and padding: the last
+        x[..., n : 2 * n] = p[torch.arange(S, device=p.device)[:, None], step]
         return torch.cat([theta, x.flatten()])
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
