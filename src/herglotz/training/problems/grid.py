@@ -91,7 +91,7 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     Segments of one trajectory have equal lengths up to one step, so that none is a stub. The last sample of a segment
     is the first of the next; it is observed once, by the earlier segment.
     """
-    recorded = data.t.double().diff()
+    recorded, device = data.t.double().cpu().diff(), data.t.device
     counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()  # model steps; a hair for rounded time stamps
     lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
     seen: list[Tensor] = []  # its observed nodes
@@ -104,23 +104,23 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
             joined.append(i > 0)
             starts.append(a)
             node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
-            row = torch.arange(a, b, device=node.device).repeat_interleave(counts[a:b])
-            before = torch.arange(len(row), device=row.device) - node[row - a]
+            row = torch.arange(a, b).repeat_interleave(counts[a:b])
+            before = torch.arange(len(row)) - node[row - a]
             lines.append((recorded[row] / counts[row], row, (before.double() + 0.5) / counts[row]))
             seen.append(node[i > 0 :])
-    end = torch.tensor([len(row) for _, row, _ in lines], device=counts.device)
+    end = torch.tensor([len(row) for _, row, _ in lines])
     K = int(end.max())
-    padding = torch.arange(K, device=end.device).minimum(end[:, None] - 1)  # the last model step again
+    padding = torch.arange(K).minimum(end[:, None] - 1)  # the last model step again
     h, row, part = (
         torch.stack([x[at] for x, at in zip(each, padding, strict=True)]) for each in zip(*lines, strict=True)
     )
     return SegmentGrid(
         h=h.to(data.t),
-        node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]),
-        start_sample=torch.tensor(starts, device=end.device),
-        joined=torch.tensor(joined, device=end.device),
-        end=end,
-        row=row,
+        node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]).to(device),
+        start_sample=torch.tensor(starts, device=device),
+        joined=torch.tensor(joined, device=device),
+        end=end.to(device),
+        row=row.to(device),
         part=part.to(data.t),
         length=length,
     )
