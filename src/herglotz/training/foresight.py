@@ -126,7 +126,7 @@ class _Ahead:
     @classmethod
     def of(cls, train: Trajectories, data: Trajectories, problem: ShootingProblem, turn: float) -> _Ahead:
         """Runs over the rest of the data, and on for two turns of the motion."""
-        owner, step, horizon = problem.grid.start_trajectory(train), data.typical_step, 0.0
+        owner, step, horizon = train.trajectory[problem.grid.start_sample], data.typical_step, 0.0
         segments, times, rows, recorded, beyond = [], [], [], [], []
         for b in torch.linspace(0, len(data) - 1, min(RUNS, len(data))).round().long().tolist():
             segment = int((owner == b).nonzero()[-1])
@@ -164,7 +164,7 @@ class _Ahead:
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]
         out = continued(model, x, grid.h, step_inputs(model, rest, grid))
-        known[at[grid.sample]] = out.flatten(0, 1)[grid.node]  # not what pads the shorter runs
+        known[at] = grid.at_samples(out)  # not what pads the shorter runs
         return known if bool(torch.isfinite(known).all()) else None
 
 

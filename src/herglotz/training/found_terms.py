@@ -59,7 +59,7 @@ class Found:
     def coloured(self) -> bool:
         """Whether the misfit goes on from sample to sample, by its autocorrelation: white noise has 0 ± 1/√N."""
         problem = self.fit.problem
-        r = problem.misfit(self.fit.path)[problem.grid.sample.argsort()]
+        r = problem.misfit(self.fit.path)
         together = problem.data.trajectory[1:] == problem.data.trajectory[:-1]
         with_next = (r[1:] * r[:-1]).sum(-1)[together].sum() / r.square().sum().clamp_min(1e-300)
         return float(with_next) > COLOURED / r.numel() ** 0.5
@@ -147,8 +147,7 @@ class Found:
         path = problem.solve(problem.pack(fit.theta, fit.path.x[:, 0, : problem.d]))
         if path is None:
             return math.inf
-        order = problem.grid.sample.argsort(), fit.problem.grid.sample.argsort()
-        change = problem.misfit(path)[order[0]] - fit.problem.misfit(fit.path)[order[1]]
+        change = problem.misfit(path) - fit.problem.misfit(fit.path)
         return float(change.square().mean().sqrt())
 
     @property

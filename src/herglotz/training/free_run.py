@@ -26,7 +26,7 @@ def states_everywhere(
     out = data.q.new_full((data.samples, 2 * data.dof + 1), torch.nan)
     out[leading(data.lengths, train_lengths)] = fitted.states
     before = [k - 1 if k < length else length for k, length in zip(train_lengths, data.lengths, strict=True)]
-    rows = (~leading(data.lengths, before)).nonzero()[:, 0]
+    rows = (~leading(data.lengths, before)).nonzero()[:, 0].to(out.device)
     if not len(rows):
         return state_of(out), "ok"
     rest = data.rows(rows, tuple(length - k for k, length in zip(before, data.lengths, strict=True) if k < length))

@@ -62,22 +62,14 @@ class Plan:
 
     def _has_effect(self, name: str) -> bool:
         one_step = self.objective in ("residual", "raw")
-        idle = {
-            "hold": not self.hold,
-            "delay": not self.delay,
-            "lag": not self.lag,
-            "zeros": not self.zeros,
-            "drag": not self.drag,
-            "absent": not self.absent,
-            "every": self.every == 1,
-            "substeps": self.substeps == 1,
-            "continues_probe": not self.continues_probe,
-            "fitted_before": not self.fitted_before,
-            "sigma": one_step,
-            "restarts": not one_step,
-            "departures": self.network in ("none", "plain"),
+        needed = {
+            "every": self.every > 1,
+            "substeps": self.substeps > 1,
+            "sigma": not one_step,
+            "restarts": one_step,
+            "departures": self.network not in ("none", "plain"),
         }
-        return not idle.get(name, False)
+        return needed.get(name, name not in IF_ANY or bool(getattr(self, name)))
 
     def by_reason(self, unit: str = "") -> list[tuple[list[str], str]]:
         """Decisions in words (`order of the time step: 2`) that have an effect, with the reason that they share.
@@ -134,6 +126,7 @@ WORDS = {  # what a decision is called; the starting values are too many to be t
     "departures": "strengths of the prior that are compared",
 }
 DECISIONS = tuple(WORDS)
+IF_ANY = ("hold", "delay", "lag", "zeros", "drag", "absent", "continues_probe", "fitted_before")  # told if not 0
 MEANINGS = {
     "level": {
         "conservative": "no damping",

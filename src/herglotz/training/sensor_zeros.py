@@ -97,7 +97,7 @@ def sensor_zeros(data: Trajectories, config: FitConfig, seen: Look) -> Apart | N
     together, alone = of.fit(seen.kept), of.fit(seen.kept[of.reference])
     if together is None or alone is None:
         return None
-    own = together.problem.data.trajectory[together.problem.grid.sample] == of.reference
+    own = together.problem.data.trajectory == of.reference
     before = _rms(together.problem.misfit(together.path)[own])
     apart = Apart(of.reference, before, alone.noise, unit=common_unit(seen.kept.units))
     if config.find_zeros is None and not apart.differs:

@@ -64,7 +64,7 @@ def smooth(model: ContactLagrangian, data: Trajectories, sigma: float, *, proces
     found = problem.states(x)
     std = torch.zeros_like(found)
     _, matrix, _ = problem.normal_equations(x, held=True)
-    std[:, : problem.d] = diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt().flatten(0, 1)[problem.node]
+    std[:, : problem.d] = problem.grid.at_samples(diagonal_of_inverse(matrix.blocks).clamp_min(0).sqrt())
     return Smoothed(*(state_of(y) for y in (found, std)))
 
 

@@ -56,7 +56,7 @@ class SmoothingFit:
         with torch.no_grad():
             stepper = Stepper(problem.parameters.at(self.theta))
             out = stepper.rollout(*start, h=problem.grid.h, inputs=problem.u)
-        miss = out.q.flatten(0, 1)[problem.node] - problem.data.q
+        miss = problem.grid.at_samples(out.q) - problem.data.q
         return float(miss.square().mean().sqrt()) <= LOST * problem.sigma
 
     def held_out_errors(self) -> Tensor:
@@ -64,7 +64,7 @@ class SmoothingFit:
         problem, (_, matrix, _) = self.problem, self.problem.normal_equations(self.x)
         r = problem.misfit(self.x) / problem.sigma
         by = problem.root_weights(r)
-        rows = (problem.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
+        rows = (problem.grid.node[:, None] * problem.d + torch.arange(problem.n, device=r.device)).flatten() + problem.P
 
         weighted = (by * r).flatten()
 
@@ -136,7 +136,7 @@ def _noises(fit: SmoothingFit) -> tuple[float, float]:
     problem = fit.problem
     misfit, (_, matrix, _) = problem.misfit(fit.x), problem.normal_equations(fit.x, held=True)
     used = problem.root_weights(misfit / problem.sigma).square()
-    variances = diagonal_of_inverse(matrix.blocks).flatten(0, 1)[problem.node, : problem.n]
+    variances = problem.grid.at_samples(diagonal_of_inverse(matrix.blocks))[:, : problem.n]
     taken = float((variances / problem.deviations.square()).sum())
     free = misfit.numel() - taken
     starts = problem.grid.segments * problem.d

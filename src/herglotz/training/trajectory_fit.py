@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
@@ -48,7 +47,7 @@ class TrajectoryFit:
     @property
     def misfit(self) -> Tensor:
         """Residuals of the data that are used, (N', n), in units of q."""
-        return self.problem.misfit(self.path)[self.problem.used[self.problem.grid.sample]]
+        return self.problem.misfit(self.path)[self.problem.used]
 
     @property
     def noise(self) -> float:
@@ -189,12 +188,10 @@ class SegmentStages:
         A heavy-tailed loss finds outliers, but fits what is left less well than least squares do (reweighted least
         squares, Rousseeuw & Leroy 1987). A push breaks a joint, and no sample that is left out can mend it.
         """
-        problem, out = trial.problem, far_out(trial.misfit)
+        out = far_out(trial.misfit)
         if float(out.double().mean()) > FEW:
             return None
-        used = torch.ones_like(problem.used)
-        used[problem.grid.sample[out]] = False
-        rest = self.fit(self.lengths[0], trial.noise, None, trial, used)
+        rest = self.fit(self.lengths[0], trial.noise, None, trial, ~out)
         if rest is None or heavy_tailed(rest.misfit):
             return None
         return None if float(rest.problem.joint_residuals(rest.path).abs().max()) > FAR else rest

@@ -49,7 +49,7 @@ def window_errors(task: Task, fitted: Fitted, states: Tensor, data: Trajectories
     start, u = state_of(states[grid.start_sample]), step_inputs(fitted.model, data, grid)
     with torch.no_grad():
         out = Stepper(fitted.model).rollout(*start, h=grid.h, inputs=u)
-    return out.q.flatten(0, 1)[grid.node] - data.q[grid.sample]
+    return grid.at_samples(out.q) - data.q
 
 
 def unseen_window_errors(task: Task, fitted: Fitted, data: Trajectories) -> Tensor:

@@ -98,7 +98,7 @@ def _follow(run: Run, q: Tensor, spread: Tensor) -> float:
         u = step_inputs(run.model, run.data, grid)
         inputs = None if u is None else u.to(states[0].dtype)
         out = run.stepper.rollout(*states, h=grid.h.to(states[0].dtype), inputs=inputs)
-    error = out.q.flatten(0, 1)[grid.node].to(q.dtype) - q[grid.sample]
+    error = grid.at_samples(out.q).to(q.dtype) - q
     value = _rms(error / spread)
     return value if math.isfinite(value) else math.inf
 

@@ -28,7 +28,7 @@ def one_step_fit(data, iterations=40, s0=None, **settings) -> tuple[Any, torch.T
     problem = ResidualProblem(model, data, sigma=1e-8, prior=prior_of(model, base, 6e-3))
     t = problem.triples
     held = torch.arange(len(t)) % 3 == 2
-    problem.triples = pick(t, ~held)
+    problem.triples, problem.deviation = pick(t, ~held), problem.deviation[~held]
     x = problem.start()
     if s0 is not None and problem.latents:
         x[-problem.latents :] = s0

@@ -113,15 +113,13 @@ def test_fewer_terms_are_taken_where_they_are_as_likely(rms, length, taken):
 
 @pytest.mark.parametrize("moved", [0.0, 3.0])
 def test_the_change_of_a_motion_is_counted_sample_by_sample(moved):
-    # fails if misfits of two problems are added, or compared in the order of their segments: every sample moves by
-    # `moved` times the size of its own misfit
-    def problem(order, misfit):
+    # fails if misfits of two problems are added: every sample moves by `moved` times the size of its own misfit
+    def problem(misfit):
         path = SimpleNamespace(x=torch.zeros(2, 1, 3))
-        grid = SimpleNamespace(sample=torch.tensor(order))
-        return SimpleNamespace(d=2, grid=grid, pack=lambda *_: None, solve=lambda _: path, misfit=lambda _: misfit)
+        return SimpleNamespace(d=2, pack=lambda *_: None, solve=lambda _: path, misfit=lambda _: misfit)
 
     misfit = torch.tensor([1.0, -2.0, 2.0])
-    own, other = (problem(order, size * misfit[order]) for order, size in (([1, 2, 0], 1.0), ([2, 1, 0], 1.0 + moved)))
+    own, other = (problem(size * misfit) for size in (1.0, 1.0 + moved))
     found = SimpleNamespace(fit=SimpleNamespace(theta=None, path=own.solve(None), problem=own))
     assert Found.changed_by(found, other) == pytest.approx(moved * 3**0.5)  # pyright: ignore
 

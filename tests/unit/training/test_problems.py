@@ -109,7 +109,7 @@ def test_free_runs_over_whole_trajectories_start_where_the_data_do(sigma, length
         simulate(scene("damped_pendulum"), trajectories=3, steps=200, h=0.1, noise=0.01, seed=0),
     )
     problem = ShootingProblem(model, data, segment_grid(data, length, 0.1), sigma=sigma)
-    first = (problem.grid.sample % 201 < 3)[:, None]
+    first = (torch.arange(data.samples) % 201 < 3)[:, None]
     assert bool((problem.weight[~first.expand_as(problem.weight)] == 1).all())
     # a standard deviation from 400 windows of nine samples, each three to five times free, is known to 3 %
     assert problem.weight[first.expand_as(problem.weight)].tolist() == pytest.approx([better] * 9, rel=0.1)
@@ -241,12 +241,12 @@ def test_gaps_are_left_out_of_triples_and_crossed_in_substeps():
     assert float(ResidualProblem(model_of("linear"), data, max_step=0.3).triples.h1.max()) < 0.3
     grid = segment_grid(data, 10, 0.3)
     assert float(grid.h.max()) <= 0.3 + 1e-9
-    assert grid.node.numel() == data.samples == grid.sample.unique().numel()  # every sample observed exactly once
+    assert grid.node.numel() == data.samples == grid.node.unique().numel()  # every sample observed exactly once
     for s in range(grid.segments):
         first, own = grid.start_sample[s], (grid.node // (grid.h.shape[1] + 1) == s).nonzero()[:, 0]
         time = torch.cat([torch.zeros(1, dtype=data.t.dtype), grid.h[s].cumsum(0)]) + data.t[first]
         k = grid.node[own] - s * (grid.h.shape[1] + 1)
-        torch.testing.assert_close(time[k], data.t[grid.sample[own]])
+        torch.testing.assert_close(time[k], data.t[own])
 
 
 def test_lifted_solution_is_the_stepped_one():
@@ -447,7 +447,7 @@ def test_held_out_errors_are_those_of_a_refit():
     _, A, _ = problem.normal_equations(x)
     assert problem.path is not None
     predicted = held_out_errors(problem, problem.path, problem.unpack(x)[0], A)
-    fold = torch.cat([torch.arange(41) * 5 // 41] * 2)[problem.grid.sample]
+    fold = torch.cat([torch.arange(41) * 5 // 41] * 2)
     for k in (2, 4):
         refit, y = fitted(torch.where(fold == k, 0.0, 1.0).double())
         path = refit.solve(y)

@@ -24,10 +24,9 @@ class SegmentGrid:
     """
 
     h: Tensor  # (S, K) model steps
-    node: Tensor  # (N',) flat index s·(K+1) + k of every observed node
-    sample: Tensor  # (N',) row of the data observed there
+    node: Tensor  # (N,) flat index s·(K+1) + k of the node that each sample observes
     start_sample: Tensor  # (S,) row of the data at the start of each segment
-    joined_to: Tensor  # (S,) the segment whose end is this one's start, −1 at the start of a trajectory
+    joined: Tensor  # (S,) bool, whether it starts where the segment before ends; else a trajectory starts there
     end: Tensor  # (S,) last node of each segment
     row: Tensor  # (S, K) row of the data at the start of the recorded step that each model step is part of
     part: Tensor  # (S, K) where in this recorded step the middle of the model step is, from 0 to 1
@@ -50,11 +49,7 @@ class SegmentGrid:
 
     def at_samples(self, x: Tensor) -> Tensor:
         """Values at the samples, (N, …) in their order, from those at every node, (S, K + 1, …)."""
-        return x.flatten(0, 1)[self.node[self.sample.argsort()]]
-
-    def start_trajectory(self, data: Trajectories) -> Tensor:
-        """Trajectory of every segment, (S,)."""
-        return data.trajectory[self.start_sample]
+        return x.flatten(0, 1)[self.node]
 
 
 def step_inputs(model: ContactLagrangian, data: Trajectories, grid: SegmentGrid | None = None) -> Tensor | None:
@@ -96,38 +91,36 @@ def segment_grid(data: Trajectories, length: int, max_step: float) -> SegmentGri
     Segments of one trajectory have equal lengths up to one step, so that none is a stub. The last sample of a segment
     is the first of the next; it is observed once, by the earlier segment.
     """
-    recorded = data.t.double().diff()
+    recorded, device = data.t.double().cpu().diff(), data.t.device
     counts = (recorded / max_step - 1e-6).ceil().clamp_min(1).long()  # model steps; a hair for rounded time stamps
     lines: list[tuple[Tensor, Tensor, Tensor]] = []  # of each segment: h, row and part of its model steps
-    seen: list[tuple[Tensor, Tensor]] = []  # its observed nodes, and their samples
+    seen: list[Tensor] = []  # its observed nodes
     starts: list[int] = []
-    joined: list[int] = []
+    joined: list[bool] = []
     for first, count in zip(data.offsets, data.lengths, strict=True):
         pieces = max(1, round((count - 1) / length))
         bounds = [first + round(i * (count - 1) / pieces) for i in range(pieces + 1)]
         for i, (a, b) in enumerate(pairwise(bounds)):
-            joined.append(-1 if i == 0 else len(starts) - 1)
+            joined.append(i > 0)
             starts.append(a)
-            sample = torch.arange(a, b + 1, device=counts.device)
             node = torch.cat([counts.new_zeros(1), counts[a:b].cumsum(0)])
-            row = sample[:-1].repeat_interleave(counts[a:b])
-            before = torch.arange(len(row), device=row.device) - node[row - a]
+            row = torch.arange(a, b).repeat_interleave(counts[a:b])
+            before = torch.arange(len(row)) - node[row - a]
             lines.append((recorded[row] / counts[row], row, (before.double() + 0.5) / counts[row]))
-            seen.append((node[i > 0 :], sample[i > 0 :]))
-    end = torch.tensor([len(row) for _, row, _ in lines], device=counts.device)
+            seen.append(node[i > 0 :])
+    end = torch.tensor([len(row) for _, row, _ in lines])
     K = int(end.max())
-    padding = torch.arange(K, device=end.device).minimum(end[:, None] - 1)  # the last model step again
+    padding = torch.arange(K).minimum(end[:, None] - 1)  # the last model step again
     h, row, part = (
         torch.stack([x[at] for x, at in zip(each, padding, strict=True)]) for each in zip(*lines, strict=True)
     )
     return SegmentGrid(
         h=h.to(data.t),
-        node=torch.cat([s * (K + 1) + node for s, (node, _) in enumerate(seen)]),
-        sample=torch.cat([sample for _, sample in seen]),
-        start_sample=torch.tensor(starts, device=end.device),
-        joined_to=torch.tensor(joined, device=end.device),
-        end=end,
-        row=row,
+        node=torch.cat([s * (K + 1) + node for s, node in enumerate(seen)]).to(device),
+        start_sample=torch.tensor(starts, device=device),
+        joined=torch.tensor(joined, device=device),
+        end=end.to(device),
+        row=row.to(device),
         part=part.to(data.t),
         length=length,
     )

@@ -211,7 +211,7 @@ class ResidualProblem(OneStep):
     def _local(self, x: Tensor, *rows: Any) -> Tensor:
         """J⁻¹R over the balance of the coordinates (or R) of one triple or of a batch of them."""
         q0, q1, q2, s0, h0, h1, u0, u1 = rows
-        theta = x[: self.P]
+        theta = x[: self.P] if self.carries_s else x
         before = self.parameters.partials(theta, q0, q1, s0, h0, 1, u0)
         after = self.parameters.partials(theta, q1, q2, s0 + before.L, h1, 2, u1)
         p = momentum_plus(before)

@@ -46,7 +46,7 @@ class ShootingProblem(StatesProblem):
         super().__init__(model, data, grid, **settings)
         self.used = torch.ones_like(data.t, dtype=torch.bool) if used is None else used
         self.better = self._known_better()  # (N, n)
-        self.weight = (self.used.to(data.q)[:, None] * self.better)[grid.sample]  # (N', n)
+        self.weight = self.used.to(data.q)[:, None] * self.better  # (N, n)
         # A joint may be off by the noise in q and the same fraction of its size in p (mass 1) and s.
         relative = self.deviations / self.scale
         action = (self.speed * self.scale * relative)[: self.d - 2 * self.n]
@@ -160,14 +160,13 @@ class ShootingProblem(StatesProblem):
         S = grid.segments
         A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
         segment = grid.node // (grid.h.shape[1] + 1)
-        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N', n, P + d)
+        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N, n, P + d)
         for k in range(S):
             own = segment == k
             self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
-        for k in (grid.joined_to >= 0).nonzero()[:, 0].tolist():
-            before = int(grid.joined_to[k])
-            J = torch.cat([Z[before, grid.end[before]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
-            columns = torch.cat([self._columns(before, P), self._columns(k, P)[P:]])
+        for k in grid.joined.nonzero()[:, 0].tolist():
+            J = torch.cat([Z[k - 1, grid.end[k - 1]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
+            columns = torch.cat([self._columns(k - 1, P), self._columns(k, P)[P:]])
             self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
         anchored, anchor = self._anchored() - self.P + P, self._anchor(x)
         A[anchored, anchored] += 1 / self._anchor_weight**2
@@ -186,8 +185,7 @@ class ShootingProblem(StatesProblem):
         At a joint the end of the earlier segment is taken, unless the loss lets joints break: then the start of the
         later one, because the end of the earlier is somewhere else.
         """
-        rows = torch.full((len(self.data.t),), -1, dtype=torch.long, device=samples.device)
-        rows[self.grid.sample] = self.grid.node
+        rows = self.grid.node.clone()
         if self.freedom is not None:
             first = torch.arange(self.grid.segments, device=samples.device) * (self.grid.h.shape[1] + 1)
             rows[self.grid.start_sample] = first
@@ -200,7 +198,7 @@ class ShootingProblem(StatesProblem):
         """
         old, new = other.grid.times(other.data), self.grid.times(self.data)
         values, x = path.x.flatten(0, 1), path.x.new_empty(*new.shape, path.x.shape[-1])
-        trajectories = [problem.grid.start_trajectory(problem.data) for problem in (other, self)]
+        trajectories = [problem.data.trajectory[problem.grid.start_sample] for problem in (other, self)]
         for b in range(len(self.data)):
             rows, own = (trajectories[0] == b).nonzero()[:, 0], (trajectories[1] == b).nonzero()[:, 0]
             inside = torch.arange(old.shape[1], device=old.device) <= other.grid.end[rows, None]
@@ -217,7 +215,7 @@ class ShootingProblem(StatesProblem):
     def guess_from_states(self, states: Tensor) -> None:
         """Start the next solve from states (N, 2n+1) at the samples, with cubics between them (Hermite's)."""
         data, times = self.data, self.grid.times(self.data)
-        owner, x = self.grid.start_trajectory(data), states.new_empty(*times.shape, states.shape[-1])
+        owner, x = data.trajectory[self.grid.start_sample], states.new_empty(*times.shape, states.shape[-1])
         for b, (first, length) in enumerate(zip(data.offsets, data.lengths, strict=True)):
             t, known, own = data.t[first : first + length].contiguous(), states[first : first + length], owner == b
             at = torch.searchsorted(t, times[own].contiguous()).clamp(1, length - 1)
@@ -229,11 +227,11 @@ class ShootingProblem(StatesProblem):
         self.path = Path(x, x[..., None])
 
     def misfit(self, path: Path) -> Tensor:
-        """q_model − q_data over the balance of the coordinates at every sample, (N', n)."""
+        """q_model − q_data over the balance of the coordinates at every sample, (N, n)."""
         return self._missed(path.x) / self.data.balance
 
     def _missed(self, x: Tensor) -> Tensor:
-        return x[..., : self.n].flatten(0, 1)[self.grid.node] - (self.data.q - self.zeros)[self.grid.sample]
+        return self.grid.at_samples(x[..., : self.n]) - (self.data.q - self.zeros)
 
     def by_zeros(self, which: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """What (JᵀJ, Jᵀr) have of zeros z of sensors, where the normal equations of all unknowns were made last.
@@ -242,10 +240,10 @@ class ShootingProblem(StatesProblem):
         """
         assert self.path is not None
         assert self._slopes is not None
-        count, which = int(which.max()) + 1, which[self.grid.sample]
+        count = int(which.max()) + 1
         fit, _ = self._residuals(self.path.x)
         by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
-        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N', n, P + d)
+        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N, n, P + d)
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         columns = rows.new_zeros(self.P + self.grid.segments * self.d, count, self.n)
         for k in range(self.grid.segments):
@@ -263,7 +261,7 @@ class ShootingProblem(StatesProblem):
         return self._residuals(path.x)[1]
 
     def data_rows(self, path: Path, theta: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals and their Jacobian, (N'·n,) and (N'·n, unknowns), over σ and in the order of the samples.
+        """Data residuals and their Jacobian, (N·n,) and (N·n, unknowns), over σ and in the order of the samples.
 
         Both carry the square roots of the weights: those of a robust loss, those of known starts, and 0 for
         samples that are not used.
@@ -272,21 +270,19 @@ class ShootingProblem(StatesProblem):
         by = self.weight * self.root_weights(self.weight * r)
         Z = self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
         Z = Z * (by / self.deviations)[..., None]
-        order = self.grid.sample.argsort()
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
-        J = Z.new_zeros(len(order), self.n, self.P + self.grid.segments * self.d)
+        J = Z.new_zeros(len(Z), self.n, self.P + self.grid.segments * self.d)
         J[..., : self.P] = Z[..., : self.P]
         for i in range(self.d):
-            J[torch.arange(len(order)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
-        return (by * r)[order].flatten(), J[order].flatten(0, 1)
+            J[torch.arange(len(Z)), :, self.P + segment * self.d + i] = Z[..., self.P + i]
+        return (by * r).flatten(), J.flatten(0, 1)
 
     def _residuals(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Data residuals (N', n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
+        """Data residuals (N, n) and joint residuals (S, d), zero for a segment that starts a trajectory."""
         fit = self.weight * self._missed(x) / self.deviations
-        before = self.grid.joined_to.clamp_min(0)
-        ends = x[before, self.grid.end[before], : self.d]
-        joints = (ends - x[:, 0, : self.d]) / self.joint_weight
-        return fit, torch.where(self.grid.joined_to[:, None] >= 0, joints, 0.0)
+        ends = x[torch.arange(len(x), device=x.device), self.grid.end, : self.d]
+        joints = (ends.roll(1, 0) - x[:, 0, : self.d]) / self.joint_weight
+        return fit, torch.where(self.grid.joined[:, None], joints, 0.0)
 
     @property
     def _anchor_weight(self) -> float:
@@ -297,12 +293,12 @@ class ShootingProblem(StatesProblem):
         """Residuals of the first s of each trajectory."""
         first = x[self._anchored()]
         if self.s is not None and len(first):
-            first = first - self.s[self.grid.start_sample[self.grid.joined_to < 0]]
+            first = first - self.s[self.grid.start_sample[~self.grid.joined]]
         return first / self._anchor_weight
 
     def _anchored(self) -> Tensor:
         """Where in the unknowns the first s of each trajectory stands; none where s does not enter the motion."""
-        first = (self.grid.joined_to < 0).nonzero()[:, 0]
+        first = (~self.grid.joined).nonzero()[:, 0]
         return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
     def _columns(self, segment: int, P: int) -> Tensor:

@@ -43,12 +43,11 @@ class SmoothingProblem(StatesProblem):
     ):
         super().__init__(model, data, grid, **settings)
         self.process, n, d = process, self.n, self.d
-        self.node = grid.node[grid.sample.argsort()]  # (N,) where in (S·M,) each sample is
         S, M = grid.segments, grid.longest + 1
         node = torch.arange(M, device=data.q.device)
         self.inside = (node <= grid.end[:, None])[..., None].to(data.q)  # (S, M, 1) padding has 0
         self.seen, self.target = data.q.new_zeros(S * M, 1), data.q.new_zeros(S * M, n)
-        self.seen[self.node], self.target[self.node] = 1.0, data.q
+        self.seen[grid.node], self.target[grid.node] = 1.0, data.q
         self.seen, self.target = self.seen.reshape(S, M, 1), self.target.reshape(S, M, n)
         # What a force that the model does not know adds to v and p in a step, to q by the way, and to s.
         v = (self.deviations * self.speed / self.scale).expand(*grid.h.shape, n)
@@ -62,8 +61,8 @@ class SmoothingProblem(StatesProblem):
         S, K = grid.h.shape
         x = self.data.q.new_zeros(S, K + 1, self.d)
         for b in range(S):
-            own = (grid.node // (K + 1) == b).nonzero()[:, 0]
-            node, rows = grid.node[own] - b * (K + 1), grid.sample[own]
+            rows = (grid.node // (K + 1) == b).nonzero()[:, 0]
+            node = grid.node[rows] - b * (K + 1)
             t = torch.cat([grid.h.new_zeros(1), grid.h[b].cumsum(0)])
             every = torch.arange(K + 1, device=node.device).clamp_max(int(grid.end[b]))
             right = torch.searchsorted(node, every).clamp(1, len(node) - 1)
@@ -72,11 +71,8 @@ class SmoothingProblem(StatesProblem):
             x[b, :, :n] = self.data.q[rows[right - 1]] * (1 - share) + self.data.q[rows[right]] * share
         with torch.no_grad():
             _, p, _ = legendre_minus(self.parameters.at(theta, self.u), x[:, :-1, :n], x[:, 1:, :n], 0 * grid.h, grid.h)
-        x[:, :-1, n : 2 * n] = p
-        last = (grid.end - 1)[:, None].clamp_min(0)
-        after = torch.arange(K + 1, device=p.device) >= grid.end[:, None]  # the last node, and padding, as before it
-        held = p.gather(1, last[..., None].expand(-1, -1, n)).expand(-1, K + 1, -1)
-        x[..., n : 2 * n] = torch.where(after[..., None], held, x[..., n : 2 * n])
+        step = torch.arange(K + 1, device=p.device).minimum(grid.end[:, None] - 1)  # last nodes and padding: the last
+        x[..., n : 2 * n] = p[torch.arange(S, device=p.device)[:, None], step]
         return torch.cat([theta, x.flatten()])
 
     def unpack(self, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -138,7 +134,7 @@ class SmoothingProblem(StatesProblem):
 
     def misfit(self, x: Tensor) -> Tensor:
         """Q − q_data over the balance of the coordinates at every sample, (N, n)."""
-        return (self.unpack(x)[1].flatten(0, 1)[self.node, : self.n] - self.data.q) / self.data.balance
+        return (self.grid.at_samples(self.unpack(x)[1][..., : self.n]) - self.data.q) / self.data.balance
 
     def defects(self, x: Tensor) -> Tensor:
         """(Φ̃(X_k) − X_{k+1})/w of every step, (S, K, d); 0 where there is none."""

@@ -126,11 +126,6 @@ def all_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | 
     return y, step_derivative(P, p0)
 
 
-def _momentum_slope(P: Partials) -> Tensor:
-    """∂p1/∂q1, (..., n, n)."""
-    return P.D22 if P.force is None else P.D22 + P.force.plus_2
-
-
 def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor] | None:
     """The same with F linear about the next state's q; exact, and equal to `all_steps`, where F = 0 there.
 
@@ -145,8 +140,8 @@ def linear_steps(L_d: FixedModel, x: Tensor, h: Tensor) -> tuple[Tensor, Tensor]
         dq, P = _linear_inclusion(P, p0, q1 - q0)
     else:
         dq = -solve(momentum_jacobian(P, p0), momentum_residual(P, p0))
-    step = dq[..., None]
-    p1, s1 = momentum_plus(P) + (_momentum_slope(P) @ step)[..., 0], s0 + P.L + (P.D2 * dq).sum(-1)
+    slope = P.D22 if P.force is None else P.D22 + P.force.plus_2  # ∂p1/∂q1
+    p1, s1 = momentum_plus(P) + (slope @ dq[..., None])[..., 0], s0 + P.L + (P.D2 * dq).sum(-1)
     return torch.cat([q1 + dq, p1, s1[..., None]], -1), step_derivative(P, p0)
 
 
