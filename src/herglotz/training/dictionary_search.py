@@ -139,12 +139,15 @@ class DictionarySearch:
         linear = starts_of(self.recorded, self.base, self.all, local)
         grown = ((self._grown(of, x.values, start), at) for at, x in enumerate(linear, 1) for of in x.ways)
         found, at = next((pair for pair in grown if pair[0] is not None), (None, 0))
-        lost = found is None or (self.data.dof == 1 and found.coloured and found.rms > MISLED * self.precision)
-        if bare is None and lost:
+        if bare is None and self._misled(found):
             bare = self._bare(start)
         if bare is not None and bare.misses_less(found):
             found, linear = bare, []
         return (found, []) if found is None else (self._finer(self._held(self._simpler(found))), linear[at:])
+
+    def _misled(self, found: Found | None) -> bool:
+        """Whether the linear problem gave no model, or one coordinate's that misses far more than the noise."""
+        return found is None or (self.data.dof == 1 and found.coloured and found.rms > MISLED * self.precision)
 
     def _from_part(self, part: Trajectories) -> Found | None:
         """What a part of the data asks for, fitted to all of them: a search costs many fits."""
