@@ -156,8 +156,7 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
     def without(reason: str) -> Structure:
         return Structure(config, base, f"no dictionary of features: {reason}")
 
-    tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
-    names, linear = next(((names, found) for names, found in tried if found), ((), None))
+    names, linear = _largest(data, base)
     if linear is None:
         return without("too few samples for its coefficients")
     every, fit, x = linear
@@ -183,6 +182,12 @@ def structured(data: Trajectories, base: Baseline, config: FitConfig) -> Structu
         return Structure(replace(rich, order=2), found, f"{words}; order 4 is not what the rest lacks")
     objective = "residual" if config.objective == "auto" else config.objective
     return Structure(replace(rich, objective=objective), found, f"{words}: exact")
+
+
+def _largest(data: Trajectories, base: Baseline) -> tuple[tuple[str, ...], tuple[int, LinearFit, Tensor] | None]:
+    """The largest dictionary that the samples suffice for, and its linear problem; none of either where none does."""
+    tried = ((names, _linear(data, base, names)) for names in dictionaries(data))
+    return next(((names, found) for names, found in tried if found), ((), None))
 
 
 def explains_steps(order4: float, order2: float, size: float) -> bool:
