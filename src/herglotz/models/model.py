@@ -220,7 +220,7 @@ class ContactLagrangian(nn.Module):
         """L_d, shape (...); with `order` 1 or 2 its `Partials` (so that functional_call reaches both)."""
         if not order:
             return self.partials(q0, q1, s0, h, 1).L
-        return self.partials(q0, q1, s0, h, order, u)
+        return self.partials(q0, q1, s0, h, order) if u is None else self.partials(q0, q1, s0, h, order, u)
 
     def _phase(
         self, q0: Tensor, q1: Tensor, s0: Tensor, h: Tensor | float, order: int, delta: Tensor | None = None
