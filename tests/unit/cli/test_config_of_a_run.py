@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -12,6 +13,8 @@ from herglotz.cli import main
 from herglotz.data import load, save, simulate
 from herglotz.scenes import scene
 from herglotz.training import FitConfig, fit, load_run, save_run, select
+
+SLOW = partial(pytest.param, marks=pytest.mark.slow)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +107,7 @@ def test_python_remembers_how_data_were_read(driven, tmp_path):
     assert fit(x.q[:, 0].numpy(), time=x.t.numpy(), iterations=5).reading == {}
 
 
-@pytest.mark.parametrize(("told", "named"), [(True, ["x"]), (False, []), ("x", "x"), (("x",), ["x"])])
+@pytest.mark.parametrize(("told", "named"), [(True, ["x"]), (False, []), SLOW("x", "x"), SLOW(("x",), ["x"])])
 def test_angles_and_sensors_are_remembered(driven, tmp_path, told, named):
     # fails if --config reads an angle as a length because Python said angles=True, or an array of zeros is forgotten
     sensors = {"sensor_zeros": np.array([0.25]), "sensor_scales": 2}

@@ -180,7 +180,7 @@ def test_the_parachute_pole():
         assert ", h = 0.1: SINGULAR: the motion escapes: q1 grows without bound as h → 0.0999" in line
 
 
-@pytest.mark.parametrize("factor", [2.0, 10.0])
+@pytest.mark.parametrize("factor", [pytest.param(2.0, marks=pytest.mark.slow), 10.0])
 def test_the_escape_is_found_at_its_time(factor):
     # fails if the place of a pole inside the step is not told: λ v0 tanh(ωh*)/ω = 1
     parachute, omega = scene("parachute"), math.sqrt(0.1)

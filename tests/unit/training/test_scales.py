@@ -1,6 +1,7 @@
 """The unit of length decides nothing: no constant of a search has one."""
 
 from dataclasses import replace
+from functools import cache
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt
 
 
+@cache  # the fit in its own unit stands beside both others
 def _found(unit: float):
     data = simulate(scene("duffing"), trajectories=2, steps=60, h=0.1, seed=0)
     data = replace(data, q=unit * data.q, p=None, s=None)

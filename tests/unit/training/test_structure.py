@@ -240,6 +240,7 @@ def test_a_dictionary_that_misses_is_not_taken_for_noise():
     assert not base.start
 
 
+@pytest.mark.slow  # 14 s; test_named_terms.py has a planet in noise
 def test_a_planet_is_learned_with_structure_is_free():
     # fails if the distance is not found: free runs then leave the orbit (the networks' end in NaN)
     data = simulate(scene("kepler"), trajectories=4, steps=40, h=0.02, seed=0)
