@@ -97,6 +97,8 @@ def simulate(
     q, p, s = _roll(scene, q0, v0, steps, h, u)
     q = q + noise * torch.randn(q.shape, generator=generator, dtype=q.dtype)
     keep = torch.stack([_kept(steps + 1, gaps, generator) for _ in range(trajectories)])  # (B, steps + 1) bool
+    more: dict[str, Any] = {"s": s.flatten(), "p": p.flatten(0, 1)} if keep_state else {}
+    more |= {} if u is None else {"u": u.repeat(trajectories, 1), "hold": "zero"}
     whole = Trajectories(
         (h * torch.arange(steps + 1, dtype=torch.float64)).repeat(trajectories),
         q.flatten(0, 1),
@@ -104,10 +106,7 @@ def simulate(
         names=tuple(scene.coordinates),
         units=tuple("rad" if a else unit for a, unit in zip(scene.angles, scene.units, strict=True)),
         angles=tuple(scene.angles),
-        s=s.flatten() if keep_state else None,
-        p=p.flatten(0, 1) if keep_state else None,
-        u=None if u is None else u.repeat(trajectories, 1),
-        hold="" if u is None else "zero",
+        **more,
         time_unit=getattr(scene, "time_unit", "s"),
         source=f"simulate({scene.name}, h={h:g}, seed={seed})",
     )
