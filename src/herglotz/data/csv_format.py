@@ -30,6 +30,9 @@ SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs befo
 def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     """Read trajectories from a csv file (UTF-8) whose columns have the wanted roles, and others by their names.
 
+    `herglotz.data.load` asks for roles by keywords (`time=`, `coordinates=`, …) and for angles; here they are a
+    `herglotz.data.csv_columns.Wanted`.
+
     Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
     which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
 
@@ -129,8 +132,8 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
     """Write trajectories so that `read_csv` returns the same numbers, bit for bit, atomically.
 
     `comments` become lines that start with #. A coordinate in rad that is not an angle is written too, although
-    `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit
-    cannot stand in the header (it has a comma, or means another column).
+    `read_csv` reads it as an angle. Raise InputError if a coordinate's name or a unit cannot stand in the header (it
+    has a comma, or means another column).
     """
     q = trajectories.names
     header = ["trajectory", f"t[{trajectories.time_unit}]"]

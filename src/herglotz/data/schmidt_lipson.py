@@ -20,8 +20,9 @@ def read_schmidt_lipson(path: PathLike) -> Trajectories:
     """Read one of the supplementary data files: `% o v` or `% x v`, then rows `trial t coordinate v`.
 
     A coordinate `o` is an angle in rad, here named `theta`; `x` is a position in pixels. Trials become trajectories.
-    The files give no unit of time (`real_linear_h_1` is in s, `real_pend_h_1` in the video's own unit). Files of two
-    coordinates (`% o1 o2 v1 v2`) follow the same pattern and are read too.
+    The files give no unit of time (`real_linear_h_1` is in s, `real_pend_h_1` in the video's own unit);
+    `dataclasses.replace(data, time_unit="s")` sets it. Files of two coordinates (`% o1 o2 v1 v2`) follow the same
+    pattern and are read too.
 
     Velocities (and accelerations) are left aside: in `real_pend_h_1` the column `v` is 0.954 times the true dq/dt,
     because it was smoothed, and a stepper is learned from positions alone.

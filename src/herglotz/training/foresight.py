@@ -145,7 +145,7 @@ class _Ahead:
         t, lengths = torch.cat(times), tuple(map(len, times))
         u = None if data.u is None else data.u[torch.cat(recorded)]
         made = replace(data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths)
-        return cls(made, torch.cat(rows), segments, torch.cat(beyond), horizon)
+        return cls(made, torch.cat(rows).to(t.device), segments, torch.cat(beyond), horizon)
 
     def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor | None:
         """States at all samples of these runs, known ones and those of the model's steps; None where a step fails.
@@ -159,7 +159,7 @@ class _Ahead:
                 parts.append(torch.arange(first + min(last, length - 3), first + length))  # three samples at least
         if not parts:
             return known
-        at = torch.cat(parts)
+        at = torch.cat(parts).to(known.device)
         rest = self.data.rows(at, tuple(map(len, parts)))
         grid = segment_grid(rest, rest.samples, max_step)
         x = known[at[grid.start_sample]]

@@ -42,7 +42,7 @@ class Candidate:
     level: str
     runs: tuple[Run, ...]
     errors: Tensor  # (seeds, blocks) held-out RMS of the free run, in units of q; inf where it failed
-    step_us: float  # measured cost of one step of one trajectory, µs
+    step_us: float  # processor time of one step of one trajectory, µs
 
     @property
     def error(self) -> float:

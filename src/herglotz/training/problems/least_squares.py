@@ -71,8 +71,8 @@ class StatesProblem(LeastSquares, ABC):
         self.d = 2 * self.n + (1 if model.s_enters_motion else 0)
         self.scale, self.speed = (data.q.new_tensor(x) for x in (model.config.scale, model.config.speed))  # (n,)
         self.action = float((self.speed * self.scale).sum())  # natural size of s
-        self.mass = self._masses(model)  # (n,) in the units of p over those of v
-        self.u = step_inputs(model, data, grid)  # (S, K, m)
+        self.mass = self._masses(model)  # (n,) in the units of p over those of v; it reads the inputs at the samples
+        self.u = step_inputs(model, data, grid)  # (S, K, m), no longer (N, m)
 
     def _masses(self, model: ContactLagrangian) -> Tensor:
         """Median of h times the diagonal of the mixed Hessian over steps of the data, (n,); 1 where it is no size."""
