@@ -46,16 +46,21 @@ lint: .venv/installed
 	$(PY) -m ruff check .
 	$(PY) -m pyright --threads $(WORKERS)
 
-# Before a commit: about a minute on two cores. Processor time, measured on an Intel Xeon with one worker: 127 s in all,
-# pyright and 2383 tests. Folders left out: theory 48 s, plots 38 s, cli 83 s, export 194 s, and longer ones.
-QUICK := tests/unit/*.py tests/unit/data tests/unit/mechanics tests/unit/models tests/golden tests/contracts
-check: lint
-	$(ENV) $(PY) -m pytest -q $(SPREAD) $(QUICK)
-
-# The types are checked beside the first tests: alone they would leave a core idle for most of a minute.
-test: .venv/installed
+# $(1): tests, all where it is empty. The types are checked beside the first of them: alone they would leave a core idle
+# for most of a minute.
+define checked
 	$(PY) -m ruff check .
-	$(PY) -m pyright & types=$$!; $(ENV) $(PY) -m pytest -q $(SPREAD); tests=$$?; wait $$types && exit $$tests
+	$(PY) -m pyright & types=$$!; $(ENV) $(PY) -m pytest -q $(SPREAD) $(1); tests=$$?; wait $$types && exit $$tests
+endef
+
+# Before a commit: one to two minutes on two cores. Processor time, measured on an Intel Xeon with one worker: 127 s in
+# all, pyright and 2383 tests. Folders left out: theory 48 s, plots 38 s, cli 83 s, export 194 s, and longer ones.
+QUICK := tests/unit/*.py tests/unit/data tests/unit/mechanics tests/unit/models tests/golden tests/contracts
+check: .venv/installed
+	$(call checked,$(QUICK))
+
+test: .venv/installed
+	$(call checked,)
 
 # Other instructions, threads, versions and roundings, each on the folders that it can change: three times as long as
 # `make test`, folder by folder; it can be stopped and goes on where it was.
