@@ -64,7 +64,7 @@ def driven(found: Trajectories, t0: float, steps: int, h: float | None) -> tuple
     InputError if the recording does not cover these steps, or has no sample at t0 where its own steps are taken.
     """
     t, u = found.t.double(), found.inputs_of_steps()
-    assert u is not None  # `recorded` has refused others
+    assert u is not None  # `input_recording` has refused others
     where, spans = f"inputs {found.source}", f"the recording spans {float(t[0]):g} to {float(t[-1]):g}"
     if h is None:
         row = int((t - t0).abs().argmin())

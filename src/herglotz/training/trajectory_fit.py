@@ -173,11 +173,10 @@ class SegmentStages:
         Student's t is the loss of all further stages (`problems.robust`). Where the model is `known` already, outliers
         cannot hide in a poor fit: they show in its residuals.
         """
-        length = self.lengths[0]
         plain = first.noise < FLOOR * self.task.size or not heavy_tailed(first.misfit)
         if self.task.config.robust != "auto" or (known and plain):
             return first
-        trial = self.fit(length, max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
+        trial = self.fit(self.lengths[0], max(scale_of(first.misfit), 1e-3 * FLOOR * self.task.size), FREEDOM, None)
         if trial is None or not heavy_tailed(trial.misfit):
             return first
         return self._without_outliers(trial) or trial

@@ -28,6 +28,7 @@ def model_of(n, angles, features, **settings) -> Any:
 
 CASES = {
     "angles": model_of(3, True, ("cos(q1 - 2q2)", "sin(q3) + 0.5 cos(q1)"), known=("sin(q2 + q3)",)),
+    "nine angles, in loops": model_of(9, True, ("cos(q1 - q9)",)),
     "r": model_of(2, False, ("r^-1", "r^2", "r", "q1^3"), correction_width=4),
     "1, affine": model_of(2, False, ("1", "q1^2"), alike=True, level="affine", damping_width=3),
     "bodies": model_of(3, False, ("(q1 - q2)^2", "(q2 - q3)^4"), diagonal=True, level="forced"),
