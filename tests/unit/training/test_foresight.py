@@ -7,8 +7,10 @@ from herglotz.data import Trajectories, simulate
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
-from herglotz.training import fit
+from herglotz.training import fit, foresight, verdict
 from herglotz.training.foresight import _Ahead
+from herglotz.training.free_run import states_everywhere
+from herglotz.training.objectives import Fitted
 
 
 @pytest.mark.parametrize(("steps", "verdict"), [(40, "does not fit: too little"), (300, "fits to the noise")])
@@ -33,3 +35,37 @@ def test_runs_that_go_on_by_one_sample_are_followed():
     found = runs.stepped_on(model, states[:4], 0.1)
     assert found is not None
     torch.testing.assert_close(found, states)
+
+
+def test_the_start_is_asked_for_over_the_unseen_samples_alone(monkeypatch):
+    # fails if the time after the recording has a say in how far the start is known
+    starts, foresee = [], verdict.foresee
+
+    def for_longer_and_longer(*arguments):
+        for turns in (2, 6):
+            monkeypatch.setattr(foresight, "TURNS", turns)
+            found = foresee(*arguments)
+            assert found is not None
+            starts.append(found.start)
+        return found
+
+    monkeypatch.setattr(verdict, "foresee", for_longer_and_longer)
+    data = simulate(scene("damped_pendulum"), trajectories=1, steps=120, h=0.1, noise=0.01, seed=2)
+    fit(data, objective="trajectory", departures=(2e-3,), progress=False)
+    assert starts[0] == pytest.approx(starts[1], rel=1e-6)
+    assert starts[0] > 0
+
+
+def test_a_free_run_that_fails_says_from_when_on():
+    # fails if the time is another trajectory's, a run that succeeds is lost with it, or samples before it are
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=20, h=0.1, gaps=0, keep_state=True)
+    model = ContactLagrangian(ModelConfig((True,), "linear", (1.0,), (1.0,), (1.0,), (0.0,), potential_width=0))
+    assert data.p is not None
+    assert data.s is not None
+    whole = torch.cat([data.q, data.p, data.s[:, None]], -1)
+    states = torch.cat([whole[:10], whole[21:36]])
+    states[-1] = torch.nan
+    found, status = states_everywhere(Fitted(model, states, "trajectory", 0.0, {}), data, (10, 15), 0.1)
+    assert status == "a step failed after t = 1.4; nothing is predicted beyond it"
+    assert torch.isfinite(found.q[:35]).all()
+    assert torch.isnan(found.q[35:]).all()
