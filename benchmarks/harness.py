@@ -24,8 +24,8 @@ from typing import Any
 
 import torch
 
+from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import write_atomically
-from herglotz.export.c_wrapper import compiler
 
 ROOT = Path(__file__).resolve().parents[1]
 RESULTS = ROOT / "benchmarks" / "results"

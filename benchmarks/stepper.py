@@ -28,10 +28,10 @@ from benchmarks import harness
 from benchmarks.harness import seconds
 from benchmarks.reference_steppers import Hand, jax_rollout
 from herglotz import export
+from herglotz.codegen.c_compiler import FLAGS
 from herglotz.errors import InputError
 from herglotz.export import compile_c
 from herglotz.export.c_stepper import CLibrary
-from herglotz.export.c_wrapper import FLAGS
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 

@@ -22,8 +22,8 @@ from torch.func import jacrev, vmap
 from benchmarks.harness import compiled, seconds
 from benchmarks.peers.rollouts import rk4
 from benchmarks.work_precision_ways import CHECKS, Case, Setup, Timed, judged
+from herglotz.codegen.c_compiler import FLAGS
 from herglotz.data import simulate
-from herglotz.export.c_wrapper import FLAGS
 from herglotz.scenes.rigid_body import FreeBody
 from herglotz.stepping import State
 from herglotz.training import levenberg_marquardt

@@ -15,9 +15,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from herglotz.export import c_wrapper
+from herglotz.codegen import c_compiler
 
-OPTIMISED = c_wrapper.FLAGS
+OPTIMISED = c_compiler.FLAGS
 RELATIVE = 1e-14
 SHAKEN = set()  # digests of what was disturbed
 
@@ -69,11 +69,11 @@ def pytest_configure():
 def _unoptimised_c():
     """C without optimisation: what it computes does not hang on -O3, which takes the compiler 4 to 8 times as long."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(c_wrapper, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in OPTIMISED))
+        patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag == "-O3" else flag for flag in OPTIMISED))
         yield
 
 
 @pytest.fixture
 def optimised_c(monkeypatch):
     """C as the package compiles it."""
-    monkeypatch.setattr(c_wrapper, "FLAGS", OPTIMISED)
+    monkeypatch.setattr(c_compiler, "FLAGS", OPTIMISED)

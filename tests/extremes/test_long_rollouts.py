@@ -8,8 +8,8 @@ import torch
 from extreme_cases import build, state
 
 import herglotz
+from herglotz.codegen.c_compiler import compiler
 from herglotz.errors import InputError
-from herglotz.export.c_wrapper import compiler
 from herglotz.stepping import Stepper
 
 STEPS, H = 1_000_000, 0.1

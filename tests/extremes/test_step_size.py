@@ -9,9 +9,9 @@ import pytest
 import torch
 from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts, state
 
+from herglotz.codegen.c_compiler import compiler
 from herglotz.errors import InputError
 from herglotz.export import compile_c
-from herglotz.export.c_wrapper import compiler
 from herglotz.scenes import scene
 from herglotz.stepping import Status, Stepper, explain_step
 

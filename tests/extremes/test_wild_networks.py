@@ -5,8 +5,8 @@ import torch
 from extreme_cases import LEVELS, TOLD, assert_nothing_silent, build, starts
 
 import herglotz
+from herglotz.codegen.c_compiler import compiler
 from herglotz.errors import InputError
-from herglotz.export.c_wrapper import compiler
 from herglotz.stepping import StepError, Stepper, explain_step
 
 WILD = {

@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from herglotz.cli import main
+from herglotz.codegen.c_compiler import compiler
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export.c_header import read_metadata
-from herglotz.export.c_wrapper import compiler
 from herglotz.scenes import scene
 from herglotz.stepping import Stepper
 from herglotz.training import FitConfig, fit, load_run, save_run

@@ -8,11 +8,11 @@ import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from herglotz.codegen.c_compiler import compiler
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_ITERATIONS, c_source, described
 from herglotz.export.c_stepper import compiled
-from herglotz.export.c_wrapper import compiler
 from herglotz.export.exported import ExportedStepper
 from herglotz.export.load import load_c
 from herglotz.export.metadata import describe

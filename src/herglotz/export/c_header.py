@@ -13,13 +13,14 @@ from typing import Any
 
 import torch
 
+from herglotz.codegen.c_function import as_scalars
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.data.holds import Arrival
 from herglotz.data.seal import sealed_text
 from herglotz.errors import InputError
 from herglotz.export.c_numbers import number, numbers, text_constant, written
 from herglotz.export.equation import Equations
-from herglotz.export.lower.c import StepInC, as_lanes, as_scalars, model_source
+from herglotz.export.lower.c import StepInC, as_lanes, model_source
 from herglotz.export.metadata import check_metadata, describe, from_json
 from herglotz.export.step_parts import pushed
 from herglotz.export.trusted import remember

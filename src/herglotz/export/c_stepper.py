@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import ctypes
+import re
 from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from herglotz.codegen.c_compiler import build
 from herglotz.data.files import PathLike
 from herglotz.errors import InputError
-from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata
-from herglotz.export.c_wrapper import build, library_of
+from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata, runtime
 from herglotz.export.exported import ExportedStepper
 from herglotz.stepping import Status
 from herglotz.stepping.rollout import Track
+
+
+def library_of(name: str) -> str:
+    """The loops around a header whose prefix is `name`."""
+    return re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
 
 
 class CLibrary:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from herglotz.export.trace import Graph, example_batch, traced
+from herglotz.codegen.trace import Graph, example_batch, traced
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State

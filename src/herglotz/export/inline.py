@@ -14,7 +14,7 @@ import torch
 from torch import Tensor, fx, nn
 from torch.export import ExportedProgram
 
-from herglotz.export.trace import Example, Graph
+from herglotz.codegen.trace import Example, Graph
 
 _library = torch.library.Library("herglotz", "DEF")
 _library.define("graph(Tensor[] arguments, int key) -> Tensor[]")

@@ -8,7 +8,7 @@ from typing import Any
 
 from torch import fx
 
-from herglotz.export.trace import Example, Graph, assembled, aten
+from herglotz.codegen.trace import Example, Graph, assembled, aten
 
 
 def parted(graph: Graph, early: Sequence[bool]) -> tuple[Graph, Graph]:

@@ -21,10 +21,10 @@ from functools import partial
 import torch
 from torch import Tensor, nn
 
+from herglotz.codegen.trace import Graph, traced
 from herglotz.export.box import Box, report
 from herglotz.export.equation import Terms, dense, example, inverse, length, step_equation
 from herglotz.export.metadata import TOLERANCE
-from herglotz.export.trace import Graph, traced
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import State, Status
 from herglotz.stepping.explicit import Leapfrog

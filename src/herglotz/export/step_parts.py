@@ -10,8 +10,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from herglotz.codegen.trace import Graph, traced
 from herglotz.export.equation import example, field_like
-from herglotz.export.trace import Graph, traced
 from herglotz.mechanics.legendre import soft_threshold
 from herglotz.mechanics.newton import Point
 from herglotz.models import ContactLagrangian

@@ -22,6 +22,7 @@ from herglotz.data import Trajectories
 from herglotz.data.trajectories import every_mth
 from herglotz.models import ContactLagrangian
 from herglotz.progress import beat
+from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
 from herglotz.training.free_run import continued
 from herglotz.training.look import Look
@@ -92,6 +93,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     theta, x = problem.parameters.get(), known[problem.grid.start_sample]
     problem.guess_from_states(known)
     cost, A, _ = problem.normal_equations(problem.pack(theta, x[:, : problem.d]))
+    A = dense(A)
     beat()
     if not math.isfinite(float(cost)):
         return None
@@ -107,7 +109,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     if path is None:
         return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
-    Z = ahead.grid.at_samples(ahead.sensitivities(theta, path)[..., : problem.n, :]) / spread[:, None]
+    Z = ahead.slopes_at_samples(theta, path) / spread[:, None]
     q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
     return _summary(A.double(), Z.double(), problem, runs, absent, inside)

@@ -10,6 +10,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import Baseline
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
@@ -68,7 +69,7 @@ class Found:
         """All unknowns, and JᵀJ of residuals over their RMS; misfits below `floor` are rounding."""
         problem = self.fit.problem
         x = problem.pack(self.fit.theta, self.fit.path.x[:, 0, : problem.d])
-        return x, problem.normal_equations(x)[1] * (problem.sigma / max(self.rms, floor)) ** 2
+        return x, dense(problem.normal_equations(x)[1]) * (problem.sigma / max(self.rms, floor)) ** 2
 
     def needed(self, worth: float, simplest: Collection[str], floor: float, *, one_less: bool = False) -> NamedTerms:
         """The terms worth so much by the quadratic model of the fit, or all but the one that is worth least.

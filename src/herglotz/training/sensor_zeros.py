@@ -25,6 +25,7 @@ from herglotz.data.units import common_unit, size
 from herglotz.models import ContactLagrangian
 from herglotz.models.drag import DragFeature, parse_drag
 from herglotz.models.features import Product, parse
+from herglotz.training.arrowhead import dense
 from herglotz.training.config import FitConfig
 from herglotz.training.cross_validation import MARGIN
 from herglotz.training.first_states import first_states, states_of_pairs
@@ -165,6 +166,7 @@ def _fitted(target: WithZeros, theta: Tensor, begin: Trajectories) -> FoundZeros
     if not math.isfinite(result.cost):
         return None
     _, A, _ = target.normal_equations(result.x)
+    A = dense(A)
     assert problem.path is not None
     rms = _rms(problem.misfit(problem.path))
     variance = torch.linalg.pinv(A, hermitian=True).diagonal()[-target.count :] * (rms / problem.sigma) ** 2

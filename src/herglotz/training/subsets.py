@@ -14,6 +14,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from herglotz.training.arrowhead import dense
 from herglotz.training.found_terms import Found, gain
 from herglotz.training.named_terms import DRY, NamedTerms, places, shapes_of_dry, values_of
 from herglotz.training.problems.shooting import ShootingProblem
@@ -48,6 +49,7 @@ def missing(found: Found, problem: ShootingProblem, every: NamedTerms) -> str | 
     cost, A, b = problem.normal_equations(x)
     if not bool(cost.isfinite()):
         return None
+    A = dense(A)
     others = torch.tensor([i for name in names for i in at[name]])
     absent = torch.zeros(len(x), dtype=torch.bool)
     absent[others] = True
@@ -77,7 +79,8 @@ def likelier(found: Found, problem: ShootingProblem, every: NamedTerms, floor: f
     elif DRY in at:  # what shapes a force of 0 has no effect yet
         held = shapes_of_dry(parameters)
     x = problem.pack(parameters.get(), found.fit.path.x[:, 0, : problem.d])
-    cost, A, b = (y.double() for y in problem.normal_equations(x))
+    cost, A, b = problem.normal_equations(x)
+    A, b = dense(A).double(), b.double()
     if not (bool(cost.isfinite()) and bool(A.isfinite().all())):
         return []
     A[held], A[:, held], b[held] = 0.0, 0.0, 0.0

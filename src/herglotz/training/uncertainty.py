@@ -20,6 +20,7 @@ from herglotz.data.spikes import spikes
 from herglotz.data.splits import leading_rows
 from herglotz.errors import InputError
 from herglotz.threads import one_thread
+from herglotz.training.arrowhead import dense
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.cross_validation import held_out_errors
 from herglotz.training.problems.grid import segment_grid
@@ -90,7 +91,7 @@ class Laplace:
         self.problem, self.path = self._solved(train, run.states.joined[list(data.offsets)], ~out, guess=states)
         self.theta = self.problem.parameters.get()
         x = self.problem.pack(self.theta, self.path.x[:, 0, : self.problem.d])
-        _, A, _ = self.problem.normal_equations(x)
+        A = dense(self.problem.normal_equations(x)[1])
         errors = held_out_errors(self.problem, self.path, self.theta, A)
         held_out = float("inf") if int(errors.isinf().sum()) > 1 else float(errors.median())
         self.inflation = max(1.0, held_out / self.sigma) if held_out < float("inf") else float("inf")
@@ -130,7 +131,7 @@ class Laplace:
             raise InputError(f"{where}: the model cannot follow the first {seen} samples; fit it to such motions too")
         problem, P, d = found.problem, len(self.theta), self.problem.d
         start = found.path.x[:, 0]
-        _, A, _ = problem.normal_equations(problem.pack(self.theta, start[:, :d]))
+        A = dense(problem.normal_equations(problem.pack(self.theta, start[:, :d]))[1])
         C, joint = self.covariance[:P, :P], []
         for own in torch.arange(P, len(A)).split(d):
             inverse = torch.linalg.pinv(A[own[:, None], own[None, :]].double(), hermitian=True)
@@ -144,9 +145,9 @@ class Laplace:
         """Runs from `start`, (B, 2n+1), with a covariance of (θ, start) for each, (P + d, P + d)."""
         whole, path = self._solved(data, start)
         with torch.no_grad():
-            Z = whole.sensitivities(self.theta, path)[..., : whole.n, :].double()  # (B, K+1, n, P + d)
-            variance = torch.stack([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
-        q, std = (whole.grid.at_samples(x).to(data.q) for x in (path.x[..., : whole.n], variance.clamp_min(0).sqrt()))
+            Z = whole.slopes_at_samples(self.theta, path).double().split(data.lengths)  # each (N_b, n, P + d)
+            variance = torch.cat([((z @ C) * z).sum(-1) for z, C in zip(Z, joint, strict=True)])
+        q, std = whole.grid.at_samples(path.x[..., : whole.n]), variance.clamp_min(0).sqrt().to(data.q)
         return Bands(q, std, self.problem.deviations)
 
     def standard_deviations(self) -> dict[str, Tensor]:

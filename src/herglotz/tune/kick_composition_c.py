@@ -19,12 +19,12 @@ import numpy as np
 import torch
 from numpy.polynomial import chebyshev, polynomial as power
 
+from herglotz.codegen.c_compiler import build
+from herglotz.codegen.c_function import as_scalars
 from herglotz.data.files import PathLike, write_atomically
 from herglotz.errors import InputError
 from herglotz.export import c_numbers
 from herglotz.export.c_header import runtime
-from herglotz.export.c_wrapper import build
-from herglotz.export.lower.c import as_scalars
 from herglotz.stepping import Rollout, State, Status
 from herglotz.tune.kick_composition import KickStepper
 

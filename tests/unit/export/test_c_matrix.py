@@ -7,7 +7,8 @@ import pytest
 import torch
 from export_models import randomise
 
-from herglotz.export import c_wrapper, compile_c
+from herglotz.codegen import c_compiler
+from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.models.mass import PositionKinetic
 from herglotz.stepping import State, Stepper
@@ -33,7 +34,7 @@ def _quick_compiler(tmp_path_factory):
     """An own cache, and less optimisation: 72 libraries."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(c_wrapper, "FLAGS", tuple("-O1" if flag.startswith("-O") else flag for flag in c_wrapper.FLAGS))
+        patch.setattr(c_compiler, "FLAGS", tuple("-O1" if flag.startswith("-O") else flag for flag in c_compiler.FLAGS))
         yield
 
 

@@ -5,15 +5,15 @@ from types import SimpleNamespace
 import pytest
 import torch
 
+from herglotz.codegen.interpret import MATHEMATICS
+from herglotz.codegen.trace import example_batch, traced
 from herglotz.data import simulate
 from herglotz.errors import InputError
 from herglotz.export import export_run
 from herglotz.export.compare import draw
 from herglotz.export.exported import check_range
 from herglotz.export.load import read_header
-from herglotz.export.lower.interpret import MATHEMATICS
 from herglotz.export.step import FLOOR, _added, first_carry, newton_iteration
-from herglotz.export.trace import example_batch, traced
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene
 from herglotz.training import fit

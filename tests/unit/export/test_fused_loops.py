@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from herglotz.export.lower.fuse import fused
-from herglotz.export.lower.program import Program
+from herglotz.codegen.fuse import fused
+from herglotz.codegen.program import Program
 
 
 def product(program, x, y):

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 import torch
 
+from herglotz.codegen.c_compiler import compiler
 from herglotz.errors import InputError
-from herglotz.export.c_wrapper import compiler
 from herglotz.mechanics import contact_defect, flow_derivative
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.scenes import scene

@@ -9,9 +9,9 @@ from typing import Any
 import torch
 from torch.export import ExportedProgram
 
+from herglotz.codegen.c_compiler import compiler
 from herglotz.data.seal import sealed_zip
 from herglotz.errors import InputError
-from herglotz.export.c_wrapper import compiler
 from herglotz.export.compare import compare
 from herglotz.export.load import load_pt2
 from herglotz.export.metadata import AOTI, KEY, to_json

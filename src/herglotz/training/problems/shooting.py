@@ -21,10 +21,20 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import AT_THE_NOISE, precisions
 from herglotz.models import ContactLagrangian
 from herglotz.stepping import Stepper, state_of
-from herglotz.training.distributed import everywhere
+from herglotz.stepping.block_tridiagonal import eliminate
+from herglotz.training.arrowhead import Arrowhead
+from herglotz.training.distributed import everywhere, world
+from herglotz.training.flow import CompiledFlow, Observed, Sums
+from herglotz.training.kernel import kernel_of
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
-from herglotz.training.solvers.lifted_newton import Path, linear_recurrence, parameter_derivatives, solve_path
+from herglotz.training.solvers.lifted_newton import (
+    Path,
+    linear_recurrence,
+    linear_steps,
+    parameter_derivatives,
+    solve_path,
+)
 
 START = 3  # samples that a free run starts from: they tell q and q̇, and too little of a force to tell it
 KNOWN = 1e3  # times σ: a start that is known so much better is known
@@ -58,6 +68,9 @@ class ShootingProblem(StatesProblem):
         self.path: Path | None = None  # the last trajectory solved: where the next solve starts
         self.patient = True  # step through the trajectories where the sweeps from the last ones do not converge
         self.zeros = data.q.new_zeros(())  # what the sensors read at 0, (N, n), where `WithZeros` fits it
+        placed = kernel_of(model) if self.d == 2 * self.n and s is None and world()[1] == 1 else None
+        sharpest = dict(model.named_buffers()).get("friction.sharpest")
+        self.compiled = None if placed is None else CompiledFlow(placed, grid, self.u, sharpest, self.n)
 
     def _known_better(self) -> Tensor:
         """How much better than by σ the samples are known that free runs over whole trajectories start from, (N, n).
@@ -74,7 +87,7 @@ class ShootingProblem(StatesProblem):
 
     def memory(self) -> dict[str, Any]:
         """The last path and where it was solved: the next solve starts there, and its last bits depend on it."""
-        if self.path is None or self._at is None:
+        if self.path is None or self._at is None or self.compiled is not None:
             return {}
         return {"at": self._at, "x": self.path.x, "A": self.path.A}
 
@@ -103,6 +116,10 @@ class ShootingProblem(StatesProblem):
         if self._solved is not None and torch.equal(self._solved[0], x):
             return self._solved[1]  # an accepted step has been solved for its cost
         theta, states = self.unpack(x)
+        if self.compiled is not None:
+            nodes = self.compiled.run(theta, self.with_s(states), self._observed())
+            self._solved = x.clone(), None if nodes is None else Path(nodes, None)
+            return self._solved[1]
         start, L_d = self.with_s(states), self.parameters.at(theta, self.u)
         tol = 1e3 * torch.finfo(x.dtype).eps
         with torch.no_grad():
@@ -143,41 +160,82 @@ class ShootingProblem(StatesProblem):
         anchor = self._anchor(x)
         return self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(x[: self.P])
 
-    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Tensor, Tensor]:
+    def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
         """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
         theta, _ = self.unpack(x)
         path = self.solve(x)
         if not everywhere(path is not None) or path is None:
-            unknowns = len(x) - self.P * held
-            return x.new_full((), torch.inf), x.new_zeros(unknowns, unknowns), x.new_zeros(unknowns)
+            none = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
+            matrix = Arrowhead(none.corner, none.border, none.blocks, none.blocks, self._eliminate)
+            return x.new_full((), torch.inf), matrix, x.new_zeros(len(x) - self.P * held)
         self.path, self._at = path, x.clone()
-        grid, n, d, P = self.grid, self.n, self.d, 0 if held else self.P
-        Z = self._slopes_of(theta, path, held=held)
         fit, joints = self._residuals(path.x)
-        cost = self.loss(fit, joints)
-        root, by_joint = self.root_weights(fit), self.root_weights(joints)
-        by_fit, fit, joints = self.weight * root, root * fit, by_joint * joints
-        S = grid.segments
-        A, b = x.new_zeros(P + S * d, P + S * d), x.new_zeros(P + S * d)
-        segment = grid.node // (grid.h.shape[1] + 1)
-        rows = Z.flatten(0, 1)[grid.node][:, :n] * (by_fit / self.deviations)[..., None]  # (N, n, P + d)
-        for k in range(S):
-            own = segment == k
-            self._add(A, b, rows[own].flatten(0, 1), fit[own].flatten(), self._columns(k, P))
-        for k in grid.joined.nonzero()[:, 0].tolist():
-            J = torch.cat([Z[k - 1, grid.end[k - 1]], -torch.eye(d, dtype=x.dtype, device=x.device)], -1)
-            columns = torch.cat([self._columns(k - 1, P), self._columns(k, P)[P:]])
-            self._add(A, b, J * (by_joint[k] / self.joint_weight)[:, None], joints[k], columns)
-        anchored, anchor = self._anchored() - self.P + P, self._anchor(x)
-        A[anchored, anchored] += 1 / self._anchor_weight**2
-        b[anchored] += anchor / self._anchor_weight
-        cost = cost + anchor.square().sum() / 2
-        if held:
-            return cost + self.prior_cost(theta), A, b
-        of_prior = self.prior_equations(theta)
-        A[:P, :P] += of_prior[1]
-        b[:P] += of_prior[2]
-        return cost + of_prior[0], A, b
+        sums = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
+        if self.compiled is None:
+            self._add_rows(sums, self._slopes_of(theta, path, held=held), fit)
+        elif self.compiled.run(theta, path.x[:, 0], self._observed(), sums) is None:
+            raise AssertionError("a motion that was run has no steps")
+        upper = torch.zeros_like(sums.blocks)
+        self._join(sums, upper, joints)
+        anchored, anchor = self._anchored() - self.P, self._anchor(x)
+        segment, at = anchored // self.d, anchored % self.d
+        sums.blocks[segment, at, at] += 1 / self._anchor_weight**2
+        sums.by_state[segment, at] += anchor / self._anchor_weight
+        cost = self.loss(fit, joints) + anchor.square().sum() / 2 + self.prior_cost(theta)
+        if not held:
+            _, A, b = self.prior_equations(theta)
+            sums.corner.add_(A)
+            sums.by_theta.add_(b)
+        matrix = Arrowhead(sums.corner, sums.border, sums.blocks, upper, self._eliminate)
+        return cost, matrix, torch.cat([sums.by_theta, sums.by_state.flatten()])
+
+    def _observed(self) -> Observed:
+        """What the kernel has to know of the samples."""
+        y, weight = self.data.q - self.zeros, self.weight / self.deviations
+        return Observed(y.contiguous(), weight.contiguous(), float(self.freedom or 0.0))
+
+    def _add_rows(self, sums: Sums, Z: Tensor, fit: Tensor) -> None:
+        """Add the data's rows to the sums, from the derivatives Z (S, K+1, d, P + d) at all nodes."""
+        P, root = len(sums.corner), self.root_weights(fit)
+        rows = Z.flatten(0, 1)[self.grid.node][:, : self.n] * (root * self.weight / self.deviations)[..., None]
+        r, segment = root * fit, self.grid.node // (self.grid.h.shape[1] + 1)
+        for k in range(self.grid.segments):
+            own, right = rows[segment == k].flatten(0, 1), r[segment == k].flatten()
+            by_theta, by_state = own[:, :P], own[:, P:]
+            sums.corner.addmm_(by_theta.T, by_theta)
+            sums.by_theta.addmv_(by_theta.T, right)
+            sums.border[k] += by_state.T @ by_theta
+            sums.blocks[k] += by_state.T @ by_state
+            sums.by_state[k] += by_state.T @ right
+        ends = torch.arange(self.grid.segments, device=Z.device), self.grid.end
+        sums.slopes.copy_(Z[ends])
+
+    def _join(self, sums: Sums, upper: Tensor, joints: Tensor) -> None:
+        """Add the rows of the joints to the sums."""
+        to = self.grid.joined.nonzero()[:, 0]
+        if not len(to):
+            return
+        P, by = len(sums.corner), self.root_weights(joints[to])  # (J, d)
+        own, r = by / self.joint_weight, by * joints[to]  # −own stands in the rows at the start
+        rows = sums.slopes[to - 1] * own[..., None]  # (J, d, P + d) by the parameters and the segment before
+        by_theta, before = rows[..., :P], rows[..., P:]
+        sums.corner.addmm_(by_theta.flatten(0, 1).T, by_theta.flatten(0, 1))
+        sums.by_theta.addmv_(by_theta.flatten(0, 1).T, r.flatten())
+        sums.blocks[to - 1] += before.mT @ before
+        sums.border[to - 1] += before.mT @ by_theta
+        sums.by_state[to - 1] += (before.mT @ r[..., None])[..., 0]
+        sums.blocks[to] += torch.diag_embed(own.square())
+        sums.border[to] -= own[..., None] * by_theta
+        sums.by_state[to] -= own * r
+        upper[to - 1] = -before.mT * own[:, None, :]
+
+    def _eliminate(self, diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+        """T⁻¹ columns of a block tridiagonal T, (S, d, R)."""
+        if self.compiled is not None:
+            return self.compiled.kernel.eliminate(diagonal, upper, columns)
+        lower = torch.cat([torch.zeros_like(upper[:1]), upper[:-1].mT])
+        x = eliminate((diagonal, upper, lower), columns)
+        return x if bool(torch.isfinite(x).all()) else None
 
     def states_at(self, path: Path, samples: Tensor) -> Tensor:
         """The fitted state (…, d) at recorded samples: where the segments of the next stage start.
@@ -239,18 +297,20 @@ class ShootingProblem(StatesProblem):
         `which` zero, from 0, each sample has, (N,); −1: none. Columns (unknowns, Z, n), diagonal and gradient (Z, n).
         """
         assert self.path is not None
-        assert self._slopes is not None
+        assert self._at is not None
         count = int(which.max()) + 1
         fit, _ = self._residuals(self.path.x)
         by = self.weight * self.root_weights(fit) / self.deviations  # ∂r/∂z
-        rows = self._slopes[1].flatten(0, 1)[self.grid.node][:, : self.n] * by.square()[..., None]  # (N, n, P + d)
+        rows = self.slopes_at_samples(self._at[: self.P], self.path) * by.square()[..., None]  # (N, n, P + d)
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
-        columns = rows.new_zeros(self.P + self.grid.segments * self.d, count, self.n)
-        for k in range(self.grid.segments):
-            own = segment == k
-            z = int(which[own][0])
-            if z >= 0:
-                columns[self._columns(k, self.P), z] += rows[own].sum(0).T
+        # Of every segment, whose samples have one zero: (S, P + d, n).
+        S, of = self.grid.segments, torch.full((self.grid.segments,), -1)
+        of[segment] = which
+        own = rows.new_zeros(S, *rows.shape[:0:-1]).index_add(0, segment, rows.mT)
+        columns = rows.new_zeros(self.P + S * self.d, count, self.n)
+        for z in range(count):
+            columns[: self.P, z] = own[of == z, : self.P].sum(0)
+            columns[self.P :, z] = torch.where((of == z)[:, None, None], own[:, self.P :], 0.0).flatten(0, 1)
         kept = which >= 0
         zero = rows.new_zeros(count, self.n)
         diagonal = zero.index_add(0, which[kept], by[kept].square())
@@ -268,8 +328,7 @@ class ShootingProblem(StatesProblem):
         """
         r = self.misfit(path) / self.sigma
         by = self.weight * self.root_weights(self.weight * r)
-        Z = self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
-        Z = Z * (by / self.deviations)[..., None]
+        Z = self.slopes_at_samples(theta, path) * (by / self.deviations)[..., None]
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         J = Z.new_zeros(len(Z), self.n, self.P + self.grid.segments * self.d)
         J[..., : self.P] = Z[..., : self.P]
@@ -301,25 +360,32 @@ class ShootingProblem(StatesProblem):
         first = (~self.grid.joined).nonzero()[:, 0]
         return self.P + first * self.d + 2 * self.n if self.d > 2 * self.n else first[:0]
 
-    def _columns(self, segment: int, P: int) -> Tensor:
-        """Columns of the unknowns that a segment's trajectory depends on: P parameters, then its own state."""
-        device = self.data.q.device
-        own = torch.arange(P + segment * self.d, P + (segment + 1) * self.d, device=device)
-        return torch.cat([torch.arange(P, device=device), own])
-
-    @staticmethod
-    def _add(A: Tensor, b: Tensor, J: Tensor, r: Tensor, columns: Tensor) -> None:
-        A[columns[:, None], columns[None, :]] += J.T @ J
-        b[columns] += J.T @ r
+    def slopes_at_samples(self, theta: Tensor, path: Path) -> Tensor:
+        """Derivatives of positions at samples by the parameters and the start of the segment, (N, n, P + d)."""
+        if self.compiled is None:
+            return self._slopes_of(theta, path).flatten(0, 1)[self.grid.node][:, : self.n]
+        plain = Observed(self.data.q, torch.ones_like(self.data.q), 0.0)
+        rows = self.data.q.new_zeros(*self.data.q.shape, self.P + self.d)
+        self.compiled.run(theta, path.x[:, 0], plain, Sums.zeros(self.P, self.grid.segments, self.d, theta), rows)
+        return rows
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
         d = self.d
-        q1, A = path.x[:, 1:, : self.n], path.A[..., :d, :d]
+        q1, A = path.x[:, 1:, : self.n], self._step_derivatives(theta, path)[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
             B = parameter_derivatives(self.parameters.at(theta, self.u), path.x, q1, A, self.grid.h)
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
         return linear_recurrence(A, torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)
+
+    def _step_derivatives(self, theta: Tensor, path: Path) -> Tensor:
+        """DΦ̃ of every step, (S, K, 2n+1, 2n+1)."""
+        if path.A is not None:
+            return path.A
+        x = torch.where((torch.arange(path.x.shape[1]) <= self.grid.end[:, None])[..., None], path.x, path.x[:, :1])
+        stepped = linear_steps(self.parameters.at(theta, self.u), x, self.grid.h)
+        assert stepped is not None  # a linear step has a solution
+        return stepped[1]

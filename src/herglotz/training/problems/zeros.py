@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.training.arrowhead import dense
 from herglotz.training.problems.shooting import ShootingProblem
 
 
@@ -50,6 +51,7 @@ class WithZeros:
         cost, A, b = self.problem.normal_equations(self._set(x))
         if not bool(torch.isfinite(cost)):
             return cost, x.new_zeros(len(x), len(x)), torch.zeros_like(x)
+        A = dense(A)
         columns, diagonal, slope = self.problem.by_zeros(self.which)
         C = columns.flatten(1)
         A = torch.cat([torch.cat([A, C], 1), torch.cat([C.T, diagonal.flatten().diag()], 1)])

@@ -38,7 +38,7 @@ class Path:
     """A solved batch of trajectories and the derivatives of their steps."""
 
     x: Tensor  # (S, K+1, 2n+1) states q, p, s
-    A: Tensor  # (S, K, 2n+1, 2n+1) DΦ̃ of each step
+    A: Tensor | None  # (S, K, 2n+1, 2n+1) DΦ̃ of each step; None where a kernel ran
 
 
 def solve_path(

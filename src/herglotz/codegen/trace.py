@@ -22,15 +22,17 @@ SAME = (  # what leaves its first argument as it is, wherever shape and dtype st
     aten.view.default, aten.slice.Tensor, aten.clone.default, aten.detach.default, aten.contiguous.default,
     aten.broadcast_to.default, aten._unsafe_view.default,
 )  # fmt: skip
-# A view holds for the strides of the example only, as a copy may have gone since; what writes in place becomes a value;
-# the sign of a complex number, which is what derivatives of |x| ask for, is that of a real one.
+# A view holds for the strides of the example only, as a copy may have gone since; the sign of a complex number, which
+# derivatives of |x| ask for, is that of a real one. An operation that writes in place is the one that returns its
+# result; most have the same name without the last underscore.
 INSTEAD: dict[Any, Any] = {
     aten.view.default: aten.reshape.default,
     aten._unsafe_view.default: aten.reshape.default,
-    aten.sub_.Tensor: aten.sub.Tensor,
     aten.fill_.Scalar: aten.full_like.default,
+    aten.zero_.default: aten.zeros_like.default,
     aten.sgn.default: aten.sign.default,
 }
+SHAPE_ONLY = ("squeeze_", "unsqueeze_", "transpose_", "t_", "as_strided_")  # these write no number
 
 
 class Graph(nn.Module):
@@ -120,6 +122,7 @@ class Recorder(TorchDispatchMode):
         self.alive: list[Any] = []
         self.unchanged: dict[int, tuple[Any, Any, Any]] = {}  # the operations left out, by their result
         self.constants: dict[Any, tuple[fx.Node, Tensor]] = {}
+        self.current: dict[int, set[int]] = {}  # by written storage: the tensors whose nodes hold what was written
         self.size: fx.Node | None = None
         self.places = [self.graph.placeholder(f"x{i}") for i in range(len(inputs))]
         for x, place in zip(inputs, self.places, strict=True):
@@ -131,19 +134,22 @@ class Recorder(TorchDispatchMode):
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         """Run one operation, and write it down."""
         kwargs = kwargs or {}
+        if self._is_fixed((args, kwargs)):
+            result = func(*args, **kwargs)
+            self.alive += [args, result]
+            return result
+        # What is written is read before: `result` is the tensor that is written to.
+        node = self._written(func, args, kwargs) if func._schema.is_mutable else None
         result = func(*args, **kwargs)
         self.alive += [args, result]
-        if self._is_fixed((args, kwargs)):
-            return result
-        same = self._same(func, args, kwargs, result)
+        same = self._same(func, args, kwargs, result) if node is None else None
         if same is not None:
             self.unchanged[id(result)] = (func, args, kwargs)
-            self._name(result, self._moved(same))
-        elif func == aten.copy_.default:  # into zeros that nothing else reads
-            shape = [self._argument(size) for size in result.shape]
-            self._name(result, self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape)))
-        else:
-            self._name(result, self._written(func, args, kwargs))
+        if node is None:
+            node = self._moved(same) if same is not None else self._written(func, args, kwargs)
+        elif func._schema.name.removeprefix("aten::") not in SHAPE_ONLY:
+            self.current[_storage(result)] = set()
+        self._name(result, node)
         return result
 
     def graph_of(self, outputs: Sequence[Tensor]) -> Graph:
@@ -162,11 +168,12 @@ class Recorder(TorchDispatchMode):
         return assembled(self.batch, inputs, calls, graph.output_node().args[0], constants)
 
     def _written(self, func: Any, args: Any, kwargs: Any) -> fx.Node:
-        if func._schema.is_mutable and func not in INSTEAD:
-            raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
+        if func == aten.copy_.default:
+            shape = [self._argument(size) for size in args[0].shape]
+            return self.graph.call_function(aten.expand.default, (self._moved(args[1]), shape))
         arguments, options = (map_aggregate(x, self._argument) for x in (args, kwargs))
         new = _finite(self.graph, func, arguments) or _gathered(self.graph, func, args, arguments)
-        return new or self.graph.call_function(INSTEAD.get(func, func), arguments, options)
+        return new or self.graph.call_function(INSTEAD.get(func) or _without_writing(func), arguments, options)
 
     def _same(self, func: Any, args: Any, kwargs: Any, result: Any) -> Tensor | None:
         """The argument that the result equals: views of the same shape, x + 0 and 1 x."""
@@ -197,12 +204,23 @@ class Recorder(TorchDispatchMode):
         if isinstance(result, Tensor):
             self.nodes[id(result)] = node
             self.alive.append(result)
+            if (storage := _storage(result)) in self.current:
+                self.current[storage].add(id(result))
         elif isinstance(result, (list, tuple)):
             for i, x in enumerate(result):
                 self._name(x, self.graph.call_function(operator.getitem, (node, i)))
 
     def _moved(self, value: Tensor) -> fx.Node:
-        """The node of a tensor; that of a constant on its first use."""
+        """The node of a tensor; that of a constant on its first use.
+
+        Raise InputError for a tensor whose numbers were written through another view of its memory: its node, or its
+        own numbers, are those of before.
+        """
+        if id(value) not in self.current.get(_storage(value), {id(value)}):
+            raise InputError(
+                "a tensor is read whose numbers were written in place through a view of it, which a trace does not "
+                "follow; write the form that returns a new tensor (x.diagonal().fill_(1): torch.eye)"
+            )
         if id(value) in self.nodes:
             return self.nodes[id(value)]
         if value.is_meta or value._is_zerotensor():  # torch.func keeps the derivative of a constant without numbers
@@ -227,6 +245,22 @@ class Recorder(TorchDispatchMode):
     def _is_size(self, x: Any) -> bool:
         """Whether this is a multiple of the example's batch."""
         return isinstance(x, int) and not isinstance(x, bool) and 0 < x <= LARGEST * self.batch and x % self.batch == 0
+
+
+def _storage(x: Tensor) -> int:
+    """Identifies the memory of a tensor; that of one without memory is its own."""
+    return id(x) if x.is_meta or x._is_zerotensor() else x.untyped_storage()._cdata
+
+
+def _without_writing(func: Any) -> Any:
+    """The operation that returns what this one writes in place; itself where it writes nothing."""
+    if not func._schema.is_mutable:
+        return func
+    name = func._schema.name.removeprefix("aten::")
+    other = getattr(getattr(aten, name.removesuffix("_"), None), func._overloadname, None)
+    if not name.endswith("_") or other is None:
+        raise InputError(f"{func} writes in place, which files cannot step; use the form that returns a new tensor")
+    return other
 
 
 def _finite(graph: fx.Graph, func: Any, arguments: Any) -> fx.Node | None:

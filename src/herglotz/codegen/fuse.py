@@ -10,7 +10,7 @@ import re
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
-from herglotz.export.lower.program import NAME, Program
+from herglotz.codegen.program import NAME, Program
 
 LOOP_OVER = re.compile(r"for \(k = 0; k < (\d+); k\+\+\) @(\d+)\[k\] = (.*);")
 ENTRY = re.compile(r"@(\d+)\[k\]")

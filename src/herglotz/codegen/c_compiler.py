@@ -6,23 +6,23 @@ import ctypes
 import hashlib
 import os
 import platform
-import re
 import shlex
 import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
+from herglotz.codegen.cache import private_folder
 from herglotz.data.files import write_atomically
 from herglotz.data.seal import check_seal, sealed_bytes
 from herglotz.errors import InputError
-from herglotz.export.c_header import runtime
-from herglotz.export.trusted import private_folder
 
 # No -ffast-math: a shared library built with it flushes denormals of the whole process, and drops the compensation of
 # rounding. Fused multiply-adds are what -std=c99 alone would turn off.
 FLAGS = ("-std=c99", "-O3", "-march=native", "-fno-math-errno", "-ffp-contract=fast")
+SOURCE = "loops.c"
 # By the variable that names a compiler: its language, the names that are looked for, and the one to install.
 COMPILERS = {"CC": ("C", ("cc", "gcc", "clang"), "gcc"), "CXX": ("C++", ("g++", "clang++", "c++"), "g++")}
 
@@ -45,25 +45,25 @@ def compiler(variable: str = "CC") -> list[str]:
 
 
 def build(header: str, loops: str) -> ctypes.CDLL:
-    """Compile C that includes the header as "stepper.h", or take the library from the cache, and load it.
+    """`built` of C that includes the header as "stepper.h"."""
+    return built("\0".join([header, loops]), lambda: {"stepper.h": header, SOURCE: loops})
 
-    Raise InputError if there is no compiler, or it does not compile the header.
+
+def built(key: str, sources: Callable[[], Mapping[str, str]], level: str = "-O3") -> ctypes.CDLL:
+    """The library of these files, of which `SOURCE` is compiled, loaded: from the cache where it is there.
+
+    `key` says what is compiled, and `level` how much the compiler optimises; the compiler, its flags and the processor
+    join the key. Raise InputError if there is no compiler, or it does not compile the files.
     """
-    words = compiler()
-    key = "\0".join([header, loops, *words, *FLAGS, sys.platform, _processor()])
-    digest = hashlib.sha256(key.encode()).hexdigest()[:32]
+    words, flags = compiler(), tuple(level if flag == "-O3" else flag for flag in FLAGS)
+    digest = hashlib.sha256("\0".join([key, *words, *flags, sys.platform, _processor()]).encode()).hexdigest()[:32]
     library = private_folder("c") / f"{digest}.so"
     if not _is_whole(library):
-        write_atomically(library, sealed_bytes(_compile(words, header, loops)))
+        write_atomically(library, sealed_bytes(_compile(words, sources(), flags)))
     try:
         return ctypes.CDLL(str(library))
     except OSError as error:
         raise InputError(f"{library}: cannot be loaded ({error}); check the compiler {words[0]}") from None
-
-
-def library_of(name: str) -> str:
-    """The loops around a header whose prefix is `name`."""
-    return re.sub(r"\bhz_", f"{name}_", runtime("library.c"))
 
 
 def _is_whole(library: Path) -> bool:
@@ -75,15 +75,15 @@ def _is_whole(library: Path) -> bool:
     return True
 
 
-def _compile(words: list[str], header: str, loops: str) -> bytes:
+def _compile(words: list[str], sources: Mapping[str, str], flags: Sequence[str]) -> bytes:
     """The shared library, as bytes; without -march=native where the compiler does not know it."""
     message = ""
     with tempfile.TemporaryDirectory(prefix="herglotz-") as folder:
-        source, library = Path(folder, "loops.c"), Path(folder, "loops.so")
-        Path(folder, "stepper.h").write_text(header)
-        source.write_text(loops)
-        for flags in (FLAGS, [f for f in FLAGS if f != "-march=native"]):
-            command = [*words, *flags, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
+        source, library = Path(folder, SOURCE), Path(folder, "loops.so")
+        for name, text in sources.items():
+            Path(folder, name).write_text(text)
+        for options in (flags, [f for f in flags if f != "-march=native"]):
+            command = [*words, *options, "-shared", "-fPIC", str(source), "-o", str(library), "-lm"]
             try:
                 done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
             except (OSError, subprocess.TimeoutExpired) as error:

@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import fx
 
+from herglotz.codegen.program import Atom, Compared, Program, Ref, fold_add, fold_multiply
+from herglotz.codegen.trace import Graph
 from herglotz.errors import InputError
-from herglotz.export.lower.program import Atom, Compared, Program, Ref, fold_add, fold_multiply
-from herglotz.export.trace import Graph
 
 aten = torch.ops.aten
 MATHEMATICS: dict[str, Callable[[float], float]] = {
@@ -28,13 +28,15 @@ ROWS = ("tanh", "sigmoid", "softplus")  # functions with a kernel for a whole ro
 def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -> list[np.ndarray]:
     """The outputs of a graph as arrays of atoms, for one sample: the batch axis has size 1.
 
-    `program` takes the statements; `inputs` are the numbers of each argument, in its order.
+    `program` takes the statements; `inputs` are the numbers of each argument, in its order. An argument without the
+    batch axis, as parameters are, has its own shape.
     """
     nodes = list(graph.code.graph.nodes)
     places = [node for node in nodes if node.op == "placeholder"]
     values: dict[fx.Node, Any] = {}
     for node, numbers in zip(places, inputs, strict=False):
-        shape = (1, *node.meta["example"].shape[1:])
+        shape = node.meta["example"].shape
+        shape = (1, *shape[1:]) if shape[0] == graph.batch else shape
         values[node] = _array(numbers).reshape(shape)
     for node, constant in zip(places[len(inputs) :], graph.constants, strict=True):
         array = constant.detach().cpu().numpy()
@@ -91,6 +93,10 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.mv.default: c.product, aten.dot.default: c.product,
         aten.sum.dim_IntList: c.sum,
         aten.linalg_inv_ex.default: lambda x, *_, **__: (c.inverse(x), None),
+        aten._linalg_solve_ex.default: c.solve,
+        aten.index_put.default: _put,
+        aten.select_backward.default: lambda g, shape, dim, i: _put_slice(g, shape, dim, i),
+        aten.slice_backward.default: lambda g, shape, dim, a, b, step: _put_slice(g, shape, dim, slice(a, b, step)),
         aten.cat.default: lambda xs, dim=0: np.concatenate(xs, dim),
         aten.stack.default: lambda xs, dim=0: np.stack(xs, dim),
         aten.unsqueeze.default: np.expand_dims, aten.select.int: lambda x, dim, i: np.take(x, i, axis=dim),
@@ -247,11 +253,34 @@ class _Numbers:
             x = np.expand_dims(total, axis) if keep else total
         return x
 
+    def solve(self, A: np.ndarray, b: np.ndarray, **_: Any) -> tuple[np.ndarray, None, None, None]:
+        """A⁻¹ b, for a vector b (..., n) or columns (..., n, k)."""
+        vector = b.ndim == A.ndim - 1
+        x = self.product(self.inverse(A), b[..., None] if vector else b)
+        return (x[..., 0] if vector else x), None, None, None
+
     def inverse(self, x: np.ndarray) -> np.ndarray:
         out = np.empty(x.shape, object)
         for i in np.ndindex(x.shape[:-2]):
             out[i] = _array(self.program.inverse(x[i])).reshape(x.shape[-2:])
         return out
+
+
+def _put(x: np.ndarray, places: Sequence[Any], value: np.ndarray, accumulate: bool = False) -> np.ndarray:
+    """A copy of x with these values at these places."""
+    if accumulate:
+        raise InputError("index_put that adds up cannot be written as C yet; export the model as .pt2 instead")
+    out = np.array(x, object)
+    index = tuple(slice(None) if place is None else place for place in places)
+    out[index] = np.broadcast_to(_atoms(value), out[index].shape)
+    return out
+
+
+def _put_slice(g: np.ndarray, shape: Sequence[int], dim: int, where: int | slice) -> np.ndarray:
+    """Zeros of this shape with g at `where` of one axis."""
+    out = _full(shape, 0)
+    out[(*(slice(None),) * (dim % len(shape)), where)] = g
+    return out
 
 
 def _atoms(x: Any) -> np.ndarray:
@@ -268,8 +297,9 @@ def _expand(x: np.ndarray, shape: Sequence[int]) -> np.ndarray:
     return np.broadcast_to(x, [x.shape[i - missing] if size == -1 else size for i, size in enumerate(shape)])
 
 
-def _diagonal(x: np.ndarray) -> np.ndarray:
+def _diagonal(x: np.ndarray, offset: int = 0, first: int = -2, second: int = -1) -> np.ndarray:
+    assert offset == 0
     out = _full((*x.shape, x.shape[-1]), 0)
     for i in range(x.shape[-1]):
         out[..., i, i] = x[..., i]
-    return out
+    return np.moveaxis(out, (-2, -1), (first, second))

@@ -1,0 +1,81 @@
+/* What traced functions are written in, by the C library: names of `herglotz.codegen.program`, in double precision. */
+#include <math.h>
+#include <stdlib.h>
+
+#define REAL double
+#define R(x) (x)
+#define SPREAD(x) (x)
+#define FN_sin sin
+#define FN_cos cos
+#define FN_exp exp
+#define FN_expm1 expm1
+#define FN_sqrt sqrt
+#define FN_fabs fabs
+#define FN_tanh tanh
+#define FN_atanh atanh
+#define FN_pow pow
+#define FN_choose(a, b, x, y) ((a) > (b) ? (x) : (y))
+
+static inline double FN_sigmoid(double x) { return 0.5 + 0.5 * tanh(0.5 * x); }
+
+static inline double FN_softplus(double x) { return (x > 0 ? x : 0) + log1p(exp(-fabs(x))); }
+
+static inline void FN_tanh_row(int n, const double *x, double *y) {
+  int i;
+  for (i = 0; i < n; i++) y[i] = tanh(x[i]);
+}
+
+static inline void FN_sigmoid_row(int n, const double *x, double *y) {
+  int i;
+  for (i = 0; i < n; i++) y[i] = FN_sigmoid(x[i]);
+}
+
+static inline void FN_softplus_row(int n, const double *x, double *y) {
+  int i;
+  for (i = 0; i < n; i++) y[i] = FN_softplus(x[i]);
+}
+
+static inline double FN_sum(int n, const double *x) {
+  double total = 0;
+  int i;
+  for (i = 0; i < n; i++) total += x[i];
+  return total;
+}
+
+/* y += x W for one row x (n), W (n, m); the transpose is for other runtimes. */
+static inline void FN_product(int n, int m, const double *W, const double *transpose, const double *x, double *y) {
+  int i, j;
+  (void)transpose;
+  for (i = 0; i < n; i++)
+    for (j = 0; j < m; j++) y[j] += x[i] * W[i * m + j];
+}
+
+/* X = A^-1 (n, n) by Gauss and Jordan; not finite where A is singular. */
+static inline void FN_inverse(int n, const double *A, double *X) {
+  double rows[hz_N][2 * hz_N];
+  int i, j, k;
+  for (i = 0; i < n; i++)
+    for (j = 0; j < n; j++) {
+      rows[i][j] = A[i * n + j];
+      rows[i][n + j] = i == j;
+    }
+  for (k = 0; k < n; k++) {
+    int best = k;
+    double pivot;
+    for (i = k + 1; i < n; i++)
+      if (fabs(rows[i][k]) > fabs(rows[best][k])) best = i;
+    pivot = rows[best][k];
+    for (j = 0; j < 2 * n; j++) {
+      const double other = rows[best][j] / pivot;
+      rows[best][j] = rows[k][j];
+      rows[k][j] = other;
+    }
+    for (i = 0; i < n; i++) {
+      const double factor = rows[i][k];
+      if (i != k)
+        for (j = 0; j < 2 * n; j++) rows[i][j] -= factor * rows[k][j];
+    }
+  }
+  for (i = 0; i < n; i++)
+    for (j = 0; j < n; j++) X[i * n + j] = rows[i][n + j];
+}

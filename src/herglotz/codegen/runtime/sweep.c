@@ -1,0 +1,222 @@
+/* Free runs over segments of a trajectory with their derivatives: the compiled half of `herglotz.training.kernel`.
+
+   Before this file stand what depends on the model: hz_N coordinates, hz_M inputs, hz_P parameters, and the functions
+   hz_evaluate, hz_derive and, with set-valued dry friction, hz_rest. */
+
+#define hz_D (2 * hz_N) /* numbers of a state that the motion depends on: q, p */
+#define hz_X (2 * hz_N + 1)
+enum { hz_MAX_ITERATIONS = 60 };
+/* The last move of Newton's iteration is taken and not looked at again: quadratic convergence makes the next one
+   rounding. */
+#define hz_LAST 1e-8
+
+static inline double hz_largest(const double x[hz_N]) {
+  double most = 0;
+  int i;
+  for (i = 0; i < hz_N; i++) most = fabs(x[i]) > most ? fabs(x[i]) : most;
+  return most;
+}
+
+/* x = J^-1 b by elimination with row exchange; 0 where J is singular. */
+static inline int hz_solve(const double J[hz_N * hz_N], const double b[hz_N], double x[hz_N]) {
+  double A[hz_N][hz_N + 1];
+  int i, j, k;
+  for (i = 0; i < hz_N; i++) {
+    for (j = 0; j < hz_N; j++) A[i][j] = J[i * hz_N + j];
+    A[i][hz_N] = b[i];
+  }
+  for (k = 0; k < hz_N; k++) {
+    int top = k;
+    for (i = k + 1; i < hz_N; i++)
+      if (fabs(A[i][k]) > fabs(A[top][k])) top = i;
+    if (!(fabs(A[top][k]) > 0)) return 0;
+    for (j = k; j <= hz_N; j++) {
+      const double y = A[k][j];
+      A[k][j] = A[top][j];
+      A[top][j] = y;
+    }
+    for (i = k + 1; i < hz_N; i++) {
+      const double f = A[i][k] / A[k][k];
+      for (j = k; j <= hz_N; j++) A[i][j] -= f * A[k][j];
+    }
+  }
+  for (i = hz_N - 1; i >= 0; i--) {
+    x[i] = A[i][hz_N];
+    for (j = i + 1; j < hz_N; j++) x[i] -= A[i][j] * x[j];
+    x[i] /= A[i][i];
+  }
+  return 1;
+}
+
+/* |F| over the diagonal of J where the iteration began, in units of q: what a move has to lower. */
+static inline double hz_merit(const double F[hz_N], const double scale[hz_N]) {
+  double y[hz_N];
+  int i;
+  for (i = 0; i < hz_N; i++) y[i] = F[i] / scale[i];
+  return hz_largest(y);
+}
+
+/* The increment of a step by Newton's iteration with backtracking, from a guess; 0 where there is none. */
+static int hz_increment(const double x[hz_X], double h, const double *u, const double *theta, const double *constants,
+                        double delta[hz_N]) {
+  double z[hz_N], F[hz_N], J[hz_N * hz_N], move[hz_N], scale[hz_N], merit;
+  const double still = 1e-15 * hz_largest(x);
+  int i, iteration, good = 0;
+#if hz_STICKS
+  double stiffness[hz_N], bound[hz_N];
+  hz_rest(x, h, u, theta, constants, z, stiffness, bound);
+#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, stiffness, bound, F, J)
+#else
+  for (i = 0; i < hz_N; i++) z[i] = delta[i];
+#define hz_AT(z) hz_evaluate(x, z, h, u, theta, constants, F, J)
+#endif
+  hz_AT(z);
+  for (i = 0; i < hz_N; i++) scale[i] = fabs(J[i * hz_N + i]) > 0 ? fabs(J[i * hz_N + i]) : 1;
+  merit = hz_merit(F, scale);
+  for (iteration = 0; iteration < hz_MAX_ITERATIONS && !good; iteration++) {
+    double trial[hz_N], size, part = 1;
+    if (!hz_solve(J, F, move)) return 0;
+    size = hz_largest(move);
+    if (!(size < 1e100)) return 0;
+    if (size <= hz_LAST * hz_largest(z) + still) {
+      for (i = 0; i < hz_N; i++) z[i] -= move[i];
+      good = 1;
+      break;
+    }
+    for (;; iteration++) {
+      double now;
+      for (i = 0; i < hz_N; i++) trial[i] = z[i] - part * move[i];
+      hz_AT(trial);
+      now = hz_merit(F, scale);
+      if (now < merit || part * size <= still) {
+        merit = now;
+        break;
+      }
+      if (iteration >= hz_MAX_ITERATIONS) return 0;
+      part /= 2;
+    }
+    for (i = 0; i < hz_N; i++) z[i] = trial[i];
+  }
+#undef hz_AT
+  if (!good) return 0;
+  for (i = 0; i < hz_N; i++) {
+#if hz_STICKS
+    delta[i] = z[i] > bound[i] ? z[i] - bound[i] : z[i] < -bound[i] ? z[i] + bound[i] : 0;
+#else
+    delta[i] = z[i];
+#endif
+  }
+  return 1;
+}
+
+/* Z <- A Z + dPhi/dtheta, (D, F + D): the derivatives of the next state by the free parameters and the start. */
+static void hz_carry(const double A[hz_D * hz_D], const double G[hz_D * hz_P], double c, long F, const long *chosen,
+                     double *Z, double *Y) {
+  const long W = F + hz_D;
+  long a;
+  int i, j;
+  for (i = 0; i < hz_D; i++) {
+    double *y = Y + i * W;
+    for (a = 0; a < W; a++) y[a] = 0;
+    for (j = 0; j < hz_D; j++) {
+      const double by = A[i * hz_D + j], *z = Z + j * W;
+      if (by != 0)
+        for (a = 0; a < W; a++) y[a] += by * z[a];
+    }
+    /* A parameter acts through F as c p0 does. */
+    for (j = 0; j < hz_N; j++) {
+      const double by = A[i * hz_D + hz_N + j] / c, *g = G + j * hz_P;
+      if (by != 0)
+        for (a = 0; a < F; a++) y[a] += by * g[chosen[a]];
+    }
+    if (i >= hz_N)
+      for (a = 0; a < F; a++) y[a] += G[i * hz_P + chosen[a]];
+  }
+  for (a = 0; a < hz_D * W; a++) Z[a] = Y[a];
+}
+
+/* The residuals of one sample, r = weight (q - y), and their rows, both times the root of the robust weight. */
+static void hz_observe(const double *x, const double *Z, long W, const double *y, const double *weight, double freedom,
+                       double *r, double *rows) {
+  int i;
+  for (i = 0; i < hz_N; i++) {
+    const double miss = weight[i] * (x[i] - y[i]);
+    const double root = freedom > 0 ? sqrt((freedom + 1) / (freedom + miss * miss)) : 1;
+    r[i] = root * miss;
+    if (rows) {
+      const double by = root * weight[i], *z = Z + i * W;
+      double *row = rows + i * W;
+      long a;
+      for (a = 0; a < W; a++) row[a] = by * z[a];
+    }
+  }
+}
+
+/* Free runs over S segments; the first model step of each is begin[s]. Return -1, or the segment that has no step.
+
+   x (S, X): the start of each, then its end.  delta (S, N): a guess of its first increment, then its last one.
+   sample[k]: the sample that the end of model step k is, or -1; first[s]: that of the start.
+   states: (X,) at every node, those of segment s from node place[s] on.
+   Z (S, D, W), W = F + D: derivatives of x by the free parameters `chosen` and the start; NULL: none are asked for.
+   r (N, n), rows (N, n, W) of the samples from `offset` on;  B (S, D, F), T (S, D, D), g (S, D): sums of the rows of
+   each segment's start by parameters, start and residuals. */
+long hz_sweep(long S, const long *begin, const double *h, const double *u, const double *theta, const double *constants,
+              long F, const long *chosen, const long *sample, const long *first, const double *y, const double *weight,
+              double freedom, long offset, const long *place, double *x, double *delta, double *states, double *Z, double *r, double *rows,
+              double *B, double *T, double *g) {
+  const long W = F + hz_D;
+  double *const Y = Z ? (double *)malloc((size_t)(hz_D * W) * sizeof(double)) : 0;
+  long s, k, at, failed = -1;
+  int i, j;
+  if (Z && !Y) return 0;
+  for (s = 0; s < S && failed < 0; s++) {
+    double *const here = x + s * hz_X, *const own = delta + s * hz_N, *const D = Z ? Z + s * hz_D * W : 0;
+    double before = begin[s] < begin[s + 1] ? h[begin[s]] : 1;
+    for (k = begin[s] - 1; k < begin[s + 1]; k++) { /* the start, then the end of every step */
+      if (k >= begin[s]) {
+        const double *const input = hz_M ? u + k * hz_M : 0;
+        double end[hz_N + 1], A[hz_D * hz_D], G[hz_D * hz_P], c;
+        for (i = 0; i < hz_N; i++) own[i] *= h[k] / before;
+        before = h[k];
+        if (!hz_increment(here, h[k], input, theta, constants, own)) {
+          failed = s;
+          break;
+        }
+        if (D) {
+          hz_derive(here, own, h[k], input, theta, constants, end, A, &c, G);
+          hz_carry(A, G, c, F, chosen, D, Y);
+        } else {
+          hz_finish(here, own, h[k], input, theta, constants, end);
+        }
+        for (i = 0; i < hz_N; i++) {
+          here[i] += own[i];
+          here[hz_N + i] = end[i];
+        }
+        here[hz_D] += end[hz_N];
+        if (!(hz_largest(here) < 1e100)) {
+          failed = s;
+          break;
+        }
+      }
+      for (i = 0; i < hz_X; i++) states[(place[s] + k + 1 - begin[s]) * hz_X + i] = here[i];
+      at = k < begin[s] ? first[s] : sample[k];
+      if (at < 0) continue;
+      if (D) {
+        double *const row = rows + (at - offset) * hz_N * W;
+        hz_observe(here, D, W, y + at * hz_N, weight + at * hz_N, freedom, r + at * hz_N, row);
+        for (i = 0; i < hz_N; i++) {
+          const double *const by = row + i * W + F;
+          for (j = 0; j < hz_D; j++) {
+            double *const b = B + (s * hz_D + j) * F, *const t = T + (s * hz_D + j) * hz_D, w = by[j];
+            long a;
+            for (a = 0; a < F; a++) b[a] += w * row[i * W + a];
+            for (a = 0; a < hz_D; a++) t[a] += w * by[a];
+            g[s * hz_D + j] += w * r[at * hz_N + i];
+          }
+        }
+      }
+    }
+  }
+  free(Y);
+  return failed;
+}

@@ -1,0 +1,91 @@
+"""JᵀJ of multiple shooting: a border of parameters around block tridiagonal states of segments.
+
+⎡ C  Bᵀ ⎤     C (P, P): parameters
+⎣ B  T  ⎦     T: the start of every segment and of the next, B (S, d, P): how each depends on the parameters
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+# (diagonal (S, d, d), upper (S, d, d), columns (S, d, R)) → T⁻¹ columns, or None where T is not positive definite
+Eliminate = Callable[[Tensor, Tensor, Tensor], Tensor | None]
+
+
+@dataclass(frozen=True)
+class Arrowhead:
+    """The matrix, solved by eliminating the states (`solvers.levenberg_marquardt.ByProducts`)."""
+
+    corner: Tensor  # (P, P)
+    border: Tensor  # (S, d, P)
+    blocks: Tensor  # (S, d, d) diagonal of T
+    upper: Tensor  # (S, d, d) right of it; 0 behind the last segment of a trajectory
+    eliminate: Eliminate
+
+    def __matmul__(self, v: Tensor) -> Tensor:
+        """The matrix times v, (P + S·d,)."""
+        P = len(self.corner)
+        a, x = v[:P], v[P:].reshape(self.border.shape[:2])
+        top = self.corner @ a + torch.einsum("sdp,sd->p", self.border, x)
+        rest = self.border @ a + (self.blocks @ x[..., None])[..., 0]
+        rest[:-1] += (self.upper[:-1] @ x[1:, :, None])[..., 0]
+        rest[1:] += (self.upper[:-1].mT @ x[:-1, :, None])[..., 0]
+        return torch.cat([top, rest.flatten()])
+
+    def diagonal(self) -> Tensor:
+        """Its diagonal."""
+        return torch.cat([self.corner.diagonal(), self.blocks.diagonal(dim1=-2, dim2=-1).flatten()])
+
+    def dense(self) -> Tensor:
+        """All of it, (P + S·d, P + S·d)."""
+        P, (S, d) = len(self.corner), self.border.shape[:2]
+        A = self.corner.new_zeros(P + S * d, P + S * d)
+        A[:P, :P] = self.corner
+        A[P:, :P] = self.border.flatten(0, 1)
+        A[:P, P:] = A[P:, :P].T
+        T, k = A[P:, P:].unflatten(0, (S, d)).unflatten(2, (S, d)), torch.arange(S)  # (S, d, S, d)
+        T[k, :, k] = self.blocks
+        T[k[:-1], :, k[1:]] = self.upper[:-1]
+        T[k[1:], :, k[:-1]] = self.upper[:-1].mT
+        return A
+
+    def reduced(self, b: Tensor, damping: Tensor | None = None) -> tuple[Tensor, Tensor, Tensor] | None:
+        """(C − Bᵀ T⁻¹ B, b_θ − Bᵀ T⁻¹ b_x, T⁻¹ [B, b_x]): the parameters' own equations, the states being eliminated.
+
+        None where T is not positive definite.
+        """
+        P, (S, d) = len(self.corner), self.border.shape[:2]
+        corner, blocks = self.corner, self.blocks
+        if damping is not None:
+            corner = corner + torch.diag(damping[:P])
+            blocks = blocks + torch.diag_embed(damping[P:].reshape(S, d))
+        columns = torch.cat([self.border, b[P:].reshape(S, d, 1)], -1)
+        solved = self.eliminate(blocks, self.upper, columns)
+        if solved is None:
+            return None
+        taken = self.border.flatten(0, 1).T @ solved.flatten(0, 1)
+        reduced = corner - taken[:, :P]
+        return (reduced + reduced.T) / 2, b[:P] - taken[:, P], solved
+
+    def solve(self, b: Tensor, damping: Tensor) -> Tensor | None:
+        """(matrix + diag(damping))⁻¹ b, or None where there is no finite one."""
+        found = self.reduced(b, damping)
+        if found is None:
+            return None
+        matrix, right, solved = found
+        factor, info = torch.linalg.cholesky_ex(matrix)
+        if int(info) != 0:
+            return None
+        top = torch.cholesky_solve(right[:, None], factor)[:, 0]
+        step = torch.cat([top, (solved[..., -1] - solved[..., :-1] @ top).flatten()])
+        return step if bool(torch.isfinite(step).all()) else None
+
+
+def dense(A: Tensor | Any) -> Tensor:
+    """JᵀJ as a matrix, however the problem has it."""
+    return A if isinstance(A, Tensor) else A.dense()

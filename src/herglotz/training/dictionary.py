@@ -1,0 +1,78 @@
+"""The dictionary that a compiled kernel holds: every named term that coordinates of one kind may have.
+
+One kernel a kind serves every subset, and is compiled once. A model whose terms are all in it is evaluated by that
+kernel, its other numbers being 0; any other model has a kernel of its own.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from itertools import combinations
+
+from herglotz.models import ModelConfig
+from herglotz.models.drag import AIR
+from herglotz.models.features import expand, lengths, revolute
+
+HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
+WAVES = 3  # highest harmonic of one angle
+COEFFICIENTS = re.compile(r"(potential\.features\.sum|kinetic\.sum|drag)\.coefficient(?:\[(\d+)\])?")
+
+
+def dictionary(config: ModelConfig) -> ModelConfig | None:
+    """The configuration with all terms of its kind; None where it has something that no dictionary holds."""
+    c, n = config, len(config.angles)
+    named = c.known or c.terms or c.translations or c.input_map or c.mass_width or c.correction_width
+    held = c.alike and c.order == 2 and (any(c.stiffness) or any(c.tilt))  # a potential that no term says
+    if named or held or c.potential_width or n > 3 or c.level in ("affine", "full") or c.alike != (n == 1):
+        return None
+    if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
+        c = replace(c, diagonal=False)  # joints that are apart have no mass between them
+    features, drag = _features(c.angles), _drag(c.angles)
+    distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
+    whole = replace(
+        c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
+        input_zero=c.inputs > 0, damping_width=0, rate=0.1, scale=(1.0,) * n, speed=(1.0,) * n, tilt=(0.0,) * n,
+        stiffness=(0.0 if n == 1 else 1.0,) * n, seed=0, absent=(),
+    )  # fmt: skip
+    held = set(expand(config.features, c.angles)) <= set(whole.features) and set(config.drag) <= set(drag)
+    return whole if held else None
+
+
+def _features(angles: tuple[bool, ...]) -> tuple[str, ...]:
+    if len(angles) == 1:
+        if angles[0]:
+            return tuple(f"{f}({'' if k == 1 else k}q1)" for k in range(1, WAVES + 1) for f in ("cos", "sin"))
+        return (*(f"q1^{k}" for k in range(2, HIGHEST + 1)), "q1", "|q1| q1", "|q1|^3")
+    if any(angles):
+        still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
+        return (*revolute(angles), *still)
+    return tuple(name for name in lengths(angles) if not name.startswith("r^"))
+
+
+def _drag(angles: tuple[bool, ...]) -> tuple[str, ...]:
+    drag = [f"|v{i}| v{i}" for i in range(1, len(angles) + 1)]
+    drag += [f"load {i}" for i, angle in enumerate(angles, 1) if angle]
+    drag += [text for i, angle in enumerate(angles, 1) if not angle for text in (f"q{i} v{i}", f"q{i}^2 v{i}")]
+    if not any(angles) and len(angles) > 1:
+        drag += [f"(v{i + 1} - v{j + 1})" for i, j in combinations(range(len(angles)), 2)]
+        drag += [AIR]
+    return tuple(drag)
+
+
+def keys_of(numbers: list[str], config: ModelConfig) -> list[str]:
+    """What each number of a model is, whatever other terms the model has: coefficients go by the text of their term."""
+    features = expand(config.features, config.angles)
+    texts = {
+        "potential.features.sum": [x for x in features if "v" not in x],
+        "kinetic.sum": [x for x in features if "v" in x],
+        "drag": list(config.drag),
+    }
+    found = []
+    for name in numbers:
+        match = COEFFICIENTS.fullmatch(name)
+        if match is None:
+            found.append(name.replace("kinetic.base.", "kinetic."))
+        else:
+            found.append(texts[match[1]][int(match[2] or 0)])
+    return found

@@ -1,0 +1,277 @@
+"""The step of a model with its derivatives by state and parameter, traced once and compiled: what a fit evaluates.
+
+The parameters θ are an argument, so that one library serves every fit of this structure and every subset of its terms
+(a term that is absent is a 0). It is kept on disk by what it is made of: the configuration, this package's sources, the
+compiler and the processor. Models without C (networks, s in the equation of motion, order 4 of several coordinates),
+and machines without a compiler, have no kernel: `kernel_of` gives None, and torch evaluates the same functions.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.func import functional_call, jvp, vmap
+
+import herglotz
+from herglotz.codegen.c_compiler import SOURCE, built, compiler
+from herglotz.codegen.c_function import Outputs, whole
+from herglotz.codegen.interpret import interpret
+from herglotz.codegen.program import Program, literal
+from herglotz.codegen.trace import traced
+from herglotz.errors import InputError
+from herglotz.mechanics import Partials, momentum_plus, momentum_residual, step_derivative
+from herglotz.models import Capabilities, ContactLagrangian, ModelConfig, numbers_of
+from herglotz.stepping.partials_equation import PartialsEquation
+from herglotz.stepping.state import State
+from herglotz.stepping.stick_slip import StickSlip, at_rest
+from herglotz.training.dictionary import dictionary, keys_of
+from herglotz.training.parameter_vector import ParameterVector
+
+RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
+MAX_PARAMETERS = 300  # of a kernel: three joints with all their terms have 206, and gcc takes 5 s for them
+LEVEL = "-O1"  # long straight lines of sums and products gain nothing from -O3, which takes 13 times as long
+MADE_OF = ("models", "mechanics", "stepping", "codegen")  # rooms whose sources decide what a kernel computes
+BATCHES = (101, 211, 431, 1021)  # primes: the example batch of a trace is larger than any axis
+
+
+class Placed(NamedTuple):
+    """A kernel, and where it has the numbers of a model."""
+
+    kernel: Kernel
+    chosen: Tensor  # (P,) places in θ of the kernel
+    rest: Tensor  # θ of the kernel with 0 at these
+
+
+def kernel_of(model: ContactLagrangian) -> Placed | None:
+    """The kernel that evaluates a model, compiled where it is not known yet; None where there can be none."""
+    c, config, parameters = model.capabilities, model.config, ParameterVector(model)
+    networks = config.potential_width or config.correction_width or config.mass_width or not config.baseline
+    plain = not networks and c.constant_c and not config.terms and (c.order == 2 or model.dof == 1)
+    like = next(model.parameters())
+    if not plain or like.device.type != "cpu" or like.dtype != torch.float64:
+        return None
+    whole = dictionary(config) or structure(config)
+    if len(numbers_of(ContactLagrangian(whole))) > MAX_PARAMETERS:
+        return None
+    try:
+        compiler()
+    except InputError:
+        return None
+    kernel = _kernel(json.dumps(whole.to_dict(), sort_keys=True))
+    at = {key: i for i, key in enumerate(keys_of(kernel.numbers, whole))}
+    chosen = torch.tensor([at[key] for key in keys_of(parameters.numbers, config)], dtype=torch.long)
+    return Placed(kernel, chosen, torch.zeros(len(kernel.numbers), dtype=torch.float64))
+
+
+def structure(config: ModelConfig) -> ModelConfig:
+    """The configuration without what a kernel takes as an argument: starts, sizes, and which numbers are 0."""
+    n = len(config.angles)
+    ones, zeros = (1.0,) * n, (0.0,) * n
+    held = config.alike or config.translations  # the baseline's potential, which is no argument there
+    stiffness, tilt = (config.stiffness, config.tilt) if held else (ones, zeros)
+    return replace(config, scale=ones, speed=ones, stiffness=stiffness, tilt=tilt, rate=0.1, seed=0, absent=(),
+                   damping_width=0)  # fmt: skip
+
+
+@cache
+def _kernel(config: str) -> Kernel:
+    return Kernel(ContactLagrangian(ModelConfig.from_dict(json.loads(config))))
+
+
+@cache
+def _sources() -> str:
+    """The hash of the package's sources that decide what a kernel computes."""
+    root, digest = Path(herglotz.__file__).parent, hashlib.sha256(Path(__file__).read_bytes())
+    for room in MADE_OF:
+        for path in sorted((root / room).rglob("*")):
+            if path.suffix in (".py", ".c", ".h"):
+                digest.update(path.read_bytes())
+    return digest.hexdigest() + torch.__version__
+
+
+class Kernel:
+    """Free runs of a structure over segments, with their derivatives by the start and by chosen parameters."""
+
+    def __init__(self, model: ContactLagrangian):
+        self.n, self.m, self.sticks = model.dof, model.inputs, model.capabilities.sticking
+        self.numbers = ParameterVector(model).numbers  # of θ, in order
+        key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
+        self.library = built(key, lambda: {SOURCE: source_of(model)}, LEVEL)
+        self.library.hz_sweep.restype = ctypes.c_long
+        self.library.hz_eliminate.restype = ctypes.c_long
+
+    def sweep(self, *arguments: Any) -> int:
+        """`hz_sweep` of `codegen/runtime/sweep.c`: -1, or the segment in which a step has no solution."""
+        return self.library.hz_sweep(*map(_passed, arguments))
+
+    def eliminate(self, diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
+        """The solution (S, d, R) of a block tridiagonal system; None where it is not positive definite."""
+        x, work = columns.contiguous().clone(), torch.empty_like(upper)
+        S, d, R = x.shape
+        bad = self.library.hz_eliminate(*map(_passed, (S, d, R, diagonal.contiguous(), upper.contiguous(), x, work)))
+        return x if bad < 0 else None
+
+
+def _passed(x: Tensor | float | int | None) -> Any:
+    """A number or an address as C takes it."""
+    if isinstance(x, int):
+        return ctypes.c_long(x)
+    if isinstance(x, float):
+        return ctypes.c_double(x)
+    assert x is None or x.is_contiguous()
+    return ctypes.c_void_p(None if x is None else x.data_ptr())
+
+
+class _Increments(nn.Module):
+    """A model's partials by q0 and Δ, as a module whose parameters and buffers can be given."""
+
+    def __init__(self, model: ContactLagrangian):
+        super().__init__()
+        self.model = model
+
+    def forward(self, *arguments: Any) -> Partials:
+        return self.model.partials_increment(*arguments)
+
+
+class _At:
+    """The discrete Lagrangian at parameters θ (P,), the widths' floors of friction (n,), and inputs u (B, m)."""
+
+    def __init__(self, parameters: ParameterVector, theta: Tensor, sharpest: Tensor, u: Tensor | None):
+        self.model, self.u = parameters.model, u
+        self.named = {f"model.{name}": value for name, value in parameters.unflatten(theta).items()}
+        if "friction.sharpest" in dict(self.model.named_buffers()):
+            self.named["model.friction.sharpest"] = sharpest
+
+    @property
+    def capabilities(self) -> Capabilities:
+        """The model's."""
+        return self.model.capabilities
+
+    def partials_increment(self, q0: Tensor, delta: Tensor, s0: Tensor, h: Tensor, order: int) -> Partials:
+        """See `ContactLagrangian.partials_increment`."""
+        return functional_call(_Increments(self.model), self.named, (q0, delta, s0, h, order, self.u))
+
+
+class Functions:
+    """What the C runtime calls, as tensor code: x = (q, p, s) is (B, 2n + 1), θ and `sharpest` have no batch."""
+
+    def __init__(self, model: ContactLagrangian):
+        self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
+        self.basis = torch.eye(len(self.parameters.numbers), dtype=torch.float64)  # made outside of the trace
+
+    def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> PartialsEquation:
+        """The step equation in Δ, with second derivatives."""
+        n, at = self.n, _At(self.parameters, theta, sharpest, u)
+        state = State(x[:, :n], x[:, n : 2 * n], x[:, 2 * n])
+        return PartialsEquation(at, state, h, 2, increments=True)  # pyright: ignore[reportArgumentType]
+
+    def rest(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> tuple[Tensor, ...]:
+        """z, K and w/K of `herglotz.stepping.stick_slip`."""
+        return tuple(y.clone() for y in at_rest(self.equation(x, h, u, theta, sharpest)))
+
+    def evaluate(
+        self, x: Tensor, z: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor, *held: Tensor
+    ) -> tuple[Tensor, ...]:
+        """F and J at the increment z or, where dry friction can hold, at z of `herglotz.stepping.stick_slip`."""
+        equation: Any = self.equation(x, h, u, theta, sharpest)
+        point = (StickSlip(equation, *held) if held else equation)(z, True)
+        return point.F.clone(), point.J.clone()
+
+    def derive(
+        self, x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor
+    ) -> tuple[Tensor, ...]:
+        """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ."""
+        n, p0 = self.n, x[:, self.n : 2 * self.n]
+
+        def by_parameters(theta: Tensor) -> Tensor:
+            P = self.equation(x, h, u, theta, sharpest)(delta, False).rest
+            return torch.cat([momentum_residual(P, p0), momentum_plus(P)], -1)
+
+        point = self.equation(x, h, u, theta, sharpest)(delta, True)
+        P, J = point.rest, point.J
+        assert J is not None
+        end = torch.cat([momentum_plus(P), P.L[:, None]], -1)
+        G = vmap(lambda t: jvp(by_parameters, (theta,), (t,))[1], out_dims=-1)(self.basis)
+        A, c = step_derivative(P, p0)[:, : 2 * n, : 2 * n], P.c.expand(len(x))
+        return tuple(y.clone() for y in (point.F, J, end, A, c, G))
+
+
+def source_of(model: ContactLagrangian) -> str:
+    """The whole C of a structure: sizes, traced functions, and the runtime."""
+    functions, tables = Functions(model), {}
+    n, m, P, sticks = functions.n, model.inputs, len(functions.basis), functions.sticks
+    end = {"h": 0, **({"u": m} if m else {}), "theta": P, "sharpest": n}
+    held = {"stiffness": n, "bound": n} if sticks else {}
+    state, solved = {"x": 2 * n + 1}, ("F", "J", "end", "A", "*c", "G")
+    parts = []
+    if sticks:
+        rest = _Traced(functions.rest, state | end, m, ("z", "stiffness", "bound"), tables)
+        trial = _Traced(functions.evaluate, state | {"z": n} | end | held, m, ("F", "J"), tables)
+        parts = [rest.function("rest", "z", "stiffness", "bound"), trial.function("evaluate", "F", "J")]
+    step = _Traced(functions.derive, state | {"delta": n} | end, m, solved, tables)
+    parts += [] if sticks else [step.function("evaluate", "F", "J")]
+    parts += [step.function("finish", "end"), step.function("derive", "end", "A", "*c", "G")]
+    sizes = f"#define hz_N {n}\n#define hz_M {m}\n#define hz_P {P}\n#define hz_STICKS {int(sticks)}\n"
+    constants = "".join(
+        f"static const double {name}[{len(row)}] = {{{', '.join(map(literal, row))}}};\n"
+        for row, name in tables.items()
+    )
+    head, *loops = ((RUNTIME / name).read_text() for name in ("mathematics.h", "sweep.c", "tridiagonal.c"))
+    return "\n".join([sizes, head, constants, *parts, OPTIMISED, *loops])
+
+
+OPTIMISED = """
+#if defined(__GNUC__) && !defined(__clang__)
+#pragma GCC optimize("O3")
+#endif
+"""
+
+
+class _Traced:
+    """A traced function with the numbers of its results, from which C functions of some of them are written."""
+
+    def __init__(
+        self, function: Callable[..., Any], given: dict[str, int], inputs: int, results: Sequence[str],
+        tables: dict[tuple[float, ...], str],
+    ):  # fmt: skip
+        self.program, self.given, self.inputs = Program(tables=tables), given, inputs
+        at = list(given).index("h") + 1
+        whole_function = function if inputs else lambda *x: function(*x[:at], None, *x[at:])
+        graph = traced(whole_function, _examples(given))
+        arrays = interpret(self.program, graph, [self.program.given(key, size) for key, size in given.items()])
+        self.outputs = {
+            name: array.ravel()[0] if name.startswith("*") else list(array.ravel())
+            for name, array in zip(results, arrays, strict=True)
+        }
+
+    def function(self, name: str, *results: str) -> str:
+        """The C function hz_`name` that writes these results."""
+        written = [f"double {key if key.startswith('*') else f'*restrict {key}'}" for key in results]
+        read = [f"double {key}" if size == 0 else f"const double *restrict {key}" for key, size in self.given.items()]
+        if not self.inputs:
+            read.insert(list(self.given).index("h") + 1, "const double *restrict u")
+        outputs: Outputs = {key: self.outputs[key] for key in results}
+        return whole(self.program, f"\nstatic void hz_{name}({', '.join([*read, *written])})", outputs)
+
+
+def _examples(given: dict[str, int]) -> tuple[Tensor, ...]:
+    """Arguments of these sizes for a trace; θ and `sharpest` have no batch, and a size of 0 is one number."""
+    batch = next(prime for prime in BATCHES if prime > given["theta"])
+    make = torch.Generator().manual_seed(0)
+    random = lambda *shape: torch.rand(*shape, generator=make, dtype=torch.float64)  # noqa: E731
+    found = []
+    for name, size in given.items():
+        if name in ("theta", "sharpest"):
+            found.append(0.1 + random(size) / 10)
+        else:
+            found.append(0.1 + random(batch, size) / 10 if size else 0.1 + random(batch) / 10)
+    return tuple(found)
