@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import fx
 
-from herglotz.codegen.program import Atom, Compared, Program, Ref, fold_add, fold_multiply
+from herglotz.codegen.program import Atom, Compared, Program, Ref, add, fold_add, fold_multiply
 from herglotz.codegen.trace import Graph
 from herglotz.errors import InputError
 
@@ -47,8 +47,17 @@ def interpret(program: Program, graph: Graph, inputs: Sequence[Sequence[Ref]]) -
         if node.target not in table:
             raise InputError(f"{node.target} cannot be written as C yet; export the model as .pt2 instead")
         options = {k: x for k, x in node.kwargs.items() if k in ("value", "alpha")}
-        values[node] = table[node.target](*known(node.args), **known(options))
+        arguments = _squeezed(node) if node.target == aten.squeeze.dims else node.args
+        values[node] = table[node.target](*known(arguments), **known(options))
     return list(known(nodes[-1].args[0]))  # the output
+
+
+def _squeezed(node: fx.Node) -> tuple[fx.Node, tuple[int, ...]]:
+    """The arguments of a squeeze with the axes that had size 1 when it was traced: here the batch has size 1, too."""
+    x, axes = node.args
+    assert isinstance(x, fx.Node)
+    shape = x.meta["example"].shape
+    return x, tuple(axis for axis in axes if shape[axis] == 1)  # pyright: ignore[reportGeneralTypeIssues, reportOptionalIterable]
 
 
 def _array(atoms: Sequence[Atom]) -> np.ndarray:
@@ -94,13 +103,14 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.sum.dim_IntList: c.sum,
         aten.linalg_inv_ex.default: lambda x, *_, **__: (c.inverse(x), None),
         aten._linalg_solve_ex.default: c.solve,
-        aten.index_put.default: _put,
+        aten.index_put.default: c.put,
         aten.select_backward.default: lambda g, shape, dim, i: _put_slice(g, shape, dim, i),
         aten.slice_backward.default: lambda g, shape, dim, a, b, step: _put_slice(g, shape, dim, slice(a, b, step)),
-        aten.cat.default: lambda xs, dim=0: np.concatenate(xs, dim),
+        # torch leaves out tensors of shape (0,), whatever the shape of the others.
+        aten.cat.default: lambda xs, dim=0: np.concatenate([x for x in xs if x.shape != (0,)], dim),
         aten.stack.default: lambda xs, dim=0: np.stack(xs, dim),
         aten.unsqueeze.default: np.expand_dims, aten.select.int: lambda x, dim, i: np.take(x, i, axis=dim),
-        aten.squeeze.dim: np.squeeze,
+        aten.squeeze.dim: np.squeeze, aten.squeeze.dims: np.squeeze,
         aten.slice.Tensor: lambda x, dim=0, a=None, b=None, step=1: x[
             (slice(None),) * (dim % x.ndim) + (slice(a, b, step),)
         ],
@@ -259,21 +269,20 @@ class _Numbers:
         x = self.product(self.inverse(A), b[..., None] if vector else b)
         return (x[..., 0] if vector else x), None, None, None
 
+    def put(self, x: np.ndarray, places: Sequence[Any], value: np.ndarray, accumulate: bool = False) -> np.ndarray:
+        """A copy of x with these values at these places, or added to what is there."""
+        index = tuple(slice(None) if place is None else place for place in places)
+        at = np.arange(x.size).reshape(x.shape)[index]
+        out, values = _atoms(x).ravel().copy(), np.broadcast_to(_atoms(value), at.shape)
+        for i, number in zip(at.ravel(), values.ravel(), strict=True):
+            out[i] = add(self.program, out[i], number) if accumulate else number
+        return out.reshape(x.shape)
+
     def inverse(self, x: np.ndarray) -> np.ndarray:
         out = np.empty(x.shape, object)
         for i in np.ndindex(x.shape[:-2]):
             out[i] = _array(self.program.inverse(x[i])).reshape(x.shape[-2:])
         return out
-
-
-def _put(x: np.ndarray, places: Sequence[Any], value: np.ndarray, accumulate: bool = False) -> np.ndarray:
-    """A copy of x with these values at these places."""
-    if accumulate:
-        raise InputError("index_put that adds up cannot be written as C yet; export the model as .pt2 instead")
-    out = np.array(x, object)
-    index = tuple(slice(None) if place is None else place for place in places)
-    out[index] = np.broadcast_to(_atoms(value), out[index].shape)
-    return out
 
 
 def _put_slice(g: np.ndarray, shape: Sequence[int], dim: int, where: int | slice) -> np.ndarray:

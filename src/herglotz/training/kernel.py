@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.func import functional_call, jvp, vmap
+from torch.func import functional_call, vjp, vmap
 
 import herglotz
 from herglotz.codegen.c_compiler import SOURCE, built, compiler
@@ -166,7 +166,7 @@ class Functions:
 
     def __init__(self, model: ContactLagrangian):
         self.parameters, self.n, self.sticks = ParameterVector(model), model.dof, model.capabilities.sticking
-        self.basis = torch.eye(len(self.parameters.numbers), dtype=torch.float64)  # made outside of the trace
+        self.basis = torch.eye(2 * self.n, dtype=torch.float64).unbind()  # made outside of the trace
 
     def equation(self, x: Tensor, h: Tensor, u: Tensor | None, theta: Tensor, sharpest: Tensor) -> PartialsEquation:
         """The step equation in Δ, with second derivatives."""
@@ -192,15 +192,21 @@ class Functions:
         """F, J, (p1, s1 − s0), and of a solved step ∂(q1, p1)/∂(q, p), c, and ∂(F, p1)/∂θ at Δ."""
         n, p0 = self.n, x[:, self.n : 2 * self.n]
 
-        def by_parameters(theta: Tensor) -> Tensor:
-            P = self.equation(x, h, u, theta, sharpest)(delta, False).rest
-            return torch.cat([momentum_residual(P, p0), momentum_plus(P)], -1)
+        def by_parameters(x: Tensor, delta: Tensor, h: Tensor, u: Tensor | None) -> Tensor:
+            def of_sample(theta: Tensor) -> Tensor:
+                driven = None if u is None else u[None]
+                P = self.equation(x[None], h[None], driven, theta, sharpest)(delta[None], False).rest
+                own = x[None, self.n : 2 * self.n]
+                return torch.cat([momentum_residual(P, own), momentum_plus(P)], -1)[0]
+
+            _, back = vjp(of_sample, theta)
+            return torch.stack([back(e)[0] for e in self.basis])
 
         point = self.equation(x, h, u, theta, sharpest)(delta, True)
         P, J = point.rest, point.J
         assert J is not None
         end = torch.cat([momentum_plus(P), P.L[:, None]], -1)
-        G = vmap(lambda t: jvp(by_parameters, (theta,), (t,))[1], out_dims=-1)(self.basis)
+        G = vmap(by_parameters, (0, 0, 0, None if u is None else 0))(x, delta, h, u)
         A, c = step_derivative(P, p0)[:, : 2 * n, : 2 * n], P.c.expand(len(x))
         return tuple(y.clone() for y in (point.F, J, end, A, c, G))
 
@@ -208,7 +214,7 @@ class Functions:
 def source_of(model: ContactLagrangian) -> str:
     """The whole C of a structure: sizes, traced functions, and the runtime."""
     functions, tables = Functions(model), {}
-    n, m, P, sticks = functions.n, model.inputs, len(functions.basis), functions.sticks
+    n, m, P, sticks = functions.n, model.inputs, len(functions.parameters.numbers), functions.sticks
     end = {"h": 0, **({"u": m} if m else {}), "theta": P, "sharpest": n}
     held = {"stiffness": n, "bound": n} if sticks else {}
     state, solved = {"x": 2 * n + 1}, ("F", "J", "end", "A", "*c", "G")

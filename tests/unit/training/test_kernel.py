@@ -1,0 +1,140 @@
+"""The compiled kernel of fits: the same motions, derivatives and normal equations as eager torch, in pieces or at once."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from herglotz.data import Trajectories
+from herglotz.models import ContactLagrangian, ModelConfig
+from herglotz.training import flow
+from herglotz.training.arrowhead import dense
+from herglotz.training.dictionary import dictionary, keys_of
+from herglotz.training.kernel import kernel_of
+from herglotz.training.parameter_vector import ParameterVector
+from herglotz.training.problems.grid import segment_grid
+from herglotz.training.problems.shooting import ShootingProblem
+
+PENDULUM = ModelConfig(angles=(True,), level="forced", stiffness=(0.0,), alike=True, potential_width=0, damping_width=0,
+                       features=("cos(q1)", "sin(2q1)"), drag=("|v1| v1",))  # fmt: skip
+SPRING = replace(PENDULUM, angles=(False,), features=("q1^2", "q1^3", "|q1| q1"), drag=("q1^2 v1",), inputs=1,
+                 input_zero=True, coulomb=True, speed=(2.0,))  # fmt: skip
+JOINTS = ModelConfig(angles=(True, True), level="forced", scale=(1.0, 1.0), speed=(1.0, 1.5), stiffness=(3.0, 2.0),
+                     tilt=(0.1, 0.0), potential_width=0, damping_width=0, coupled=True, coulomb=True,
+                     features=("cos(q1 - q2) v1 v2", "sin(q2) v1 v1"))  # fmt: skip
+MODELS = {
+    "order 2": PENDULUM,
+    "order 4": replace(PENDULUM, order=4),
+    "one rate": replace(PENDULUM, level="linear", drag=()),
+    "driven, dry": SPRING,
+    "held": replace(SPRING, sticking=True),
+    "joints": JOINTS,
+    "joints without a number": replace(JOINTS, absent=("friction.viscous[0]", "coupling.viscous")),
+    "own structure": replace(PENDULUM, alike=False, stiffness=(1.0,)),
+}
+
+
+def problem_of(config, *, length=5, freedom=None, samples=24):
+    """A problem over segments of `length` steps, and unknowns near a motion of the model."""
+    model, n = ContactLagrangian(config), config.dof
+    make = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for name, value in model.named_parameters():
+            if "log" not in name:
+                value.add_(0.1 * torch.rand(value.shape, generator=make, dtype=torch.float64))
+        ParameterVector(model).set(ParameterVector(model).get())  # absent numbers are 0 again
+    t = torch.linspace(0, 1.5, samples, dtype=torch.float64)
+    q = torch.stack([torch.cos(2 * t + i) * (0.8 + 0.2 * i) for i in range(n)], -1)
+    u = torch.sin(5 * t)[:, None].repeat(1, config.inputs) if config.inputs else None
+    data = Trajectories.cat([Trajectories.of(t, by * q, angles=config.angles, u=u) for by in (1.0, 0.7)])
+    grid = segment_grid(data, length, 0.04)
+    problem = ShootingProblem(model, data, grid, sigma=0.05, freedom=freedom)
+    states = torch.cat([data.q[grid.start_sample], 0.3 - data.q[grid.start_sample]], -1)
+    return problem, problem.pack(problem.parameters.get(), states)
+
+
+def eager(config, **settings):
+    problem, x = problem_of(config, **settings)
+    problem.compiled = None
+    return problem, x
+
+
+@pytest.mark.parametrize("freedom", [None, 4.0])
+@pytest.mark.parametrize("config", MODELS.values(), ids=MODELS.keys())
+def test_compiled_equations_are_those_of_torch(config, freedom):
+    # fails if a derivative, a robust weight, a joint or the place of a number in the kernel is wrong
+    problem, x = problem_of(config, freedom=freedom)
+    assert problem.compiled is not None
+    other, _ = eager(config, freedom=freedom)
+    mine, its = problem.normal_equations(x), other.normal_equations(x)
+    assert float(mine[0]) == pytest.approx(float(its[0]), rel=1e-10)
+    for a, b in ((dense(mine[1]), dense(its[1])), (mine[2], its[2])):
+        assert float((a - b).abs().max()) <= 1e-10 * float(b.abs().max())
+    assert float(problem.cost(x)) == pytest.approx(float(mine[0]), rel=1e-13)
+    rows, own = (p.slopes_at_samples(x[: p.P], p.path) for p in (other, problem))
+    assert float((rows - own).abs().max()) <= 1e-10 * float(rows.abs().max())
+
+
+@pytest.mark.parametrize("length", [5, 23])
+def test_pieces_add_up_to_the_whole(length, monkeypatch):
+    # fails if a segment that is cut into pieces loses a sample, its state or its derivatives
+    problem, x = problem_of(MODELS["joints"], length=length)
+    whole = problem.normal_equations(x)
+    monkeypatch.setattr(flow, "CHUNK", 8 * 2 * 40 * 7)  # seven samples at most
+    pieces = problem.normal_equations(x)
+    assert float((dense(whole[1]) - dense(pieces[1])).abs().max()) <= 1e-12 * float(dense(whole[1]).abs().max())
+    assert float((whole[2] - pieces[2]).abs().max()) <= 1e-12 * float(whole[2].abs().max())
+
+
+def test_equations_are_solved_by_blocks():
+    # fails if elimination of the states is not that of the whole matrix
+    problem, x = problem_of(MODELS["order 2"])
+    _, A, b = problem.normal_equations(x)
+    damping = 1e-3 * A.diagonal()
+    expected = torch.linalg.solve(dense(A) + torch.diag(damping), b)
+    found = A.solve(b, damping)
+    assert found is not None
+    assert float((found - expected).abs().max()) <= 1e-8 * float(expected.abs().max())
+    assert float((A @ b - dense(A) @ b).abs().max()) <= 1e-12 * float((dense(A) @ b).abs().max())
+
+
+def test_a_motion_that_has_no_step_costs_infinity():
+    # fails if a step without a solution gives numbers
+    problem, x = problem_of(MODELS["order 4"])
+    x[: problem.P] = 1e200
+    assert float(problem.cost(x)) == float("inf")
+    assert not bool(torch.isfinite(problem.normal_equations(x)[0]))
+
+
+def test_one_kernel_serves_every_subset_of_its_terms():
+    # fails if a model of fewer terms is compiled again: a search would take seconds for each
+    kernels = {kernel_of(ContactLagrangian(MODELS[name])).kernel for name in ("joints", "joints without a number")}
+    fewer = replace(JOINTS, features=(), coulomb=False)
+    kernels.add(kernel_of(ContactLagrangian(fewer)).kernel)
+    assert len(kernels) == 1
+    assert kernel_of(ContactLagrangian(PENDULUM)).kernel is kernel_of(ContactLagrangian(MODELS["one rate"])).kernel
+
+
+def test_numbers_go_by_their_terms():
+    # fails if a coefficient is found by its place: subsets have other places
+    whole = dictionary(PENDULUM)
+    assert whole is not None
+    fewer = replace(PENDULUM, features=("sin(2q1)",))
+    assert set(keys_of(ParameterVector(ContactLagrangian(fewer)).numbers, fewer)) == {
+        "sin(2q1)", "damping.rate", "friction.viscous", "|v1| v1",
+    }  # fmt: skip
+
+
+def test_models_with_networks_have_no_kernel():
+    # fails if a network is left out of a compiled fit
+    assert kernel_of(ContactLagrangian(replace(PENDULUM, potential_width=4))) is None
+    assert kernel_of(ContactLagrangian(ModelConfig(level="affine"))) is None
+    assert kernel_of(ContactLagrangian(PENDULUM).float()) is None
+
+
+def test_without_a_compiler_torch_fits(monkeypatch):
+    # fails if a machine without a compiler cannot fit
+    monkeypatch.setenv("CC", "no-such-compiler")
+    problem, x = problem_of(MODELS["order 2"])
+    assert problem.compiled is None
+    assert bool(torch.isfinite(problem.normal_equations(x)[0]))
