@@ -52,8 +52,9 @@ def build(header: str, loops: str) -> ctypes.CDLL:
 def built(key: str, sources: Callable[[], Mapping[str, str]], level: str | None = None) -> ctypes.CDLL:
     """The library of these files, of which `SOURCE` is compiled, loaded: from the cache where it is there.
 
-    `key` says what is compiled, and `level`, in place of that of `FLAGS`, how much the compiler optimises; the compiler,
-    its flags and the processor join the key. Raise InputError if there is no compiler, or it does not compile the files.
+    `key` says what is compiled, and `level`, in place of that of `FLAGS`, how much the compiler optimises; the
+    compiler, its flags and the processor join the key. Raise InputError if there is no compiler, or it does not compile
+    the files.
     """
     words, flags = compiler(), tuple(level if level and flag.startswith("-O") else flag for flag in FLAGS)
     digest = hashlib.sha256("\0".join([key, *words, *flags, sys.platform, _processor()]).encode()).hexdigest()[:32]

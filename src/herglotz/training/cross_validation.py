@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.training.arrowhead import Arrowhead, dense
 from herglotz.training.problems.shooting import ShootingProblem
 from herglotz.training.solvers.lifted_newton import Path
 
@@ -43,7 +44,7 @@ def held_out_errors(
     problem: ShootingProblem,
     path: Path,
     theta: Tensor,  # (P,)
-    A: Tensor,  # JᵀJ of the whole problem at the fit, prior included
+    A: Tensor | Arrowhead,  # JᵀJ of the whole problem at the fit, prior included
 ) -> Tensor:
     """Return the RMS error of each fold if its samples had been left out, (FOLDS,), in units of q.
 
@@ -54,7 +55,7 @@ def held_out_errors(
     out: a free run begins there.
     """
     r, J = problem.data_rows(path, theta)
-    values, vectors = torch.linalg.eigh(A.double())
+    values, vectors = torch.linalg.eigh(dense(A).double())
     known = values > len(values) * torch.finfo(values.dtype).eps * values[-1]
     r, G = r.double(), J.double() @ (vectors[:, known] / values[known].sqrt())  # G Gᵀ = J A⁻¹ Jᵀ
     better = problem.better.flatten().to(r)  # counts in r and J, and not in errors in units of q

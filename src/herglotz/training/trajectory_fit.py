@@ -11,7 +11,6 @@ from herglotz.data import Trajectories
 from herglotz.data.roughness import precision, spread
 from herglotz.errors import InputError
 from herglotz.models import ContactLagrangian
-from herglotz.training.arrowhead import dense
 from herglotz.training.cross_validation import Chosen, held_out_errors, strongest_not_beaten
 from herglotz.training.first_states import first_states, states_of_pairs
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, segment_lengths
@@ -72,7 +71,7 @@ class TrajectoryFit:
         """Of every fold, in units of q; see `cross_validation`."""
         problem = self.problem
         _, A, _ = problem.normal_equations(self.result.x)
-        return held_out_errors(problem, self.path, self.theta, dense(A))
+        return held_out_errors(problem, self.path, self.theta, A)
 
 
 def check_size(data: Trajectories, most: int = MOST * FIRST_SEGMENT // 2) -> None:

@@ -54,6 +54,7 @@ def pendulum():
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.1, noise=0.0, seed=0)
     model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0, scale=(2.5,), speed=(2.0,)))
     problem = ShootingProblem(model, data, segment_grid(data, 60, 0.2), sigma=0.01)
+    problem.compiled = None  # a kernel steps, and needs no path to start from
     start = problem.grid.start_sample
     v = (data.q[start + 1] - data.q[start]) / 0.1
     x = problem.pack(problem.parameters.get(), problem.states(data.q[start], v))

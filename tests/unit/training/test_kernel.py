@@ -1,4 +1,4 @@
-"""The compiled kernel of fits: the same motions, derivatives and normal equations as eager torch, in pieces or at once."""
+"""The compiled kernel of fits: the motions, derivatives and normal equations of eager torch, in pieces or at once."""
 
 from dataclasses import replace
 
