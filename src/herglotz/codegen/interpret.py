@@ -100,7 +100,7 @@ def operations(program: Program) -> dict[Any, Callable[..., Any]]:
         aten.addmm.default: lambda b, x, w: c.add(c.product(x, w), b) if b.ndim > 1 else c.product(x, w, b),
         aten.mm.default: c.product, aten.bmm.default: c.product,
         aten.mv.default: c.product, aten.dot.default: c.product,
-        aten.sum.dim_IntList: c.sum,
+        aten.sum.dim_IntList: c.sum, aten.sum.default: lambda x: c.sum(x, list(range(x.ndim))),
         aten.linalg_inv_ex.default: lambda x, *_, **__: (c.inverse(x), None),
         aten._linalg_solve_ex.default: c.solve,
         aten.index_put.default: c.put,

@@ -12,6 +12,7 @@ import ctypes
 import hashlib
 import json
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -67,6 +68,8 @@ def kernel_of(model: ContactLagrangian) -> Placed | None:
     except InputError:
         return None
     kernel = _kernel(json.dumps(whole.to_dict(), sort_keys=True))
+    if kernel is None:
+        return None
     at = {key: i for i, key in enumerate(keys_of(kernel.numbers, whole))}
     chosen = torch.tensor([at[key] for key in keys_of(parameters.numbers, config)], dtype=torch.long)
     return Placed(kernel, chosen, torch.zeros(len(kernel.numbers), dtype=torch.float64))
@@ -83,8 +86,11 @@ def structure(config: ModelConfig) -> ModelConfig:
 
 
 @cache
-def _kernel(config: str) -> Kernel:
-    return Kernel(ContactLagrangian(ModelConfig.from_dict(json.loads(config))))
+def _kernel(config: str) -> Kernel | None:
+    """The kernel of this structure; None where it has an operation without a form in C."""
+    with suppress(InputError):
+        return Kernel(ContactLagrangian(ModelConfig.from_dict(json.loads(config))))
+    return None
 
 
 @cache
