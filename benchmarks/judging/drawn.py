@@ -32,5 +32,5 @@ def _written(folder: Path, of: ZooSystem) -> Job:
     save(folder / "unseen.csv", trajectories(of, of.test))
     scale, size = ((x * unit(of)).tolist() for x in (of.floor, of.size))
     trials = [Trial("unseen.csv", of.warmup)]
-    best = max(1.0, float(np.round(of.attainable, 3)))
+    best = max(1.0, float(np.round(of.attainable or 1.0, 3)))
     return Job("train.csv", trials, scale=scale, unit="over noise", size=size, attainable=best, facts=of.facts())
