@@ -124,7 +124,7 @@ def store(path: Path, result: dict[str, Any]) -> None:
 def compare(old: Path, new: Path, floor: float) -> int:
     """Print what changed; 1 if a row is worse."""
     pair = [json.loads(path.read_text(encoding="utf-8")) for path in (old, new)]
-    text, worse = tables.compared(*pair, floor)
+    text, worse = tables.compared(pair[0], pair[1], floor)
     print(text, end="")
     return int(worse > 0)
 
@@ -149,7 +149,7 @@ def arguments_of(argv: list[str] | None) -> argparse.Namespace:
 def main(argv: list[str] | None = None) -> int:
     arguments = arguments_of(argv)
     if arguments.compare:
-        return compare(*arguments.compare, arguments.floor)
+        return compare(arguments.compare[0], arguments.compare[1], arguments.floor)
     source = arguments.source.resolve() if arguments.source else None
     commit, out = commit_of(source), (arguments.out or RESULTS).resolve()
     name = f"judge_quick_{commit}" if arguments.quick else f"judge_{commit}"

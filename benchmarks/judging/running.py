@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -18,6 +19,8 @@ from benchmarks.judging.make import ABSENT
 
 ROOT = Path(__file__).resolve().parents[2]
 WALL = 20  # times its limit that a process may take on a busy machine
+# A signal of its own says that the time is over; 5 s later comes one that nothing can catch.
+BOUND = 'ulimit -c 0; ulimit -H -t $(($0 + 5)); ulimit -S -t "$0"; exec "$@"'
 LOOK = 0.05  # s between two looks at a process
 MAKING = 1200  # processor time for the data of a row, s: a draw of the zoo fits its true equation many times
 AT_NOISE, USABLE = 1.5, 0.1  # times a perfect model's error, and of the spread: the bounds of the zoo's outcomes
@@ -49,7 +52,7 @@ def limited(command: list[str], limit: float, environment: dict[str, str], folde
     """
     folder.mkdir(parents=True, exist_ok=True)
     with (folder / "stdout").open("w+") as out, (folder / "stderr").open("w+") as err:
-        bound = ["sh", "-c", 'ulimit -t "$0"; exec "$@"', str(max(1, round(limit))), *command]
+        bound = ["sh", "-c", BOUND, str(max(1, round(limit))), *command]
         process = subprocess.Popen(bound, stdout=out, stderr=err, env=environment, cwd=folder)
         waited = 0.0  # counted, not read off a clock: while the judge itself is stopped, its children may be, too
         while True:
@@ -66,8 +69,9 @@ def limited(command: list[str], limit: float, environment: dict[str, str], folde
             file.seek(0)
             texts.append(file.read())
     cpu = usage.ru_utime + usage.ru_stime
-    over = process.returncode < 0 and (cpu > 0.98 * limit or waited > WALL * limit)
-    return Ended(None if over else process.returncode, cpu, usage.ru_maxrss / MEGABYTE, *texts)
+    ended = process.returncode
+    over = ended == -signal.SIGXCPU or (ended < 0 and (cpu > limit or waited > WALL * limit))
+    return Ended(None if over else ended, cpu, usage.ru_maxrss / MEGABYTE, *texts)
 
 
 def environment(source: Path | None) -> dict[str, str]:

@@ -6,6 +6,7 @@ import json
 import math
 from dataclasses import fields, replace
 from pathlib import Path
+from typing import Any
 
 import torch
 
@@ -19,19 +20,18 @@ NOISE = 0.01  # rad, or of a motion's size
 EXACT = 1e-4  # of the spread: what counts as the noise of exact data, as in the zoo
 
 
-def _job(folder: Path, train: Trajectories, test: Trajectories, noise: float = 0.0, **settings: object) -> Job:
+def _job(folder: Path, train: Trajectories, test: Trajectories, noise: float = 0.0) -> Job:
     """Fit all of the training data; predict exact recordings from unseen starts, over the noise of the former."""
     save(folder / "train.csv", train)
     save(folder / "test.csv", test)
     size = train.unwrapped().q.double().std(0)
     scale = torch.full_like(size, noise) if noise else EXACT * size
-    flags = (*EVERYTHING, *settings.pop("flags", ()))  # type: ignore[misc]
     trials = [Trial("test.csv", WARMUP)]
-    return Job("train.csv", trials, flags=flags, scale=scale.tolist(), unit="over noise", size=size.tolist(),
-               attainable=1.0, **settings)  # type: ignore[arg-type]  # fmt: skip
+    named = {"scale": scale.tolist(), "unit": "over noise", "size": size.tolist(), "attainable": 1.0}
+    return Job("train.csv", trials, flags=EVERYTHING, **named)
 
 
-def _unseen(seed: int, steps: int = 100, h: float = 0.2, trajectories: int = 20, **starts: object) -> Trajectories:
+def _unseen(seed: int, steps: int = 100, h: float = 0.2, trajectories: int = 20, **starts: Any) -> Trajectories:
     """Exact recordings of the damped pendulum."""
     return simulate(
         scene("damped_pendulum"), trajectories=trajectories, steps=steps + WARMUP - 1, h=h, seed=seed + 500, **starts
@@ -41,7 +41,7 @@ def _unseen(seed: int, steps: int = 100, h: float = 0.2, trajectories: int = 20,
 def noise(folder: Path, trajectories: int, seed: int) -> Job:
     """The damped pendulum with 0.01 rad of noise; of one recording, from starts that it surrounds."""
     data = simulate(scene("damped_pendulum"), trajectories=trajectories, steps=40, h=0.2, noise=NOISE, seed=seed)
-    starts = {}
+    starts: dict[str, Any] = {}
     if trajectories == 1:
         reach = float(data.q.abs().max())
         starts = {"q_range": (-0.7 * reach, 0.7 * reach), "v_range": (-0.3 * reach, 0.3 * reach)}

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from benchmarks import zoo
-from benchmarks.zoo_systems.mechanisms import Mechanism
+from benchmarks.zoo_systems.mechanisms import Array, Mechanism
 from benchmarks.zoo_systems.neural_ode import NeuralODE, fit_neural_ode
 from benchmarks.zoo_systems.open_laws import LAWS, fixed_law
 from benchmarks.zoo_systems.open_systems import (
@@ -88,7 +88,8 @@ def test_action_dependent_friction_is_herglotzs():
     L = lambda q, v, s, u: v**2 / 2 - V(q) - gamma * s - beta * s**2 + b * u * q  # noqa: E731
     q, v, s, u, e = 0.7, -0.4, 0.5, 0.3, 1e-6
     slopes = [(L(*(x + e * d)) - L(*(x - e * d))) / (2 * e) for d in np.eye(4)[:3] for x in [np.array([q, v, s, u])]]
-    a, ds = herglotz(V, lambda x: x + x**3, gamma, beta, b)(*(np.full((1, 1), x) for x in (q, v, s)), np.array([u]))
+    slope = herglotz(V, lambda x: x + x**3, gamma, beta, b)
+    a, ds = slope(np.array([[q]]), np.array([[v]]), np.array([[s]]), np.array([u]))
     assert a[0, 0] == pytest.approx(slopes[0] + slopes[2] * slopes[1], abs=1e-8)  # ∂L/∂v = v: its rate is q̈
     assert ds[0, 0] == pytest.approx(L(q, v, s, u))
 
@@ -107,7 +108,7 @@ def test_what_is_attainable_is_what_the_warm_up_leaves_open():
     # fails if the true equation is given a start that no recording tells, or the noise of the data predicted is left
     # out: a line through 20 samples is off by σ √(1 + x (XᵀX)⁻¹ xᵀ) at x
     of, count = still(lambda q, v, w, u: (0 * q, w)), 400  # noqa: ARG005
-    t = np.arange(WARMUP + AHEAD) * 0.01
+    t: Array = 0.01 * np.arange(WARMUP + AHEAD, dtype=np.float64)
     truth = np.zeros((count, len(t), 1))
     data = Recording(t, truth, truth, np.zeros((count, len(t))))
     X = np.stack([t**0, t], -1)
