@@ -56,7 +56,7 @@ def machine() -> str:
     return f"{name}, {os.cpu_count()} cores"
 
 
-def kept(path: Path, commit: str) -> dict[str, dict[str, Any]]:
+def kept(path: Path, commit: str | None = None) -> dict[str, dict[str, Any]]:
     """Rows that an earlier run measured; one that was skipped, or whose line was cut short, is tried again."""
     rows: dict[str, dict[str, Any]] = {}
     for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
@@ -64,7 +64,7 @@ def kept(path: Path, commit: str) -> dict[str, dict[str, Any]]:
             row = json.loads(line)
         except ValueError:
             continue
-        if row["commit"] != commit:
+        if commit is not None and row["commit"] != commit:
             raise SystemExit(
                 f"error: {path} holds rows of commit {row['commit']}, this is {commit}: take another --out"
             )
@@ -121,9 +121,17 @@ def store(path: Path, result: dict[str, Any]) -> None:
         part.replace(file)
 
 
+def opened(path: Path) -> dict[str, Any]:
+    """A table, or the rows of a run that goes on."""
+    if path.suffix != ".jsonl":
+        return json.loads(path.read_text(encoding="utf-8"))
+    rows = list(kept(path).values())
+    return {"commit": rows[0]["commit"] if rows else "none", "rows": rows}
+
+
 def compare(old: Path, new: Path, floor: float) -> int:
     """Print what changed; 1 if a row is worse."""
-    pair = [json.loads(path.read_text(encoding="utf-8")) for path in (old, new)]
+    pair = [opened(path) for path in (old, new)]
     text, worse = tables.compared(pair[0], pair[1], floor)
     print(text, end="")
     return int(worse > 0)
@@ -131,7 +139,13 @@ def compare(old: Path, new: Path, floor: float) -> int:
 
 def arguments_of(argv: list[str] | None) -> argparse.Namespace:
     made = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    made.add_argument("--compare", nargs=2, type=Path, metavar=("OLD", "NEW"), help="compare two tables (.json)")
+    made.add_argument(
+        "--compare",
+        nargs=2,
+        type=Path,
+        metavar=("OLD", "NEW"),
+        help="compare two tables (.json), or the rows of a run that goes on (.jsonl)",
+    )
     made.add_argument("--floor", type=float, default=tables.FLOOR, help="of the spread: errors below it count as that "
                       "(default %(default)g)")  # fmt: skip
     made.add_argument("--source", type=Path, help="folder that holds the package herglotz (default: of PYTHONPATH)")

@@ -89,6 +89,9 @@ def test_the_command_compares_and_exits(tmp_path, capsys):
     assert judge.main(compare) == 1
     assert "* worse: a: time × 5" in capsys.readouterr().out
     assert judge.main(["--compare", str(paths[1]), str(paths[0])]) == 0
+    rows = tmp_path / "rows.jsonl"  # fails if a run that goes on has to end before it is compared
+    rows.write_text(json.dumps(row(cpu_s=10.0)) + "\n", encoding="utf-8")
+    assert judge.main(["--compare", str(rows), str(paths[1])]) == 1
 
 
 def test_the_table_has_every_row(tmp_path):
