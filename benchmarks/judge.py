@@ -129,9 +129,10 @@ def opened(path: Path) -> dict[str, Any]:
     return {"commit": rows[0]["commit"] if rows else "none", "rows": rows}
 
 
-def compare(old: Path, new: Path, floor: float) -> int:
-    """Print what changed; 1 if a row is worse."""
+def compare(old: Path, new: Path, floor: float, asked: Callable[[str], bool] = bool) -> int:
+    """Print what changed in the rows that are asked for; 1 if one is worse."""
     pair = [opened(path) for path in (old, new)]
+    pair = [result | {"rows": [row for row in result["rows"] if asked(row["name"])]} for result in pair]
     text, worse = tables.compared(pair[0], pair[1], floor)
     print(text, end="")
     return int(worse > 0)
@@ -162,8 +163,11 @@ def arguments_of(argv: list[str] | None) -> argparse.Namespace:
 
 def main(argv: list[str] | None = None) -> int:
     arguments = arguments_of(argv)
+    asked = lambda name: (  # noqa: E731
+        any(word in name for word in arguments.only) and (not arguments.quick or name in catalogue.QUICK)
+    )
     if arguments.compare:
-        return compare(arguments.compare[0], arguments.compare[1], arguments.floor)
+        return compare(arguments.compare[0], arguments.compare[1], arguments.floor, asked)
     source = arguments.source.resolve() if arguments.source else None
     commit, out = commit_of(source), (arguments.out or RESULTS).resolve()
     name = f"judge_quick_{commit}" if arguments.quick else f"judge_{commit}"
@@ -172,9 +176,7 @@ def main(argv: list[str] | None = None) -> int:
     beside = path.with_suffix("") if arguments.out else ROOT / "runs" / "judge" / name
     beside.mkdir(parents=True, exist_ok=True)
     path.parent.mkdir(parents=True, exist_ok=True)
-    wanted = [row for row in catalogue.rows(arguments.count) if any(word in row.name for word in arguments.only)]
-    if arguments.quick:
-        wanted = [row for row in wanted if row.name in catalogue.QUICK]
+    wanted = [row for row in catalogue.rows(arguments.count) if asked(row.name)]
     rows = kept(beside / "rows.jsonl", commit)
     judge = Judge(arguments.prepared.resolve(), beside / "work", arguments.limit, environment(source))
     measure(wanted, rows, beside / "rows.jsonl", arguments.workers, judge.row, commit)

@@ -92,6 +92,9 @@ def test_the_command_compares_and_exits(tmp_path, capsys):
     rows = tmp_path / "rows.jsonl"  # fails if a run that goes on has to end before it is compared
     rows.write_text(json.dumps(row(cpu_s=10.0)) + "\n", encoding="utf-8")
     assert judge.main(["--compare", str(rows), str(paths[1])]) == 1
+    # fails if rows that nobody asks for count: a quick run has no others
+    assert judge.main(["--compare", str(rows), str(paths[1]), "--quick"]) == 0
+    assert judge.main(["--compare", str(rows), str(paths[1]), "--only", "b"]) == 0
 
 
 def test_the_table_has_every_row(tmp_path):
