@@ -8,7 +8,7 @@ ENV := OMP_NUM_THREADS=1 MPLBACKEND=Agg PYTHONDONTWRITEBYTECODE=
 # Each worker takes tests that stand side by side, so that few fixtures of a module are made twice.
 SPREAD := -n $(WORKERS) --dist worksteal
 
-.PHONY: demo docs tutorials lint check test test-anywhere test-pythons test-slow coverage mutants fuzz faults supply census clean
+.PHONY: demo docs tutorials judge lint check test test-anywhere test-pythons test-slow coverage mutants fuzz faults supply census clean
 
 # $(1): what is installed beside the package's own requirements
 define install
@@ -41,6 +41,11 @@ docs: .venv/site
 
 tutorials: .venv/runtime
 	$(ENV) $(PY) tools/pages.py
+
+# What the default fit is worth: cases, measured sets, laws that no dictionary holds, the zoo, many coordinates. It can be
+# stopped and goes on where it was; CONTRIBUTING.md has what its rows are, and how two tables are compared.
+judge: .venv/runtime
+	$(ENV) $(PY) benchmarks/judge.py --workers $(WORKERS)
 
 lint: .venv/installed
 	$(PY) -m ruff check .

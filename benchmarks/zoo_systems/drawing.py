@@ -63,7 +63,7 @@ def _error(of: ZooSystem, mechanism: Mechanism) -> float:
 
 def _attempt(rng: Generator, kind: str, seed: int, index: int) -> ZooSystem | None:
     mechanism, friction, driven = draw_mechanism(rng, kind)
-    rate = _log_uniform(rng, 8, 200)
+    rate = log_uniform(rng, 8, 200)
     count = int(rng.choice([1, 1, 1, 2, 3, 5, 10]))
     samples = int(np.clip(rng.uniform(4, 15) * rate, 90, 450))
     if count > 2:
@@ -71,13 +71,13 @@ def _attempt(rng: Generator, kind: str, seed: int, index: int) -> ZooSystem | No
     jitter = 0.25 if rng.random() < 0.2 else 0.0
     warmup = int(max(20, np.ceil(rate / 2)))
     rest = int(np.clip(4 * rate, 40, 250))
-    amplitude = _between(rng, 0.3, 1.0)
-    noise = 0.0 if rng.random() < 0.3 else _log_uniform(rng, 0.001, 0.03)
-    length_unit, time_unit = _log_uniform(rng, 1e-3, 10), 1 / _log_uniform(rng, 0.5, 30)
+    amplitude = between(rng, 0.3, 1.0)
+    noise = 0.0 if rng.random() < 0.3 else log_uniform(rng, 0.001, 0.03)
+    length_unit, time_unit = log_uniform(rng, 1e-3, 10), 1 / log_uniform(rng, 0.5, 30)
     drawn = []
     for starts, length in ((count, samples), (3, warmup + rest)):
-        t = _times(rng, length, PERIOD / rate, jitter)
-        u = _inputs(rng, starts, t, amplitude) if driven else np.zeros((starts, length))
+        t = sample_times(rng, length, PERIOD / rate, jitter)
+        u = draw_inputs(rng, starts, t, amplitude) if driven else np.zeros((starts, length))
         q0, v0 = _start(rng, mechanism, starts)
         with np.errstate(all="ignore"):
             truth = exact_motion(mechanism, q0, v0, t, u)[0]
@@ -106,34 +106,34 @@ def draw_mechanism(rng: Generator, kind: str) -> tuple[Mechanism, str, bool]:
     mechanism = Mechanism(kind, n.get(kind, 1), {})
     values = POTENTIALS[kind](rng, mechanism.n)
     if kind in ("chain", "pendulums"):
-        values |= {f"m{i}": _between(rng, 0.5, 2.0) for i in range(1, mechanism.n)}
+        values |= {f"m{i}": between(rng, 0.5, 2.0) for i in range(1, mechanism.n)}
     friction = "van der Pol" if "z0" in values else _choose(rng, FRICTIONS)
     friction = INSTEAD.get((kind, friction), friction)
     for i in range(mechanism.n):
         values |= _friction(rng, friction, i, kind == "axis")
     driven = kind == "axis" or rng.random() < 0.35
     if driven:
-        values["b"] = _between(rng, 0.5, 1.5)
+        values["b"] = between(rng, 0.5, 1.5)
     return Mechanism(kind, mechanism.n, values), friction, driven
 
 
-def _between(rng: Generator, low: float, high: float) -> float:
+def between(rng: Generator, low: float, high: float) -> float:
     return float(rng.uniform(low, high))
 
 
 def _pendulum(rng: Generator, _: int) -> Values:
     values: Values = {"g": 1.0}
     if rng.random() < 0.3:
-        values["g2"] = _between(rng, -0.4, 0.4)
+        values["g2"] = between(rng, -0.4, 0.4)
     if rng.random() < 0.2:
-        values["o0"] = _between(rng, 0.1, 0.3)
+        values["o0"] = between(rng, 0.1, 0.3)
     return values
 
 
 def _cart_pole(rng: Generator, _: int) -> Values:
-    values: Values = {"m": _between(rng, 0.1, 0.4), "r": _between(rng, 0.5, 1.5), "g": 1.0}
+    values: Values = {"m": between(rng, 0.1, 0.4), "r": between(rng, 0.5, 1.5), "g": 1.0}
     if rng.random() < 0.5:
-        values["k"] = _between(rng, 0.2, 1.0)
+        values["k"] = between(rng, 0.2, 1.0)
     return values
 
 
@@ -141,12 +141,12 @@ def _spring(rng: Generator, _: int) -> Values:
     """Linear, hardening, lopsided, double well, or van der Pol's oscillator."""
     shape = rng.choice(["linear", "hardening", "lopsided", "double well", "van der Pol"], p=[0.15, 0.4, 0.2, 0.1, 0.15])
     if shape == "van der Pol":
-        return {"k": 1.0, "z0": _log_uniform(rng, 0.2, 2.0)}
+        return {"k": 1.0, "z0": log_uniform(rng, 0.2, 2.0)}
     if shape == "double well":
-        return {"k": -1.0, "k3": _between(rng, 0.5, 2.0)}
-    values: Values = {"k": _between(rng, 0.3, 1.5)}
+        return {"k": -1.0, "k3": between(rng, 0.5, 2.0)}
+    values: Values = {"k": between(rng, 0.3, 1.5)}
     if shape != "linear":
-        values["k3"] = _log_uniform(rng, 0.3, 10.0)
+        values["k3"] = log_uniform(rng, 0.3, 10.0)
     if shape == "lopsided":
         values["k2"] = float(rng.choice([-1, 1]) * rng.uniform(0.2, 0.8))
     return values
@@ -156,10 +156,10 @@ def _spring(rng: Generator, _: int) -> Values:
 POTENTIALS: dict[str, Callable[[Generator, int], Values]] = {
     "spring": _spring,
     "pendulum": _pendulum,
-    "axis": lambda rng, _: {"o0": _between(rng, -0.05, 0.05)},
-    "chain": lambda rng, n: {f"k{j}": _between(rng, 0.3, 1.5) for j in range(n + 1)} | {"k3": _between(rng, 0.0, 2.0)},
-    "pendulums": lambda rng, n: {f"g{i}": _between(rng, 0.7, 1.3) for i in range(n)} | {"k": _between(rng, 0.1, 0.6)},
-    "double_pendulum": lambda rng, _: {"m": _between(rng, 0.3, 1.0), "r": _between(rng, 0.6, 1.2), "g": 1.0},
+    "axis": lambda rng, _: {"o0": between(rng, -0.05, 0.05)},
+    "chain": lambda rng, n: {f"k{j}": between(rng, 0.3, 1.5) for j in range(n + 1)} | {"k3": between(rng, 0.0, 2.0)},
+    "pendulums": lambda rng, n: {f"g{i}": between(rng, 0.7, 1.3) for i in range(n)} | {"k": between(rng, 0.1, 0.6)},
+    "double_pendulum": lambda rng, _: {"m": between(rng, 0.3, 1.0), "r": between(rng, 0.6, 1.2), "g": 1.0},
     "cart_pole": _cart_pole,
 }
 
@@ -167,14 +167,14 @@ POTENTIALS: dict[str, Callable[[Generator, int], Values]] = {
 def _friction(rng: Generator, friction: str, i: int, axis: bool) -> Values:
     values: Values = {}
     if friction in ("viscous", "dry", "stribeck", "quadratic"):
-        values[f"d{i}"] = _log_uniform(rng, 0.2, 0.8) if axis else _log_uniform(rng, 0.01, 0.3)
+        values[f"d{i}"] = log_uniform(rng, 0.2, 0.8) if axis else log_uniform(rng, 0.01, 0.3)
     if friction in ("dry", "stribeck"):
-        values[f"c{i}"] = _between(rng, 0.05, 0.2) if axis else _log_uniform(rng, 0.01, 0.06)
+        values[f"c{i}"] = between(rng, 0.05, 0.2) if axis else log_uniform(rng, 0.01, 0.06)
     if friction == "stribeck":
-        values[f"e{i}"] = float(values[f"c{i}"]) * _between(rng, 0.3, 1.0)
-        values[f"w{i}"] = _between(rng, 0.05, 0.3)
+        values[f"e{i}"] = float(values[f"c{i}"]) * between(rng, 0.3, 1.0)
+        values[f"w{i}"] = between(rng, 0.05, 0.3)
     if friction == "quadratic":
-        values[f"a{i}"] = _log_uniform(rng, 0.03, 0.4)
+        values[f"a{i}"] = log_uniform(rng, 0.03, 0.4)
     return values
 
 
@@ -185,12 +185,12 @@ def _start(rng: Generator, of: Mechanism, count: int) -> tuple[Array, Array]:
     return reach * q, 0.6 * reach * v
 
 
-def _times(rng: Generator, samples: int, h: float, jitter: float) -> Array:
+def sample_times(rng: Generator, samples: int, h: float, jitter: float) -> Array:
     steps = h * (1 + jitter * rng.uniform(-1, 1, samples - 1))
     return np.concatenate([[0.0], np.cumsum(steps)])
 
 
-def _inputs(rng: Generator, count: int, t: Array, amplitude: float) -> Array:
+def draw_inputs(rng: Generator, count: int, t: Array, amplitude: float) -> Array:
     """(B, N) held inputs: three sines, or a telegraph signal that switches about twice a period."""
     if rng.random() < 0.3:
         level = rng.choice([-1.0, 1.0], (count, len(t)))
@@ -206,5 +206,5 @@ def _choose(rng: Generator, weights: dict[str, float]) -> str:
     return list(weights)[int(rng.choice(len(p), p=p / p.sum()))]
 
 
-def _log_uniform(rng: Generator, low: float, high: float) -> float:
+def log_uniform(rng: Generator, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))

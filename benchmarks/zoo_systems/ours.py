@@ -29,6 +29,7 @@ class OurFit:
     said: str  # why the fit called itself a failure; empty if it did not
     cpu: float  # s of processor time
     metrics: dict[str, Any]
+    code: int | None = None  # exit code; None: out of time
 
 
 def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
@@ -39,7 +40,7 @@ def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
     code, message, cpu = _run_fit(folder, limit)
     said = "" if code == 0 else "too slow" if code is None else f"exit code {code}: {message}"
     if not (folder / "run" / "metrics.json").is_file():
-        return OurFit(None, said or "no run", cpu, {})
+        return OurFit(None, said or "no run", cpu, {}, code)
     run = load_run(folder / "run")
     said = said or complaint(run.metrics)
     found = {"later": _later(of, run)}
@@ -50,7 +51,7 @@ def fit_ours(of: ZooSystem, folder: Path, limit: float) -> OurFit:
         found["unseen"] = test.prediction.numpy()[free] / unit(of), thinned.q.numpy()[free] / unit(of)
     except Exception as error:
         said, found["unseen"] = said or f"predict: {error}", (np.full((1, of.mechanism.n), np.nan),) * 2
-    return OurFit(found, said, cpu, run.metrics)
+    return OurFit(found, said, cpu, run.metrics, code)
 
 
 def complaint(metrics: dict[str, Any]) -> str:

@@ -41,6 +41,7 @@ class ZooSystem:
     warmup: int  # leading samples of a test recording that the start state is read from
     length_unit: float  # what natural length and time are in the files
     time_unit: float
+    attainable: float | None = None  # of an open system: error over the noise of its true equation from the warm-up
 
     @property
     def name(self) -> str:

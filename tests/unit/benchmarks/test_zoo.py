@@ -188,7 +188,7 @@ def test_the_report_counts(pendulum):
     row |= {"ours": {**numbers, "said": ""}, "sindy": numbers, "known": numbers}
     rows = [row, row | {"outcome": SILENT, "ahead_of_sindy": False}]
     assert shares(rows) == {AT: 0.5, USE: 0.0, SAID: 0.0, SILENT: 0.5, "ahead of SINDy": 0.5}
-    assert "**failed silently**" in report(rows, 1, 60.0)
+    assert "**failed silently**" in report(rows, "The zoo", "--draw 1")
 
 
 def test_the_command_prints_json(pendulum, tmp_path, monkeypatch, capsys):
@@ -212,7 +212,7 @@ def test_what_was_not_reached_is_null_in_json(pendulum):
     json.dumps(row, allow_nan=False)
     assert row["ours"]["score"] is None
     assert row["known"]["score"] == max(row["known"][f"score_{part}"] for part in ("later", "unseen"))
-    assert "too slow" in report([row], 1, 150.0)
+    assert "too slow" in report([row], "The zoo", "--draw 1")
     assert "not reached" in line(row)
 
 
