@@ -93,7 +93,6 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     theta, x = problem.parameters.get(), known[problem.grid.start_sample]
     problem.guess_from_states(known)
     cost, A, _ = problem.normal_equations(problem.pack(theta, x[:, : problem.d]))
-    A = dense(A)
     beat()
     if not math.isfinite(float(cost)):
         return None
@@ -112,7 +111,7 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     Z = ahead.slopes_at_samples(theta, path) / spread[:, None]
     q = ahead.grid.at_samples(path.x[..., : problem.n])
     inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
-    return _summary(A.double(), Z.double(), problem, runs, absent, inside)
+    return _summary(dense(A).double(), Z.double(), problem, runs, absent, inside)
 
 
 @dataclass(frozen=True)

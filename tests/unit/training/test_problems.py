@@ -417,43 +417,26 @@ def test_sensitivities_are_made_once(monkeypatch):
     assert len(made) == 2
 
 
-class Weighted(ShootingProblem):
-    """A shooting problem that can leave samples out."""
-
-    weights: torch.Tensor
-
-    def _residuals(self, x):
-        fit, joints = super()._residuals(x)
-        return fit * self.weights[:, None], joints
-
-    def sensitivities(self, theta, path, *, held=False):
-        Z = super().sensitivities(theta, path, held=held)
-        flat = Z.flatten(0, 1).clone()
-        flat[self.grid.node] = flat[self.grid.node] * self.weights[:, None, None]
-        return flat.reshape(Z.shape)
-
-
 def test_held_out_errors_are_those_of_a_refit():
     # fails if the block formula is wrong: on a problem close to linear, refitting without the block must agree
     data = simulate(scene("damped_pendulum"), trajectories=2, steps=40, h=0.2, noise=0.005, seed=1)
     model = ContactLagrangian(ModelConfig(rate=0.2, potential_width=0, scale=(2.5,), speed=(2.0,)))
 
-    def fitted(weights):
-        problem = Weighted(model, data, segment_grid(data, 40, 0.3), sigma=0.005, prior=prior_of(model, data))
-        problem.weights = weights
+    def fitted(used):
+        grid = segment_grid(data, 40, 0.3)
+        problem = ShootingProblem(model, data, grid, sigma=0.005, prior=prior_of(model, data), used=used)
         starts = problem.grid.start_sample
         v = (data.q[starts + 1] - data.q[starts]) / 0.2
         result = levenberg_marquardt(problem, problem.pack(problem.parameters.get(), problem.states(data.q[starts], v)))
         return problem, result.x
 
-    everything = torch.ones(data.samples, dtype=torch.float64)
-    problem, x = fitted(everything)
+    problem, x = fitted(torch.ones(data.samples, dtype=torch.bool))
     _, A, _ = problem.normal_equations(x)
     assert problem.path is not None
     predicted = held_out_errors(problem, problem.path, problem.unpack(x)[0], A)
     fold = torch.cat([torch.arange(41) * 5 // 41] * 2)
     for k in (2, 4):
-        refit, y = fitted(torch.where(fold == k, 0.0, 1.0).double())
+        refit, y = fitted(fold != k)
         path = refit.solve(y)
         assert path is not None
         error = refit.misfit(path)[fold == k].square().mean().sqrt()
