@@ -24,7 +24,9 @@ from herglotz.training.config import FitConfig
 from herglotz.training.dictionary_search import ROUNDING
 from herglotz.training.distributed import is_first
 from herglotz.training.equation import Equation, equation_of
+from herglotz.training.equation_notes import notes_of
 from herglotz.training.evaluate import evaluate
+from herglotz.training.identifiability import joint_of
 from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
@@ -143,13 +145,11 @@ def _equation(run: Run, plan: Plan, least: float) -> Equation:
 
     They are those of data that are known no better than to `least`, in units of q: what moves them by less is rounding.
     """
-    covariance = None
+    joint = None
     if plan.network == "none" and run.metrics["follows_data"]:
         with suppress(InputError):  # whole trajectories cannot be followed: no deviations
-            posterior = laplace(run)
-            rounding = max(1.0, least / (posterior.sigma * posterior.inflation)) ** 2
-            covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)] * rounding
-    return equation_of(run, covariance)
+            joint = joint_of(laplace(run), least)
+    return equation_of(run, joint, notes_of(run))
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:
