@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from torch import Tensor
 
 from herglotz.data.trajectories import GAP
+from herglotz.data.units import common_unit, size
 from herglotz.errors import InputError
 from herglotz.training.baseline import JITTER
 from herglotz.training.equation_terms import is_formula, newtonian
@@ -23,11 +25,17 @@ BETWEEN = {
     "first": "straight between the samples",
     "smooth": "polynomials between the samples",
 }
-# The step of order 2 of masses of their own, whose friction takes the velocity and the position of the middle.
-LEAPFROG = (
-    "step it as the model does: m v = (p + (h/2) f(q, v)) exp(−γ h/2), q₊ = q + h v, p₊ = m v exp(−γ h/2) + "
-    "(h/2) f(q₊, v), with {rate} and f the right side without −γ m v"
+# A model's own step, for where exact integration is another motion (`models/terms.py`, `models/order4.py`).
+RULE = (
+    "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, s₊ = s + L_d with {parts}, "
+    "c = exp(h ∂L/∂s) and L_d = {L_d}; K, ∂L/∂s and f are taken at q̄ = (q + q₊)/2 and v = (q₊ − q)/h{dry}"
 )
+OF_ORDER = {
+    2: "(c − 1)(s − (h/2) V(q)) + √c h K − (h/2)(V(q) + V(q₊))",
+    4: "(c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − (h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), "
+    "e = K_q − V_q − K_qv v − γ K_v, M = K_vv",
+}
+DRY = ", but dry friction, of q and v, acts by h in place of h/2 in the first of them, and not in the second"
 
 
 def notes_of(run: FittedRun) -> tuple[str, ...]:
@@ -61,25 +69,38 @@ def _sensors(run: FittedRun) -> str:
 
 def _steps(run: FittedRun) -> str:
     """The model's step and rule, and by how much the exact motion of the equation departs from them."""
-    unit = "" if run.data.time_unit == "1" else f" {run.data.time_unit}"
-    what = f"the model's steps are {run.h:.4g}{unit}, its rule of order {run.model.config.order}"
-    ratio = departure(run)
-    if ratio is None:
+    time, model = "" if run.data.time_unit == "1" else f" {run.data.time_unit}", run.model
+    what = f"the model's steps are {run.h:.7g}{time}, its rule of order {model.config.order}"
+    found = departure(run)
+    if found is None:
         return what
-    told = f"{what}; integrated exactly, the equation departs from it by {ratio:.2g} times what it misses the data by"
-    if ratio <= 1:
+    unit = common_unit(run.data.units)
+    by = f"{size(found.moved, unit, bool(run.data.degrees))}, " if unit or run.data.dof == 1 else ""
+    ratio = f"{found.moved / found.missed:.2g} times what it misses the data by"
+    told = f"{what}; integrated exactly, the equation departs from it by {by}{ratio}"
+    if found.moved <= found.missed:
         return told
-    if not newtonian(run.model) or run.model.config.order > 2:
-        return f"{told}: export it to step it (herglotz export)"
-    rate = getattr(run.model.damping, "rate", None)
-    return f"{told}: {LEAPFROG.format(rate=f'γ = {plain(0.0 if rate is None else float(rate.detach()), DIGITS)}')}"
+    parts = "L = K − V + s ∂L/∂s, f the forces"
+    if newtonian(model):
+        rate = 0.0 if model.damping is None else float(model.damping.rate.detach())  # type: ignore[operator]
+        loads = ", constants on angles among them" if any(text.startswith("load") for text in model.config.drag) else ""
+        parts = f"L = K − V − γ s, γ = {plain(rate, DIGITS)}, V of the forces by position, f the others without −γ m v"
+        parts += loads
+    dry = DRY if model.friction is not None and model.friction.sticking else ""
+    return f"{told}: {RULE.format(parts=parts, L_d=OF_ORDER[model.config.order], dry=dry)}"
 
 
-def departure(run: FittedRun) -> float | None:
-    """RMS of what the model's steps miss of the exact motion, over that of what the model misses of the data.
+class Departure(NamedTuple):
+    """RMS over all coordinates, each over its balance."""
 
-    By free runs of all recordings, with the model's steps and with halved ones. None where one breaks off, the model
-    meets the data exactly, or is more than its equation.
+    moved: float  # by which the model's steps miss the exact motion of its equation
+    missed: float  # by which the model misses the data
+
+
+def departure(run: FittedRun) -> Departure | None:
+    """What the model's steps miss of the exact motion, by free runs of all recordings with these and with halved steps.
+
+    None where one breaks off, the model meets the data exactly, or is more than its equation.
     """
     data = run.data.unwrapped()
     if not is_formula(run.model):
@@ -89,9 +110,9 @@ def departure(run: FittedRun) -> float | None:
         whole, halved = (free_run(run, max_step) for max_step in (longest, longest / 2))
     except InputError:
         return None
-    missed, moved = ((x / data.balance).square().mean().sqrt() for x in (whole - data.q, HALVED * (halved - whole)))
-    ratio = float(moved / missed)
-    return ratio if math.isfinite(ratio) else None
+    changes = whole - data.q, HALVED * (halved - whole)
+    missed, moved = (float((x / data.balance).square().mean().sqrt()) for x in changes)
+    return Departure(moved, missed) if missed > 0 and math.isfinite(moved) and math.isfinite(missed) else None
 
 
 def longest_step(run: FittedRun) -> float:

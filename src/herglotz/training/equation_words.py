@@ -123,4 +123,6 @@ def number(value: float, deviation: float | None, alone: float | None, digits: i
     if deviation is None or not math.isfinite(deviation):
         return text
     last = round(deviation * 10.0**places)
-    return f"{text}({last})" if 0 < last < LAST else text if last == 0 else f"{text}(±{plain(float(f'{deviation:.2g}'))})"
+    if last >= LAST:
+        return f"{text}(±{plain(float(f'{deviation:.2g}'))})"
+    return f"{text}({last})" if last else text

@@ -34,12 +34,14 @@ class Reader:
         return found
 
     def sum(self, closed=""):
-        found, sign = "", next((s for mark, s in SIGNS.items() if self.take(mark)), "")
-        while True:
-            found += sign + self.product(closed)
+        return "".join(self.terms(closed))
+
+    def terms(self, closed=""):
+        found, sign = [], next((s for mark, s in SIGNS.items() if self.take(mark)), "")
+        while sign is not None:
+            found.append(sign + self.product(closed))
             sign = next((s for mark, s in SIGNS.items() if self.take(mark)), None)
-            if sign is None:
-                return found
+        return found
 
     def product(self, closed):
         found = []
@@ -87,12 +89,14 @@ class Reader:
 
 
 class Printed:
-    """What a printed equation says: masses, forces and L as functions of q, v, s, u, and the words below it."""
+    """What a printed equation says: masses, forces and L as functions of q, v, s, u, and the words below it.
+
+    Coordinates stand first, (n, ...): what follows are recordings, and points that differences need.
+    """
 
     def __init__(self, text, names, inputs=()):
-        self.names, n = names, len(names)
-        joined, lines = text.replace("\n    ", " ").split("\n"), {}
-        self.words = ""
+        self.names, self.n = names, len(names)
+        joined, lines, self.words = text.replace("\n    ", " ").split("\n"), {}, ""
         for line in joined:
             left, _, right = line.partition(" = ")
             if re.fullmatch(r"L|force on .*|.*″", left) and left not in lines:
@@ -105,66 +109,148 @@ class Printed:
         if "L" in lines:
             symbols["s"] = "s"
         for distance in re.findall(r"(\S+) = √\(", self.words):
-            symbols[distance] = f"np.sqrt({'+'.join(f'q[{i}]**2' for i in range(n))})"
-        self.masses, self.forces, self.factors, self.L = [1.0] * n, ["0.0"] * n, ["0.0"] * n, None
+            symbols[distance] = f"np.sqrt({'+'.join(f'q[{i}]**2' for i in range(self.n))})"
+        self.mass, forces, self.L = np.ones(self.n), ["0.0"] * self.n, None
+        of_q = list(forces)
         for left, right in lines.items():
             code = Reader(right, symbols)
-            found = code.sum()
+            terms = code.terms()
+            found = "".join(terms)
             assert code.at == len(right), f"not read: {right[code.at :]!r}"
             if left == "L":
                 self.L = function(found, "q, v, s")
                 continue
             i = next(k for k, name in enumerate(names) if re.search(rf"(^| ){re.escape(name)}″?$", left))
-            self.forces[i] = found
-            if "″" in left and (match := NUMBER.match(left)) and match[0] != names[i]:
-                self.masses[i] = float(match[1] + (match[2] or ""))
+            forces[i] = found
+            beside = "[uv]" if "constants on angles among them" not in self.words else r"[uv]|^[-+]?[\d.]+(e[-+]?\d+)?$"
+            of_q[i] = "".join(term for term in terms if not re.search(beside, term)) or "0.0"
+            if (match := NUMBER.match(left)) and "″" in left:
+                self.mass[i] = float(match[1] + (match[2] or ""))
         self.held = "stays 0" in self.words
         self.steps = float(re.search(r"steps are ([\d.e-]+)", self.words)[1]) if "step it as" in self.words else None
-        self.damps = float(re.search(r"γ = (\S+)", self.words)[1].replace("−", "-")) if self.steps else 0.0
-        self.factors = [grip(force, i) for i, force in enumerate(self.forces)] if self.held else ["0.0"] * n
-        smooth = [re.sub(r"sgn\(v\[\d+\]\)", "0.0", force) if self.held else force for force in self.forces]
-        self.force = function(f"[{', '.join(smooth)}]", "q, v, u")
-        self.grip = function(f"[{', '.join(self.factors)}]", "q, v, u")
+        self.order = int(re.search(r"rule of order (\d)", self.words)[1])
+        rate = re.search(r"γ = (−?[\d.e-]+), V", self.words)
+        self.damps = 0.0 if rate is None else float(rate[1].replace("−", "-"))
+        self._of_q = function(f"[{', '.join(of_q)}]", "q")
+        slips = [re.sub(r"sgn\(v\[\d+\]\)", "0.0", force) if self.held else force for force in forces]
+        self._force = function(f"[{', '.join(slips)}]", "q, v, u")
+        self._grip = function(
+            f"[{', '.join(grip(x, i) if self.held else '0.0' for i, x in enumerate(forces))}]", "q, v, u"
+        )
+
+    def force(self, q, v, u):
+        """All forces but set-valued friction, (n, ...)."""
+        return stacked(self._force(q, v, u), q)
+
+    def grip(self, q, v, u):
+        """What set-valued friction can hold, (n, ...)."""
+        return np.maximum(stacked(self._grip(q, v, u), q), 0.0)
 
     def acceleration(self, q, v, s, u):
-        """(n, B) and s′ (B,)."""
-        force = np.stack(np.broadcast_arrays(*self.force(q, v, u), q[0])[:-1])
+        """The second derivative of q, (n, ...), and s′, (...)."""
+        force = self.force(q, v, u)
         if self.L is None:
-            return force / np.array(self.masses)[:, None], np.zeros_like(s)
-        _, of_v, by_s, mass = self.slopes(q, v, s)
-        of_q, tiny = self.by_q(q, v, s), 1e-5
-        ahead, behind = (self.slopes(q + d * v, v, s)[1] for d in (tiny, -tiny))
-        rate = self.L(q, v, s)
-        by_time = (ahead - behind) / (2 * tiny) + (self.slopes(q, v, s + 0.5)[1] - self.slopes(q, v, s - 0.5)[1]) * rate
-        push = of_q + by_s * of_v + force - by_time
-        return np.linalg.solve(np.moveaxis(mass, -1, 0), push.T[..., None])[..., 0].T, rate
+            return force / self.masses(q), np.zeros_like(s)
+        tiny = 1e-5
+        near = np.stack([q, q + tiny * v, q - tiny * v, q, q], 1)
+        of_v, by_s, mass = self.slopes(
+            near, spread(v, 5), s + np.array([0, 0, 0, 0.5, -0.5]).reshape(5, *(1,) * s.ndim)
+        )
+        of_q, rate = differences(lambda x: self.L(x, v[:, None], s), q), self.L(q, v, s)
+        by_time = (of_v[:, 1] - of_v[:, 2]) / (2 * tiny) + (of_v[:, 3] - of_v[:, 4]) * rate
+        return solved(mass[:, :, 0], of_q + by_s[0] * of_v[:, 0] + force - by_time), rate
 
     def slopes(self, q, v, s):
-        """L, ∂L/∂v and ∂L/∂s, and ∂²L/∂v²: L is quadratic in v and linear in s, so that differences are exact."""
-        n, unit = len(q), np.eye(len(q))[:, :, None]
-        of_v = np.stack([(self.L(q, v + e, s) - self.L(q, v - e, s)) / 2 for e in unit])
-        mass = np.empty((n, n, q.shape[1]))
-        for i in range(n):
-            for j in range(n):
-                a, b = unit[i], unit[j]
-                four = [self.L(q, v + x * a + y * b, s) for x, y in ((1, 1), (1, -1), (-1, 1), (-1, -1))]
-                mass[i, j] = (four[0] - four[1] - four[2] + four[3]) / 4
-        return self.L(q, v, s), of_v, self.L(q, v, s + 0.5) - self.L(q, v, s - 0.5), mass
+        """∂L/∂v, ∂L/∂s and ∂²L/∂v²: L is quadratic in v and linear in s, so that differences are exact."""
+        n, unit = self.n, np.eye(self.n)
+        moves = [unit[i] * x + unit[j] * y for i in range(n) for j in range(n) for x in (1, -1) for y in (1, -1)]
+        moves = np.array([*unit, *-unit, *moves]).T.reshape(n, -1, *(1,) * (q.ndim - 1))
+        L = self.L(q[:, None], v[:, None] + moves, s)
+        L = np.broadcast_to(L, (moves.shape[1], *np.broadcast_shapes(q.shape[1:], v.shape[1:])))
+        of_v, four = (L[:n] - L[n : 2 * n]) / 2, L[2 * n :].reshape(n, n, 4, *L.shape[1:])
+        mass = (four[:, :, 0] - four[:, :, 1] - four[:, :, 2] + four[:, :, 3]) / 4
+        return of_v, self.L(q, v, s + 0.5) - self.L(q, v, s - 0.5), mass
 
-    def by_q(self, q, v, s):
-        """∂L/∂q by central differences of order 4."""
-        tiny, found = 1e-3, []
-        for e in np.eye(len(q))[:, :, None]:
-            one, two = (self.L(q + k * tiny * e, v, s) - self.L(q - k * tiny * e, v, s) for k in (1, 2))
-            found.append((8 * one - two) / (12 * tiny))
-        return np.stack(found)
+    def masses(self, q):
+        """The masses of lines, shaped like q."""
+        return self.mass.reshape(-1, *(1,) * (q.ndim - 1))
+
+    def momentum(self, q, v, s):
+        """The p of velocities v, (n, ...)."""
+        return self.masses(q) * v if self.L is None else self.slopes(q, v, s)[0]
 
     def velocity(self, q, p, s):
-        """The v of momenta p, (n, B)."""
+        """The v of momenta p, (n, ...)."""
+        return p / self.masses(q) if self.L is None else self.by_mass(q, p - self.momentum(q, 0 * q, s))
+
+    def by_mass(self, q, e):
+        """M⁻¹ e, (n, ...)."""
+        return e / self.masses(q) if self.L is None else solved(self.slopes(q, 0 * q, 0 * q[0])[2], e)
+
+    def potential(self, q):
+        """V: what L is at rest, or the integral of the forces by position along a straight line."""
+        if self.L is not None:
+            return -self.L(q, 0 * q, 0 * q[0]) + 0 * q[0]
+        x, w = NODES
+        path = q[:, None] * ((x + 1) / 2).reshape(-1, *(1,) * (q.ndim - 1))
+        return -np.tensordot(w / 2, (self.at_rest(path) * q[:, None]).sum(0), 1)
+
+    def at_rest(self, q):
+        """The forces by position, (n, ...)."""
+        return stacked(self._of_q(q), q)
+
+    def kinetic(self, q, v):
+        """K: what of L is quadratic or linear in v."""
         if self.L is None:
-            return p / np.array(self.masses)[:, None]
-        _, of_v, _, mass = self.slopes(q, 0 * q, s)
-        return np.linalg.solve(np.moveaxis(mass, -1, 0), (p - of_v).T[..., None])[..., 0].T
+            return (self.masses(q) * v * v).sum(0) / 2
+        return self.L(q, v, 0 * q[0]) - self.L(q, 0 * v, 0 * q[0])
+
+    def by_s(self, q, v, s):
+        """∂L/∂s."""
+        return -self.damps + 0 * s if self.L is None else self.L(q, v, s + 0.5) - self.L(q, v, s - 0.5)
+
+    def beside(self, q, v, u):
+        """f of the rule: the forces that are not those of L."""
+        if self.L is not None:
+            return self.force(q, v, u)
+        return self.force(q, v, u) - self.at_rest(q) + self.damps * self.masses(q) * v
+
+    def action(self, q0, q1, s, h):
+        """L_d of the text, of order 2 or 4."""
+        middle, v = (q0 + q1) / 2, (q1 - q0) / h
+        rate = self.by_s(middle, v, s)
+        c, V0, V1, K = np.exp(h * rate), self.potential(q0), self.potential(q1), self.kinetic(middle, v)
+        if self.order == 2:
+            return (c - 1) * (s - h / 2 * V0) + np.sqrt(c) * h * K - h / 2 * (V0 + V1)
+        tiny = 1e-3
+        ahead, behind = (self.kinetic(middle + d * v, v) for d in (tiny, -tiny))
+        K_q, K_qq = (ahead - behind) / (2 * tiny), (ahead - 2 * K + behind) / tiny**2
+        of_v = [self.momentum(middle + d * v, v, 0 * s) for d in (0.0, tiny, -tiny)]
+        by_q = differences(lambda x: self.kinetic(x, v[:, None]) - self.potential(x), middle)
+        e = by_q - (of_v[1] - of_v[2]) / (2 * tiny) + rate * of_v[0]
+        bend = K_qq - 2 * rate * K_q + rate**2 * K - (e * self.by_mass(middle, e)).sum(0)
+        simpson = h / 6 * (c * V0 + 4 * np.sqrt(c) * self.potential(middle) + V1)
+        return (c - 1) * s + np.sqrt(c) * (h * K + h**3 / 24 * bend) - simpson
+
+
+TINY = 1e-5
+NODES = np.polynomial.legendre.leggauss(16)
+
+
+def stacked(parts, like):
+    """Numbers and arrays as one array that is shaped like another."""
+    return np.stack([part + 0 * like[0] for part in parts])
+
+
+def spread(x, count):
+    return np.repeat(x[:, None], count, 1)
+
+
+def solved(matrix, b):
+    """M⁻¹ b of matrices (n, n, ...) and vectors (n, ...)."""
+    return np.moveaxis(
+        np.linalg.solve(np.moveaxis(matrix, (0, 1), (-2, -1)), np.moveaxis(b, 0, -1)[..., None])[..., 0], -1, 0
+    )
 
 
 def grip(force, i):
@@ -178,10 +264,10 @@ def function(code, arguments):
 
 
 def integrated(printed, t, q, p, s, u, parts=20):
-    """Positions (B, N, n) at the times t (B, N) from q, p (B, n), s (B,), with inputs u (t, k) → (m, B) or None."""
+    """Positions (B, N, n) at the times t (B, N) from q, p (B, n), s (B,), with inputs u(k, share), (m, B)."""
     q, s = q.T.copy(), s.copy()
     v, out = printed.velocity(q, p.T, s), [q.copy()]
-    moves = moreau if printed.held else leapfrog if printed.steps else runge_kutta
+    moves = discrete if printed.steps else moreau if printed.held else runge_kutta
     for k in range(t.shape[1] - 1):
         whole = t[:, k + 1] - t[:, k]
         count = max(1, round(float(np.median(whole)) / printed.steps)) if printed.steps else parts
@@ -190,7 +276,7 @@ def integrated(printed, t, q, p, s, u, parts=20):
             now = lambda share, part=part, count=count, k=k: u(k, (part + share) / count)  # noqa: E731
             q, v, s = moves(printed, q, v, s, h, now)
         if not np.abs(q).max() < FAR:
-            return np.full((t.shape[0], t.shape[1], len(q)), np.inf)
+            return np.full((*t.shape, len(q)), np.inf)
         out.append(q.copy())
     return np.stack(out, 1).transpose(2, 1, 0)
 
@@ -209,26 +295,45 @@ def runge_kutta(printed, q, v, s, h, u):
 
 def moreau(printed, q, v, s, h, u):
     """Half a drift, the other forces, dry friction up to rest, half a drift."""
-    q, mass = q + h / 2 * v, np.array(printed.masses)[:, None]
+    q = q + h / 2 * v
     middle = v + h / 2 * printed.acceleration(q, v, s, u(0.5))[0]
     v = v + h * printed.acceleration(q, middle, s, u(0.5))[0]
-    held = np.maximum(np.stack(np.broadcast_arrays(*printed.grip(q, v, u(0.5)), q[0])[:-1]), 0.0) * h / mass
-    v = np.sign(v) * np.maximum(np.abs(v) - held, 0.0)
+    v = np.sign(v) * np.maximum(np.abs(v) - h * printed.grip(q, v, u(0.5)) / printed.masses(q), 0.0)
     return q + h / 2 * v, v, s
 
 
-def leapfrog(printed, q, v, s, h, u):
-    """As the text says: m v = (p + (h/2) f(q, v)) exp(−γ h/2), q₊ = q + h v, p₊ = m v exp(−γ h/2) + (h/2) f(q₊, v)."""
-    mass, decay, x = np.array(printed.masses)[:, None], np.exp(-printed.damps * h / 2), v
+def discrete(printed, q, v, s, h, u):
+    """One step by the rule that the text has, from q, v = M⁻¹ p and s: L_d is differenced."""
+    p, q1, end = printed.momentum(q, v, s), q + h * v, u(0.5)
 
-    def force(at, middle, x):
-        """Products of q and v are those in the middle, what depends on q alone is at the end of the step."""
-        friction = acceleration(middle, x) - acceleration(middle, 0 * x) + printed.damps * x
-        return mass * (acceleration(at, 0 * x) + friction)
+    def forces(q1):
+        return h / 2 * printed.beside((q + q1) / 2, (q1 - q) / h, end)
 
-    def acceleration(q, v):
-        return printed.acceleration(q, v, s, u(0.5))[0]
+    def residual(q1, way):
+        c, v = np.exp(h * printed.by_s((q + q1) / 2, (q1 - q) / h, s)), (q1 - q) / h
+        held = h * printed.grip(q, v, end) * way
+        return c * (p + forces(q1) - held) + differences(lambda x: printed.action(x, q1[:, None], s, h), q)
 
-    for _ in range(60):
-        x = (v + h / 2 * force(q, q + h / 2 * x, x) / mass) * decay
-    return q + h * x, x * decay + h / 2 * force(q + h * x, q + h / 2 * x, x) / mass, s
+    push = residual(q, 0.0)
+    way = np.sign(push)
+    rests = np.abs(push) <= np.abs(push - residual(q, way))  # friction at rest holds so much
+    assert len(q) == 1 or not rests.any(), "one coordinate alone rests"
+    for _ in range(6):
+        ahead, behind = (
+            np.stack([residual(q1 + d * e, way) for e in np.eye(len(q))[:, :, None]], 1) for d in (TINY, -TINY)
+        )
+        q1 = q1 - solved((ahead - behind) / (2 * TINY), residual(q1, way))
+    q1 = np.where(rests, q, q1)
+    p1 = differences(lambda x: printed.action(q[:, None], x, s, h), q1) + forces(q1)
+    s1 = s + printed.action(q, q1, s, h)
+    return q1, printed.velocity(q1, p1, s1), s1
+
+
+def differences(f, x, tiny=1e-3):
+    """∂f/∂x by central differences of order 6; f is given all points at once, (n, 6n, ...)."""
+    n = len(x)
+    moves = tiny * np.array([k * e for e in np.eye(n) for k in (1, 2, 3, -1, -2, -3)]).T
+    values = f(x[:, None] + moves.reshape(n, -1, *(1,) * (x.ndim - 1)))
+    values = np.broadcast_to(values, (6 * n, *x.shape[1:])).reshape(n, 6, *x.shape[1:])
+    one, two, three = (values[:, k] - values[:, k + 3] for k in range(3))
+    return (45 * one - 9 * two + three) / (60 * tiny)

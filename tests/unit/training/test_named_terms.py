@@ -254,7 +254,8 @@ def test_the_contact_form_damps_every_coordinate():
 def test_no_number_is_left_out_of_an_equation():
     # fails if a term is dropped where its own deviation is large: with another one it may be determined, and the
     # equation without it is another motion (a damping of 2.955 and a gain of 4.9 were, by 2.3 rad)
-    wide = Equation((Term("x″", "x", -2.0, 0.5, "1/s²"), Term("x″", "x′", -0.12, 1.0, "1/s", 0.003)), ("x″",), "m", None)
+    terms = (Term("x″", "x", -2.0, 0.5, "1/s²"), Term("x″", "x′", -0.12, 1.0, "1/s", 0.003))
+    wide = Equation(terms, ("x″",), "x in m", None)
     assert str(wide).splitlines()[0] == "x″ = −2.0(5) x − 0.120(±1) x′"
 
 
