@@ -126,6 +126,7 @@ class Printed:
             of_q[i] = "".join(term for term in terms if not re.search(beside, term)) or "0.0"
             if (match := NUMBER.match(left)) and "″" in left:
                 self.mass[i] = float(match[1] + (match[2] or ""))
+        self.slope = None
         self.held = "stays 0" in self.words
         self.steps = float(re.search(r"steps are ([\d.e-]+)", self.words)[1]) if "step it as" in self.words else None
         self.order = int(re.search(r"rule of order (\d)", self.words)[1])
@@ -318,11 +319,14 @@ def discrete(printed, q, v, s, h, u):
     way = np.sign(push)
     rests = np.abs(push) <= np.abs(push - residual(q, way))  # friction at rest holds so much
     assert len(q) == 1 or not rests.any(), "one coordinate alone rests"
-    for _ in range(6):
-        ahead, behind = (
-            np.stack([residual(q1 + d * e, way) for e in np.eye(len(q))[:, :, None]], 1) for d in (TINY, -TINY)
-        )
-        q1 = q1 - solved((ahead - behind) / (2 * TINY), residual(q1, way))
+    for turn in range(30):  # Newton's, with the derivatives of an earlier step while they serve
+        if printed.slope is None or turn == 10:
+            moves = TINY * np.eye(len(q))[:, :, None]
+            printed.slope = np.stack([(residual(q1 + e, way) - residual(q1 - e, way)) / (2 * TINY) for e in moves], 1)
+        move = solved(printed.slope, residual(q1, way))
+        q1 = q1 - move
+        if np.abs(move).max() < 1e-14 * np.abs(q1).max():
+            break
     q1 = np.where(rests, q, q1)
     p1 = differences(lambda x: printed.action(q[:, None], x, s, h), q1) + forces(q1)
     s1 = s + printed.action(q, q1, s, h)
