@@ -299,7 +299,11 @@ def moreau(printed, q, v, s, h, u):
     q = q + h / 2 * v
     middle = v + h / 2 * printed.acceleration(q, v, s, u(0.5))[0]
     v = v + h * printed.acceleration(q, middle, s, u(0.5))[0]
-    v = np.sign(v) * np.maximum(np.abs(v) - h * printed.grip(q, v, u(0.5)) / printed.masses(q), 0.0)
+    most, push = h * printed.grip(q, v, u(0.5)), np.zeros_like(v)
+    by_push = np.stack([printed.by_mass(q, 0 * q + e) for e in np.eye(len(q))[:, :, None]], 1)  # ∂v_i/∂push_j
+    for i in (i for _ in range(1 if len(q) == 1 else 30) for i in range(len(q))):  # each up to rest, the others held
+        new = np.clip(push[i] - v[i] / by_push[i, i], -most[i], most[i])
+        v, push[i] = v + by_push[:, i] * (new - push[i]), new
     return q + h / 2 * v, v, s
 
 
