@@ -47,7 +47,7 @@ from herglotz.training.pruning import inverse_of
 from herglotz.training.structure import MOST
 from herglotz.training.task import Task, build_model, with_sticking
 
-UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless; as `LOST` of the verdict
+UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless
 TURNS = 2.0  # a turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation
 LONGEST = 10  # times the recorded time: no free run is followed for longer
 ALIKE = 1e-9  # of a term's own information: what less is left of, others do as well; it changes nothing

@@ -21,7 +21,7 @@ from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.equation_words import number
 from herglotz.training.fewer_numbers import FewerNumbers
-from herglotz.training.fit import _equation
+from herglotz.training.fit import _joint
 from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import starts_of
 from herglotz.training.named_terms import NamedTerms, candidates, loads, offered, turns_one_way
@@ -351,9 +351,12 @@ def test_deviations_are_no_smaller_than_rounding(duffing):
     plan, least = Plan.from_dict(duffing.metrics["plan"]), 50 * duffing.metrics["sigma"]
     posterior = laplace(duffing)
     by = 50 / posterior.inflation
-    for term, wide in zip(duffing.equation().terms, _equation(duffing, plan, least).terms, strict=True):
+    for term, wide in zip(
+        duffing.equation().terms, equation_of(duffing, _joint(duffing, plan, least)).terms, strict=True
+    ):
         assert wide.deviation == pytest.approx(by * term.deviation)
-    assert str(_equation(duffing, plan, 0.0)) == str(duffing.equation())
+        assert wide.alone == pytest.approx(50 * term.alone)
+    assert equation_of(duffing, _joint(duffing, plan, 0.0)).terms == duffing.equation().terms
 
 
 @pytest.mark.parametrize("pushes", [True, False])
