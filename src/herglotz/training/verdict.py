@@ -196,14 +196,14 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any]) -> str:
     """What the data do not determine, and what to record; a longer recording only where that would tell."""
-    over = f"over the next {ahead.horizon:.3g} units of time"
+    over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
-        return f"the model's own motion breaks off {over}; {errors}. Try {_remedy(metrics, False)}"
+        return f"the model's own motion breaks off {over}; {errors}. Try {_remedy(metrics, missed)}"
     what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
         what, share = "the uncertainty of the parameters", ahead.parameters
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
-    if errors.windows > AT_THE_NOISE * errors.limit:
+    if missed:
         return f"a force is missing, and others are left open; {errors}. {changes}. Try {_remedy(metrics, True)}"
     times = (ahead.open / UNCERTAIN) ** 2  # what is left open falls with the root of the number of samples
     if times > MORE**2:
