@@ -95,7 +95,7 @@ def across_in_words(P: Tensor, names: Sequence[str]) -> list[tuple[str, float]]:
         size = next((w for w in row if w), 1.0)
         parts = [(w / size, name) for w, name in zip(row, names, strict=True) if w]
         texts = [
-            f"{'−' if w < 0 else '+'} {'' if abs(abs(w) - 1) < SAME else f'{abs(w):.4g} '}{name}" for w, name in parts
+            f"{'−' if w < 0 else '+'} {'' if abs(abs(w) - 1) < SAME else f'{abs(w):.10g} '}{name}" for w, name in parts
         ]
         form = " ".join(texts).removeprefix("+ ")
         found.append((f"({form})" if len(parts) > 1 else form, size))

@@ -3,7 +3,7 @@
 from herglotz.training.choose import choose as choose
 from herglotz.training.config import FitConfig as FitConfig
 from herglotz.training.fit import fit as fit
-from herglotz.training.identifiability import Trade as Trade, traded as traded
+from herglotz.training.identifiability import traded as traded
 from herglotz.training.look import Look as Look, look as look
 from herglotz.training.plan import Plan as Plan
 from herglotz.training.problems.one_step import ResidualProblem as ResidualProblem
@@ -17,6 +17,7 @@ from herglotz.training.selection import Selection as Selection, select as select
 from herglotz.training.smoother import Smoothed as Smoothed, smooth as smooth
 from herglotz.training.solvers.adam import adam as adam
 from herglotz.training.solvers.levenberg_marquardt import levenberg_marquardt as levenberg_marquardt
+from herglotz.training.trades import Trade as Trade
 from herglotz.training.uncertainty import (
     Bands as Bands,
     Laplace as Laplace,

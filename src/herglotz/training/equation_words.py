@@ -3,52 +3,89 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
 
 from herglotz.models.drag import DragFeature
-from herglotz.models.feature_grammar import Product
+from herglotz.models.feature_grammar import Feature, Product
 
-SMALL = 1e-4  # below it a number has its power of ten: more than four zeros are not counted at a glance
-RELATIVE = 1e-12  # smaller deviations are rounding
+SMALL, LARGE = 1e-4, 1e7  # beyond them a number has its power of ten: its zeros are not counted at a glance
+EXACT = 10  # digits of a number that is told, and no more than rounding
+UNKNOWN = 7  # digits of a number of which nothing says how much the motion depends on it
+LAST = 100  # units of the last digit: larger deviations are told as ±, for brackets of three digits are not read
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 
 
-def drag_in_words(f: DragFeature, i: int, names: Sequence[str]) -> str:
-    """A friction force on coordinate i with the names of its coordinates."""
+def own_term(name: str, angle: bool, power: int, newton: bool) -> tuple[str, float]:
+    """Text and factor of a term of the potential k (1 − cos q) + b sin q, or k q²/2 + b q: of its force, or in L."""
+    if newton:
+        return (f"sin {name}" if power == 2 else f"cos {name}") if angle else (name if power == 2 else ""), -1.0
+    if angle:
+        return (f"cos {name}", 1.0) if power == 2 else (f"sin {name}", -1.0)
+    return raised(name, power), -0.5 if power == 2 else -1.0
+
+
+def drag_in_words(f: DragFeature, i: int, names: Sequence[str], sign: str = "") -> str:
+    """A friction force on coordinate i with the names of its coordinates; `sign` is the direction of dry friction."""
     if f.air:
         return f"√({' + '.join(f'{name}′²' for name in names)}) {names[i]}′"
     speed = f"{names[f.on]}′" if f.of is None else f"({names[f.on]}′ − {names[f.of]}′)"
     position, size = [raised(names[f.at], f.a)] if f.a else [], [f"|{speed.strip('()')}|"] if f.b else []
     if f.dry:
-        return f"{f'{f.wave}({names[f.at]})' if f.wave else position[0]} sgn({speed})"
+        return f"{f'{f.wave}({names[f.at]})' if f.wave else position[0]} {sign}"
     return " ".join([*position, *size, *([raised(speed, f.c)] if f.c else [])])
 
 
 def slope(p: Product, i: int, names: Sequence[str]) -> tuple[str, float, int]:
     """∂/∂q_i of a product without velocities: its text, its factor, and the power of length in the unit of a force."""
     if p.function == "radius":
-        return f"{raised('r', p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
+        return f"{raised(distance(names), p.power - 2)} {names[i]}".strip(), p.factor * p.power, 2 - p.power
     form, w = _form(p.form, names), p.form[i]
     if p.function == "power":
-        inner = form if sum(1 for x in p.form if x) == 1 else f"({form})"
-        return (raised(inner, p.power - 1) if p.power > 1 else ""), p.factor * p.power * w, 2 - p.power
+        return raised(_inner(p.form, names), p.power - 1), p.factor * p.power * w, 2 - p.power
     if p.function == "signed":
-        return f"|{form}| {raised(form, p.power - 2)}".strip(), p.factor * p.power * w, 2 - p.power
+        return f"|{form}| {raised(_inner(p.form, names), p.power - 2)}".strip(), p.factor * p.power * w, 2 - p.power
     return (f"sin({form})", -p.factor * w, 1) if p.function == "cos" else (f"cos({form})", p.factor * w, 1)
+
+
+def distance(names: Sequence[str]) -> str:
+    """What the distance |q| is called."""
+    return "ρ" if "r" in names else "r"
 
 
 def _form(form: tuple[float, ...], names: Sequence[str]) -> str:
     parts = [(w, name) for w, name in zip(form, names, strict=True) if w]
-    text = " ".join(f"{'−' if w < 0 else '+'} {'' if abs(w) == 1 else f'{abs(w):g} '}{name}" for w, name in parts)
+    text = " ".join(f"{'−' if w < 0 else '+'} {'' if abs(w) == 1 else f'{plain(abs(w))} '}{name}" for w, name in parts)
     return text.removeprefix("+ ")
 
 
-def feature_in_words(text: str, names: Sequence[str]) -> str:
-    """A feature's text with the names of the coordinates."""
-    text = re.sub(r"(?<![\d.])1(?=q)", "", text).replace("-", "−").replace("*", " ")
-    text = re.sub(r"([qv])(\d+)", lambda x: names[int(x[2]) - 1] + ("′" if x[1] == "v" else ""), text)
-    return f"({text})" if " − " in text and "(" not in text else text  # x y′ − y x′ has one coefficient
+def _inner(form: tuple[float, ...], names: Sequence[str]) -> str:
+    """A form of which a power is taken."""
+    text = _form(form, names)
+    return text if text in names else f"({text})"
+
+
+def feature_in_words(feature: Feature, names: Sequence[str]) -> str:
+    """A feature with the names of the coordinates; x y′ − y x′ has one coefficient, and stands in brackets."""
+    texts = [(p.factor, _product(p, names)) for p in feature]
+    if len(texts) == 1 and texts[0][0] == 1:
+        return texts[0][1]
+    sizes = [(factor < 0, text if abs(factor) == 1 and text else f"{plain(abs(factor))} {text}".rstrip())
+             for factor, text in texts]  # fmt: skip
+    joined = " ".join(f"{'−' if minus else '+'} {text}" for minus, text in sizes).removeprefix("+ ")
+    return f"({joined})"
+
+
+def _product(p: Product, names: Sequence[str]) -> str:
+    """A product without its factor; nothing of a constant."""
+    speeds = [raised(f"{names[i]}′", p.velocities.count(i)) for i in dict.fromkeys(p.velocities)]
+    if p.function == "radius":
+        return raised(distance(names), p.power)
+    form = _form(p.form, names)
+    if p.function in ("cos", "sin"):
+        return " ".join([f"{p.function}({form})", *speeds])
+    power = p.power - (p.function == "signed")
+    own = [f"|{form}|"] if p.function == "signed" else []
+    return " ".join([*own, *([raised(_inner(p.form, names), power)] if power and form else []), *speeds])
 
 
 def raised(base: str, power: int) -> str:
@@ -63,18 +100,29 @@ def unit_of(unit: str, power: int, time: str, per: int) -> str:
     return (f"{top or '1'}/{bottom}" if bottom else top) or "1"
 
 
-def number(value: float, deviation: float | None) -> str:
-    """A value with its standard deviation in units of its last digit: 25.0(3), and 4.7(2)e-8 of small ones."""
-    if deviation is None or not math.isfinite(deviation) or deviation <= RELATIVE * value:
-        return f"{value:.4g}"
-    if 0 < (size := max(value, deviation)) < SMALL:
-        power = math.floor(math.log10(size))
-        return f"{number(value / 10.0**power, deviation / 10.0**power)}e{power}"
-    digits = -math.floor(math.log10(deviation))
-    last = round(deviation * 10.0**digits)
-    digits, last = (digits + 1, round(deviation * 10.0 ** (digits + 1))) if last == 1 else (digits, last)
-    if digits > 12 or digits < -6:
-        return f"{value:.6g} ± {deviation:.1g}"
-    return (
-        f"{value:.{digits}f}({last})" if digits > 0 else f"{round(value, digits):.0f}({round(deviation, digits):.0f})"
-    )
+def plain(value: float, digits: int = EXACT) -> str:
+    """A number without a deviation."""
+    return f"{value:.{digits}g}".replace("-", "−", int(value < 0))
+
+
+def number(value: float, deviation: float | None, alone: float | None, digits: int = UNKNOWN) -> str:
+    """A value ≥ 0 with its standard deviation, as the motion needs it: 25.0(3), 2.955(±4.1), 4.7(2)e-8.
+
+    It is rounded to a digit below `alone`, its deviation with all other numbers held: numbers that make up for each
+    other are known together far better than one by one, and rounding changes one by one. Its own deviation stands in
+    units of the last digit, or as ±.
+    """
+    if alone is None or not 0 < alone < math.inf:
+        return plain(value, digits)
+    if not SMALL <= max(value, alone) < LARGE:
+        power = math.floor(math.log10(max(value, alone)))
+        size = 10.0**power
+        return f"{number(value / size, None if deviation is None else deviation / size, alone / size)}e{power}"
+    places = max(0, -math.floor(math.log10(alone)))
+    text = f"{value:.{places}f}"
+    if deviation is None or not math.isfinite(deviation):
+        return text
+    last = round(deviation * 10.0**places)
+    if last >= LAST:
+        return f"{text}(±{plain(float(f'{deviation:.2g}'))})"
+    return f"{text}({last})" if last else text

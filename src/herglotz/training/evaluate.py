@@ -30,6 +30,8 @@ from herglotz.training.run import Run
 from herglotz.training.task import Task
 from herglotz.training.verdict import judged
 
+GONE = 1e3  # times the spread: a free run so far away has left the world, however little its start is known
+
 
 def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig) -> Run:
     """Return the finished run: its states, its free run beyond the training part, and the errors of both.
@@ -43,7 +45,15 @@ def evaluate(task: Task, seen: Look, plan: Plan, fitted: Fitted, told: FitConfig
         dropped[~dropped] = ~fitted.used
     states, status = states_everywhere(fitted, data, train.lengths, task.base.model_step)
     metrics, free = _errors(fitted, task, seen, dropped, states)
+    if free is not None and (metrics["extrapolation_rms"] or 0.0) > GONE * metrics["spread"]:
+        times = metrics["extrapolation_rms"] / metrics["spread"]
+        status = (
+            f"the free run over the unseen samples leaves the world: it misses them by {times:.1g} times their spread"
+        )
+        free, metrics["extrapolation_rms"] = torch.full_like(free, torch.inf), None
     metrics |= judged(task, seen, fitted, states.joined, free, metrics)
+    if metrics["train_rms"] == 0.0:  # where a model follows none, states are the recorded ones
+        metrics["train_rms"] = metrics["window_rms"]
     metrics |= {
         "extrapolation_status": status,
         "outlier_samples": leading_rows(data.lengths, train.lengths)[dropped.cpu()].tolist(),

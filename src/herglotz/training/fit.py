@@ -23,11 +23,15 @@ from herglotz.training.choose import choose
 from herglotz.training.config import FitConfig
 from herglotz.training.dictionary_search import ROUNDING
 from herglotz.training.distributed import is_first
-from herglotz.training.equation import Equation, equation_of
+from herglotz.training.equation import equation_of
+from herglotz.training.equation_notes import notes_of
+from herglotz.training.equation_numbers import Joint
 from herglotz.training.evaluate import evaluate
+from herglotz.training.identifiability import joint_of
 from herglotz.training.look import look
 from herglotz.training.objectives import OBJECTIVES
 from herglotz.training.plan import Plan
+from herglotz.training.push import pushes
 from herglotz.training.rivals import held_out_winner
 from herglotz.training.run import Run
 from herglotz.training.run_folder import FILES, LOG, MANIFEST, reading_told
@@ -133,23 +137,22 @@ def _fit(data: Trajectories, config: FitConfig, plan: Plan | None, stages: Stage
         seen = replace(seen, settings=plan.applied(seen.settings))
         task = seen.task(stages)
         run = evaluate(task, seen, plan, OBJECTIVES[plan.objective](task, seen, plan), config)
-    run.metrics["equation"] = _equation(run, plan, ROUNDING * task.exact).as_dict()
+    joint = _joint(run, plan, ROUNDING * task.exact)
+    run.metrics["equation"] = equation_of(run, joint, notes_of(run)).as_dict()
+    run.metrics["verdict"] = ". ".join(filter(None, (run.metrics["verdict"], pushes(run, joint))))
     run.metrics["seconds"] = round(time.perf_counter() - started, 3)
     return run
 
 
-def _equation(run: Run, plan: Plan, least: float) -> Equation:
-    """The learned equation, with standard deviations where named terms were fitted to trajectories.
+def _joint(run: Run, plan: Plan, least: float) -> Joint | None:
+    """What the data say of all numbers together, where named terms were fitted to trajectories.
 
-    They are those of data that are known no better than to `least`, in units of q: what moves them by less is rounding.
+    The data are known no better than to `least`, in units of q: what moves them by less is rounding.
     """
-    covariance = None
     if plan.network == "none" and run.metrics["follows_data"]:
         with suppress(InputError):  # whole trajectories cannot be followed: no deviations
-            posterior = laplace(run)
-            rounding = max(1.0, least / (posterior.sigma * posterior.inflation)) ** 2
-            covariance = posterior.covariance[: len(posterior.theta), : len(posterior.theta)] * rounding
-    return equation_of(run, covariance)
+            return joint_of(laplace(run), least)
+    return None
 
 
 def _key(data: Trajectories, config: FitConfig, plan: Plan | None) -> str:

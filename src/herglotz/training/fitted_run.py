@@ -25,6 +25,10 @@ class FittedRun(Protocol):
     @property
     def data(self) -> Trajectories: ...  # noqa: D102
     @property
+    def states(self) -> State: ...  # noqa: D102
+    @property
+    def reading(self) -> dict[str, Any]: ...  # noqa: D102
+    @property
     def train_lengths(self) -> tuple[int, ...]: ...  # noqa: D102
     @property
     def h(self) -> float: ...  # noqa: D102

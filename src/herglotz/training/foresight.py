@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
+from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.trajectories import every_mth
 from herglotz.models import ContactLagrangian
 from herglotz.progress import beat
@@ -48,7 +49,7 @@ from herglotz.training.pruning import inverse_of
 from herglotz.training.structure import MOST
 from herglotz.training.task import Task, build_model, with_sticking
 
-UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless; as `LOST` of the verdict
+UNCERTAIN = 0.1  # of the spread: free runs that are known no better are useless
 TURNS = 2.0  # a turn is 2π times the ratio of the spreads of q and q̇: the period of an oscillation
 LONGEST = 10  # times the recorded time: no free run is followed for longer
 ALIKE = 1e-9  # of a term's own information: what less is left of, others do as well; it changes nothing
@@ -96,21 +97,24 @@ def foresee(task: Task, fitted: Fitted, seen: Look, states: Tensor) -> Foresight
     beat()
     if not math.isfinite(float(cost)):
         return None
+    low, high = task.data.q.amin(0), task.data.q.amax(0)
     runs = _Ahead.of(task.data, seen.data, problem, _turn(task.data, known))
-    ahead = ShootingProblem(
-        model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step / every), sigma=problem.sigma
-    )
     guess = runs.stepped_on(fitted.model, states, base.model_step / every)
+    runs, guess = runs.until_lost(guess, low, high)
+    ahead, path = None, None
     if guess is not None:
+        ahead = ShootingProblem(
+            model, runs.data, segment_grid(runs.data, runs.data.samples, base.model_step / every), sigma=problem.sigma
+        )
         ahead.guess_from_states(guess)
-    path = None if guess is None else ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
+        path = ahead.solve(ahead.pack(theta, x[runs.segments, : ahead.d]))
     beat()
-    if path is None:
+    if ahead is None or path is None:
         return Foresight(math.inf, math.inf, 0.0, "", runs.horizon, False)
     spread = task.data.q.std(0, correction=0).clamp_min(1e-300)
     Z = ahead.slopes_at_samples(theta, path) / spread[:, None]
     q = ahead.grid.at_samples(path.x[..., : problem.n])
-    inside = ((q >= task.data.q.amin(0)) & (q <= task.data.q.amax(0))).all(-1)
+    inside = ((q >= low) & (q <= high)).all(-1)
     return _summary(dense(A).double(), Z.double(), problem, runs, absent, inside)
 
 
@@ -148,8 +152,8 @@ class _Ahead:
         made = replace(data, t=t, q=data.q.new_zeros(len(t), data.dof), u=u, s=None, p=None, lengths=lengths)
         return cls(made, torch.cat(rows).to(t.device), segments, torch.cat(beyond), horizon)
 
-    def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor | None:
-        """States at all samples of these runs, known ones and those of the model's steps; None where a step fails.
+    def stepped_on(self, model: ContactLagrangian, states: Tensor, max_step: float) -> Tensor:
+        """States at all samples of these runs, known ones and those of the model's steps; NaN from a failed step on.
 
         They are the fitted model's own, which steps quicker than one with all terms.
         """
@@ -166,7 +170,27 @@ class _Ahead:
         x = known[at[grid.start_sample]]
         out = continued(model, x, grid.h, step_inputs(model, rest, grid))
         known[at] = grid.at_samples(out)  # not what pads the shorter runs
-        return known if bool(torch.isfinite(known).all()) else None
+        return known
+
+    def until_lost(self, states: Tensor, low: Tensor, high: Tensor) -> tuple[_Ahead, Tensor | None]:
+        """These runs up to where a step fails, with their `states`; None where one fails inside of [low, high], (n,).
+
+        A run that fails after it left the recorded range says no more of the model than others that leave it.
+        """
+        found, q = torch.isfinite(states).all(-1), states[:, : len(low)]
+        inside, kept, lengths = ((q >= low) & (q <= high)).all(-1), [], []
+        for first, length in zip(self.data.offsets, self.data.lengths, strict=True):
+            lost = (~found[first : first + length]).nonzero()[:, 0]
+            end = length if not len(lost) else int(lost[0])
+            if end < length and (end < MIN_SAMPLES or bool(inside[first + end - 1])):
+                return self, None
+            kept.append(torch.arange(first, first + end))
+            lengths.append(end)
+        rows = torch.cat(kept).to(states.device)
+        cut = replace(
+            self, data=self.data.rows(rows, tuple(lengths)), rows=self.rows[rows], beyond=self.beyond[rows.cpu()]
+        )
+        return cut, states[rows]
 
 
 def _turn(data: Trajectories, states: Tensor) -> float:

@@ -1,68 +1,21 @@
 """Combinations of physical parameters that the data do not determine, because one can replace another.
 
 With A = JᵀJ of the fit, prior included, the information that the data hold on the parameters φ of interest, whatever
-the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Scaled to a
-unit diagonal it has no units, and a small eigenvalue λ is a combination that moves the prediction √(λ_max/λ) times
-less than the best determined one: the condition index of Belsley, Kuh & Welsch (1980), who call 30 harmful. Its
-eigenvector says which parameters are traded. Where eigenvalues are equal, as those of exact null directions are, any
-basis of their span consists of eigenvectors; the span is then described by sparse vectors (`sparse_basis`).
+the networks and the states are, is the Schur complement M = A_φφ − A_φr A_rr⁻¹ A_rφ less the prior of φ. Its small
+eigenvalues are what one of them can make up for in another (`herglotz.training.trades`).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
+from herglotz.training.equation_numbers import Joint
+from herglotz.training.trades import Trade, combinations
 from herglotz.training.uncertainty import Laplace
 
 PHYSICAL = ("kinetic.log", "kinetic.off", "potential.stiffness", "potential.tilt", "damping.rate", "damping.drag",
             "friction.")  # fmt: skip
-HARMFUL = 30.0  # condition index above which parameters are not determined one by one (Belsley, Kuh & Welsch 1980)
-LARGEST = 1e7  # condition index of an exact null direction, up to rounding
-PART = 0.05  # a parameter with a smaller share of a combination is not named
-# Eigenvalues of the scaled information closer than this (of the largest) count as equal: rounding moves them by some
-# 1e-15, which turns eigenvectors across a gap g by 1e-15/g, so that names stay below PART by a margin of 1e4.
-EQUAL = 1e-10
-NEAR_LARGEST = 0.9  # pivots this near the largest are ties, and the first is taken: rounding must not choose
-WORDS = {
-    "kinetic.log_diagonal": "the mass",
-    "kinetic.off_diagonal": "the coupling of masses",
-    "potential.stiffness": "the stiffness k of the potential",
-    "potential.tilt": "the tilt b of the potential (a constant force at q = 0)",
-    "damping.rate": "the damping rate γ",
-    "damping.drag": "the drag",
-    "friction.viscous": "viscous friction",
-    "friction.coulomb": "dry friction",
-    "friction.breakaway": "the excess of dry friction at breakaway",
-    "friction.log_smooth": "the speed below which dry friction is smooth",
-    "friction.log_stribeck": "the speed over which breakaway fades",
-    "friction.input_map": "the map from inputs to forces",
-    "friction.input_zero": "the zero of the input's sensor",
-}
-
-
-@dataclass(frozen=True)
-class Trade:
-    """Parameters of which the data determine some combination, and not each one alone."""
-
-    index: float  # condition index: how many times less the combination moves the prediction than the best known one
-    parts: tuple[tuple[str, float], ...]  # parameters and their shares of the combination, the largest first
-
-    def __str__(self) -> str:
-        names = [in_words(name) for name, _ in self.parts]
-        if len(names) == 1:
-            return f"{names[0]} has next to no effect on these data: its value is the prior's, not a measurement"
-        listed = ", ".join(names[:-1]) + " and " + names[-1]
-        how = "cannot be told apart at all" if self.index >= LARGEST else f"are hard to tell apart ({self.index:.0f}:1)"
-        return f"{listed} {how}: change one, the others make up for it, and the prediction stays the same"
-
-
-def in_words(name: str) -> str:
-    """A parameter's name, `friction.viscous[1]`, as a newcomer may read it."""
-    stem, _, entry = name.partition("[")
-    return WORDS.get(stem, stem) + (f", entry {int(entry[:-1]) + 1}" if entry else "")
 
 
 def traded(posterior: Laplace) -> list[Trade]:
@@ -70,54 +23,30 @@ def traded(posterior: Laplace) -> list[Trade]:
 
     `posterior` is that of a fit (`herglotz.training.laplace`).
     """
-    A, P = posterior.information, len(posterior.theta)
     names = posterior.problem.parameters.numbers
-    own = torch.tensor([name.startswith(PHYSICAL) for name in names])
-    rows = own.nonzero()[:, 0]
-    rest = torch.cat([(~own).nonzero()[:, 0], torch.arange(P, len(A))])
+    rows = torch.tensor([i for i, name in enumerate(names) if name.startswith(PHYSICAL)], dtype=torch.long)
+    M = information_of(posterior, rows)
+    return combinations(M, posterior.information.diagonal()[rows], [names[i] for i in rows.tolist()])
+
+
+def information_of(posterior: Laplace, rows: Tensor) -> Tensor:
+    """What the data alone say of these parameters, whatever the others and the starts are; see the head of this module.
+
+    `rows` are their places, (K,); returns (K, K).
+    """
+    A = posterior.information
+    rest = torch.ones(len(A), dtype=torch.bool)
+    rest[rows] = False
+    rest = rest.nonzero()[:, 0]
     _, prior, _ = posterior.prior.normal_equations(posterior.theta)
     inverse = torch.linalg.pinv(A[rest[:, None], rest], hermitian=True)
     M = A[rows[:, None], rows] - A[rows[:, None], rest] @ inverse @ A[rest[:, None], rows]
-    M = M - prior.double()[rows[:, None], rows]
-    # A parameter of no effect has a diagonal of rounding size, of either sign.
-    alone = A.diagonal()[rows]
-    seen = M.diagonal() > alone / LARGEST**2
-    found = [Trade(LARGEST, ((names[i], 1.0),)) for i in rows[~seen].tolist()]
-    rows, M = rows[seen], M[seen][:, seen]
-    if not len(rows):
-        return found
-    size = M.diagonal().sqrt()
-    M = M / size[:, None] / size
-    values, vectors = torch.linalg.eigh(M)
-    for vector in _within_equal(values, vectors).T:  # values ascend
-        value = vector @ M @ vector
-        condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
-        if condition < HARMFUL:
-            break
-        share = vector.square()
-        order = [k for k in share.argsort(descending=True).tolist() if share[k] >= PART]
-        found.append(Trade(condition, tuple((names[rows[k]], float(share[k])) for k in order)))
-    return found
+    return M - prior.double()[rows[:, None], rows]
 
 
-def _within_equal(values: Tensor, vectors: Tensor) -> Tensor:
-    """The eigenvectors, those of equal eigenvalues replaced by a sparse basis of their span; values ascend."""
-    groups = vectors.tensor_split((values.diff() > EQUAL * values[-1]).nonzero()[:, 0] + 1, 1)
-    return torch.cat([group if group.shape[1] == 1 else sparse_basis(group) for group in groups], 1)
-
-
-def sparse_basis(span: Tensor) -> Tensor:
-    """A basis of the same span, (m, k), in reduced echelon form, columns of length 1: few entries differ from 0.
-
-    Where the span has a basis of vectors that share no entry, this is that basis.
-    """
-    basis = span.clone()
-    for j in range(basis.shape[1]):
-        size = basis[:, j:].norm(dim=1)
-        row = int((size >= NEAR_LARGEST * size.max()).nonzero()[0])
-        column = j + int(basis[row, j:].abs().argmax())
-        basis[:, [j, column]] = basis[:, [column, j]]
-        basis[:, j] /= basis[row, j].clone()
-        others = torch.arange(basis.shape[1]) != j
-        basis[:, others] -= basis[:, j : j + 1] * basis[row, others]
-    return basis / basis.norm(dim=0)
+def joint_of(posterior: Laplace, least: float) -> Joint:
+    """What the data say of all numbers together, if they are known no better than to `least`, in units of q."""
+    P, sigma = len(posterior.theta), posterior.sigma
+    rounding = max(1.0, least / (sigma * posterior.inflation)) ** 2
+    alone = posterior.information.diagonal()[:P].clamp_min(1e-300).rsqrt() * max(1.0, least / sigma)
+    return Joint(posterior.covariance[:P, :P] * rounding, alone, information_of(posterior, torch.arange(P)))

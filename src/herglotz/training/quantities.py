@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 from herglotz.training.equation_words import unit_of
-from herglotz.training.identifiability import PHYSICAL, WORDS
+from herglotz.training.identifiability import PHYSICAL
 from herglotz.training.run import Run
+from herglotz.training.trades import WORDS
 from herglotz.training.uncertainty import Laplace
 
 INPUT_MAP = "friction.input_map"

@@ -23,6 +23,7 @@ from herglotz.theory import ContinuousEquation, FractionalStepper
 from herglotz.training.baseline import JITTER
 from herglotz.training.config import FitConfig
 from herglotz.training.equation import Equation, equation_of
+from herglotz.training.equation_notes import notes_of
 from herglotz.training.motion import Motion, free_motion
 from herglotz.training.plan import Plan
 from herglotz.training.predict import Prediction, predict
@@ -162,15 +163,14 @@ class Run:
             If the neighbours of a state cannot be stepped to.
         """
         H = self.continuous.hamiltonian(*state)
-        lost = (~torch.isfinite(H)).nonzero()
-        if len(lost):
+        if len(lost := (~torch.isfinite(H)).nonzero()):
             raise InputError(f"no energy at sample {tuple(lost[0].tolist())}: a step beside it fails; leave it out")
         return H
 
     def equation(self) -> Equation:
         """M q̈ = forces as learned, in the data's units; ± where all terms are named (docs/tutorials/duffing.md)."""
-        stored = self.metrics.get("equation")
-        return Equation.from_dict(stored) if stored else equation_of(self)
+        known = self.metrics.get("equation")
+        return Equation.from_dict(known) if known else equation_of(self, None, notes_of(self))
 
     def last_fitted(self, trajectory: int = 0) -> tuple[State, float]:
         """State and time at the last training sample of a trajectory.
@@ -261,7 +261,7 @@ class Run:
         Returns
         -------
         Figure
-            Axes carry the units of the data.
+            In the units of the data.
 
         Raises
         ------

@@ -8,8 +8,10 @@ Three errors are compared with the precision of the data, which is estimated fro
 * the one free run over the whole unseen part, `extrapolation_rms`.
 
 A free run that is lost rejects a model, unless what the data leave open of its start explains that: chaotic motion
-leaves every model in the long run. What the data leave open of the model itself (`foresight`) rejects it too: a
-recording that is too short fits many models. Errors of several coordinates are over the spread of each.
+leaves every model in the long run. One that breaks off, or leaves the world, rejects it always. What the data leave
+open of the model itself (`foresight`) rejects it too: a recording that is too short fits many models. Errors of several
+coordinates are over the spread of each. Where recordings are too short to show their noise, what the model misses of
+the training data stands for it.
 """
 
 from __future__ import annotations
@@ -22,10 +24,10 @@ import torch
 from torch import Tensor
 
 from herglotz.data import Trajectories
-from herglotz.data.roughness import AT_THE_NOISE, precision
+from herglotz.data.roughness import AT_THE_NOISE, SAMPLES, precision
 from herglotz.data.units import common_unit, size
 from herglotz.stepping import Stepper, state_of
-from herglotz.training.foresight import Foresight, foresee
+from herglotz.training.foresight import UNCERTAIN, Foresight, foresee
 from herglotz.training.look import Look
 from herglotz.training.objectives import Fitted
 from herglotz.training.problems.grid import FIRST_SEGMENT, segment_grid, step_inputs
@@ -36,10 +38,16 @@ from herglotz.training.trajectory_fit import SegmentStages
 
 FITS, WORSE, FAILS = "fits to the noise", "fits, worse than the noise", "does not fit"
 EXACT_ENOUGH = 1e-4  # of the spread: exact data have no noise to be compared with
-LOST = 0.1  # of the spread: what `herglotz verify` bounds windows of 20 steps by; a model with nothing in it has 1
+# Share of the spread, and multiple of the noise: an error above both of a pair is lost. Windows of 20 steps that miss a
+# tenth are what `herglotz verify` refuses, and a model with nothing in it misses all; noise that buries the motion is
+# missed by a model that follows it, too. Of precise data less is a misfit that their noise has no part in.
+LOST = ((0.1, 3.0), (0.05, 20.0))
+APART = 20.0  # times another error in the same sentence: a word has to say why
+CHANCE = 3.0  # standard deviations of a free run, by what the data leave open of its start
 HALF = 0.5  # of the spread: windows of noise alone, whose starts are fitted, leave 0.9 to 0.95 of it
 CLEARLY = 2.0  # standard errors by which a free run is better than the mean of the data
-BURIED = 3.0  # times the precision: windows that miss no more follow the data, however large the noise is
+MORE = 30.0  # times what may be left open: 900 times as much of the same is not recorded
+EACH = "all over the spread of each coordinate"
 STATE_ITERATIONS = 10  # of fitting the states of unseen windows: 2n numbers a window from 20 samples need fewer
 
 
@@ -69,7 +77,7 @@ class Errors:
 
     windows: float
     unseen: float | None  # None: nothing was held out
-    free: float | None
+    free: float | None  # inf: it breaks off, or leaves the world
     noise: float  # precision of the data; inf: not known
     spread: float
     unit: str | None = ""  # None: all are over the spread of each coordinate, which is 1
@@ -78,23 +86,61 @@ class Errors:
     @property
     def limit(self) -> float:
         """What can be asked of a fit."""
-        return max(self.noise if math.isfinite(self.noise) else 0.0, EXACT_ENOUGH * self.spread)
+        noise = self.noise if math.isfinite(self.noise) else min(self.windows, self.lost)
+        return max(noise, EXACT_ENOUGH * self.spread)
 
     @property
     def lost(self) -> float:
         """Where an error is no longer one of a model that follows the motion."""
-        return max(LOST * self.spread, BURIED * self.limit)
+        if not math.isfinite(self.noise):  # no multiple of it is known
+            return LOST[0][0] * self.spread
+        return min(max(share * self.spread, times * self.limit) for share, times in LOST)
+
+    @property
+    def worst(self) -> float:
+        """The largest of them."""
+        return max(self.windows, self.unseen or 0.0, self.free or 0.0)
 
     def __str__(self) -> str:
-        unit, factor = ("deg", math.degrees(1)) if self.degrees else (self.unit or "", 1.0)
-        windows, unseen, free, limit, spread = (
-            "" if x is None else size(factor * x, unit, digits=2)
-            for x in (self.windows, self.unseen, self.free, self.limit, self.spread)
+        told = [f"free runs over {FIRST_SEGMENT} steps {self._missed(self.windows, 'the training data')}"]
+        if self.unseen is not None:
+            told.append(self._missed(self.unseen, "unseen data", missed=math.isfinite(self.windows)))
+            told[-1] += self._why(self.unseen, self.windows, "where the fit has not been")
+        if self.free is not None and math.isfinite(self.free):
+            told.append(f"all unseen time in one run by {self._size(self.free)}")
+            told[-1] += self._why(
+                self.free, max(self.windows, self.unseen or 0.0), "as errors of one run grow with its time"
+            )
+        elif self.free is not None:
+            told.append("and one run over all unseen time breaks off or leaves the world")
+        spread = f"their spread is {self._size(self.spread)}" if self.unit is not None else EACH
+        return f"{', '.join(told)}; {self._precision()}, {spread}"
+
+    def _missed(self, error: float, what: str, missed: bool = False) -> str:
+        if not math.isfinite(error):
+            return f"fail on {what}"
+        return f"{what} by {self._size(error)}" if missed else f"miss {what} by {self._size(error)}"
+
+    def _why(self, error: float, other: float, why: str) -> str:
+        """Why an error is far from the one that was told before it; nothing where it is not."""
+        if not (math.isfinite(error) and 0 < other < math.inf) or 1 / APART < error / other < APART:
+            return ""
+        return (
+            f" ({error / other:.2g} times as much, {why})"
+            if error > other
+            else " (less: that part asks less of the model)"
         )
-        held_out = f", unseen data by {unseen}, all unseen time in one run by {free}" if unseen else ""
-        spread = f"their spread is {spread}" if self.unit is not None else "all over the spread of each coordinate"
-        missed = f"free runs over {FIRST_SEGMENT} steps miss the training data by {windows}{held_out}"
-        return f"{missed}; the data's precision is {limit}, {spread}"
+
+    def _precision(self) -> str:
+        if not math.isfinite(self.noise):
+            return f"the data's precision is unknown, for no training part has {SAMPLES} samples"
+        exact = self.limit > self.noise
+        least = f" (errors below {self._size(self.limit)} count as none)" if exact else ""
+        return f"the data's precision is {self._size(self.noise)}{least}"
+
+    def _size(self, x: float) -> str:
+        unit, factor = ("deg", math.degrees(1)) if self.degrees else (self.unit or "", 1.0)
+        return size(factor * x, unit, digits=2)
 
 
 def judged(
@@ -128,35 +174,42 @@ def judged(
 
 def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -> str:
     """One of the three verdicts, with numbers and, where the model does not fit, what to try."""
-    worst, free = max(errors.windows, errors.unseen or 0.0), errors.free or 0.0
-    follows = metrics.get("follows_data", True) and worst <= errors.lost
+    free = errors.free or 0.0
+    follows = metrics.get("follows_data", True) and max(errors.windows, errors.unseen or 0.0) <= errors.lost
     if not follows or not math.isfinite(free):
-        return f"{FAILS}: {errors}. Try {_remedy(metrics, errors.windows > errors.lost)}"
+        return f"{FAILS}: {errors}. Try {_remedy(metrics, not errors.windows <= errors.lost)}"
     if errors.windows > HALF * errors.spread and not (metrics.get("gain_over_mean") or 0.0) > CLEARLY:
         return f"{FAILS}: no motion stands out from the noise; {errors}. Try less noise, or a longer recording"
-    chance = 0.0 if ahead is None else BURIED * ahead.start * errors.spread
+    chance = 0.0 if ahead is None else CHANCE * ahead.start * errors.spread
     if free > max(errors.lost, chance):
         return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
-    if ahead is not None and ahead.open > LOST:
-        return f"{FAILS}: too little was recorded to tell; {errors}. {_left_open(ahead)}"
-    error = max(worst, free)
-    if error <= AT_THE_NOISE * errors.limit:
+    if ahead is not None and ahead.open > UNCERTAIN:
+        return f"{FAILS}: {_left_open(ahead, errors, metrics)}"
+    times = errors.worst / errors.limit
+    if times <= AT_THE_NOISE:
         return f"{FITS}: {errors}"
     apart = metrics.get("apart")
     apart = f". The recordings may differ: {apart}. Try each by itself, or --sensor-zeros" if apart else ""
-    return f"{WORSE} by a factor of {error / errors.limit:.2g}: {errors}{apart}"
+    known = "" if math.isfinite(errors.noise) else ", for which its misfit of the training data stands,"
+    return f"{WORSE}{known} by a factor of {times:.2g}: {errors}{apart}"
 
 
-def _left_open(ahead: Foresight) -> str:
-    """What the data do not determine, and what to record."""
-    over = f"over the next {ahead.horizon:.3g} units of time"
+def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any]) -> str:
+    """What the data do not determine, and what to record; a longer recording only where that would tell."""
+    over, missed = f"over the next {ahead.horizon:.3g} units of time", errors.windows > AT_THE_NOISE * errors.limit
     if not ahead.reached:
-        return f"The model's own motion breaks off {over}. Try a longer recording"
+        return f"the model's own motion breaks off {over}; {errors}. Try {_remedy(metrics, missed)}"
     what, share = f"a force too small to be seen ({ahead.name})", ahead.hidden
     if ahead.parameters >= ahead.hidden:
         what, share = "the uncertainty of the parameters", ahead.parameters
     changes = f"{what[0].upper()}{what[1:]} may change the motion {over} by {100 * share:.2g} % of its spread"
-    return f"{changes}. Try a longer recording, or several from other starts"
+    if missed:
+        return f"a force is missing, and others are left open; {errors}. {changes}. Try {_remedy(metrics, True)}"
+    times = (ahead.open / UNCERTAIN) ** 2  # what is left open falls with the root of the number of samples
+    if times > MORE**2:
+        return f"such motions do not tell, however many; {errors}. {changes}. Try other motions: starts, inputs, speeds"
+    longer = f"a recording {max(2, math.ceil(times))} times as long, or several from other starts"
+    return f"too little was recorded to tell; {errors}. {changes}. Try {longer}"
 
 
 def _remedy(metrics: dict[str, Any], training: bool) -> str:

@@ -13,6 +13,7 @@ from herglotz.models import ContactLagrangian, ModelConfig, numbers_of
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
 from herglotz.training.equation import equation_of
+from herglotz.training.equation_numbers import Joint
 from herglotz.training.fewer_numbers import FewerNumbers
 from herglotz.training.foresight import _with_absent_terms
 from herglotz.training.named_terms import NamedTerms, settings_of
@@ -66,8 +67,9 @@ def test_the_equation_gives_each_number_its_own_deviation():
     numbers = ParameterVector(model).numbers
     deviations = torch.arange(1.0, len(numbers) + 1, dtype=torch.float64)
     data = Trajectories.of(torch.arange(3.0), torch.zeros(3, 2), (3,), names=("a", "b"))
-    terms = equation_of(SimpleNamespace(model=model, data=data), deviations.square().diag()).terms  # pyright: ignore
-    found = {(term.left, term.what): term.deviation for term in terms}
+    joint = Joint(deviations.square().diag(), deviations, deviations.square().reciprocal().diag())
+    terms = equation_of(SimpleNamespace(model=model, data=data), joint).terms  # pyright: ignore
+    found = {(term.left.split()[-1], term.what): term.deviation for term in terms}
     assert found[("b″", "b")] == pytest.approx(float(deviations[numbers.index("potential.stiffness[1]")]))
     assert found[("b″", "")] == pytest.approx(float(deviations[numbers.index("potential.tilt[1]")]))
     assert ("a″", "a") not in found

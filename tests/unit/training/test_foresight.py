@@ -33,8 +33,29 @@ def test_runs_that_go_on_by_one_sample_are_followed():
         out = Stepper(model).rollout(*torch.tensor([[0.5], [0.1]], dtype=torch.float64), h=0.1, steps=4)
     states = torch.cat([out.q, out.p, out.s[:, None]], -1)
     found = runs.stepped_on(model, states[:4], 0.1)
-    assert found is not None
     torch.testing.assert_close(found, states)
+
+
+@pytest.mark.parametrize(("last", "ends"), [(0.9, None), (1.1, 6)])
+def test_a_run_that_fails_beyond_the_recorded_range_says_nothing(last, ends):
+    # fails if a motion under inputs that drive it far away, where a step fails, rejects a model (a rotary pendulum at
+    # the noise: exit code 3), or one that fails where data were recorded is believed
+    t = 0.1 * torch.arange(10, dtype=torch.float64).repeat(2)
+    made = Trajectories.of(t, 0 * t, (10, 10))
+    runs = _Ahead(made, torch.arange(20), [0, 1], t > 0.15, 0.8)
+    states = torch.zeros(20, 3, dtype=torch.float64)
+    states[15, 0] = last  # of the second run, within or beyond the range from −1 to 1
+    states[16:] = torch.nan
+    one = torch.ones(1, dtype=torch.float64)
+    cut, known = runs.until_lost(states, -one, one)
+    if ends is None:
+        assert known is None
+        return
+    assert cut.data.lengths == (10, ends)
+    assert known is not None
+    assert bool(torch.isfinite(known).all())
+    assert cut.rows.tolist() == list(range(16))
+    assert torch.equal(cut.beyond, runs.beyond[:16])
 
 
 def test_the_start_is_asked_for_over_the_unseen_samples_alone(monkeypatch):

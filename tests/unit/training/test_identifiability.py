@@ -8,8 +8,8 @@ from herglotz.data import Trajectories
 from herglotz.models import ContactLagrangian, ModelConfig
 from herglotz.stepping import State, Stepper
 from herglotz.training import FitConfig, Run, laplace, traded
-from herglotz.training.identifiability import LARGEST, in_words, sparse_basis
 from herglotz.training.recorded_range import box_of
+from herglotz.training.trades import LARGEST, in_words, sparse_basis
 
 NOISE, H = 1e-3, 0.2
 

@@ -21,7 +21,7 @@ from herglotz.training.dictionary_search import DictionarySearch
 from herglotz.training.equation import Equation, Term, equation_of
 from herglotz.training.equation_words import number
 from herglotz.training.fewer_numbers import FewerNumbers
-from herglotz.training.fit import _equation
+from herglotz.training.fit import _joint
 from herglotz.training.found_terms import Found
 from herglotz.training.linear_terms import starts_of
 from herglotz.training.named_terms import NamedTerms, candidates, loads, offered, turns_one_way
@@ -231,7 +231,10 @@ def test_a_lagrangian_has_its_kinetic_energy():
         model.get_parameter("kinetic.sum.coefficient").fill_(0.85)
     # fails if ½ vᵀ M v is lost beside a product of speeds, or the second of its products without the coefficient
     text = str(equation_of(SimpleNamespace(model=model, data=data)))  # pyright: ignore
-    assert text.startswith("L = 0.5 a′² + 0.5 b′² − 0.1 s + 0.85 (a b′ − b a′)")
+    assert text.startswith("L = 0.5 a′² + 0.5 b′² + 0.85 (a b′ − b a′) − 0.1 s")
+    # fails if the law of motion is not told, without which nobody can integrate L, or a force of 0 has a line
+    assert "motion: d/dt ∂L/∂a′ = ∂L/∂a + (∂L/∂s) ∂L/∂a′, so for every coordinate; s′ = L" in " ".join(text.split())
+    assert "force on a = " not in text
 
 
 def test_the_contact_form_damps_every_coordinate():
@@ -248,12 +251,12 @@ def test_the_contact_form_damps_every_coordinate():
     assert "− 0.3 s" in str(equation_of(SimpleNamespace(model=both, data=data)))  # pyright: ignore
 
 
-def test_an_equation_is_never_empty():
-    # fails if deviations that are all too wide leave x″ = 0, which is another equation
-    wide = Equation((Term("x″", "x", -2.0, 5.0, "1/s²"), Term("x″", "x′", -0.1, 1.0, "1/s")), ("x″",), "x in m", None)
-    assert str(wide).startswith("x″ = −2(5) x − 0.1")
-    clear = Equation((Term("x″", "x", -2.0, 0.5, "1/s²"), Term("x″", "x′", -0.1, 1.0, "1/s")), ("x″",), "x in m", None)
-    assert str(clear).splitlines()[0] == "x″ = −2.0(5) x"
+def test_no_number_is_left_out_of_an_equation():
+    # fails if a term is dropped where its own deviation is large: with another one it may be determined, and the
+    # equation without it is another motion (a damping of 2.955 and a gain of 4.9 were, by 2.3 rad)
+    terms = (Term("x″", "x", -2.0, 0.5, "1/s²"), Term("x″", "x′", -0.12, 1.0, "1/s", 0.003))
+    wide = Equation(terms, ("x″",), "x in m", None)
+    assert str(wide).splitlines()[0] == "x″ = −2.0(5) x − 0.120(±1) x′"
 
 
 @pytest.mark.slow  # 8 s
@@ -348,9 +351,12 @@ def test_deviations_are_no_smaller_than_rounding(duffing):
     plan, least = Plan.from_dict(duffing.metrics["plan"]), 50 * duffing.metrics["sigma"]
     posterior = laplace(duffing)
     by = 50 / posterior.inflation
-    for term, wide in zip(duffing.equation().terms, _equation(duffing, plan, least).terms, strict=True):
+    for term, wide in zip(
+        duffing.equation().terms, equation_of(duffing, _joint(duffing, plan, least)).terms, strict=True
+    ):
         assert wide.deviation == pytest.approx(by * term.deviation)
-    assert str(_equation(duffing, plan, 0.0)) == str(duffing.equation())
+        assert wide.alone == pytest.approx(50 * term.alone)
+    assert equation_of(duffing, _joint(duffing, plan, 0.0)).terms == duffing.equation().terms
 
 
 @pytest.mark.parametrize("pushes", [True, False])
@@ -375,28 +381,33 @@ def test_lines_of_an_equation_break_between_terms():
     )
     lines = str(Equation(terms, ("x″",), "x in m", None)).splitlines()
     assert [line.strip() for line in lines] == [
-        "x″ = −0.123456(10) x′ − 0.123456(10) |x′| x′ − 0.123456(10) (u_0 + 0.1)",
-        "− 0.123456(10) x − 0.123456(10) x³ − 0.123456(10) x⁵ − 0.123456(10) x⁷",
-        "with x in m; in brackets: standard deviation of the last digits by noise",
-        "alone, without the error of the time step",
+        "x″ = −0.12346(1) x′ − 0.12346(1) |x′| x′ − 0.12346(1) (u_0 + 0.1)",
+        "− 0.12346(1) x − 0.12346(1) x³ − 0.12346(1) x⁵ − 0.12346(1) x⁷",
+        "with x in m; in brackets: standard deviation, of the last digits or as ±, by",
+        "noise alone",
     ]
     assert "brackets" not in str(Equation((Term("x″", "x", -1.0, None, "1/s²"),), ("x″",), "x in m", None))
 
 
 @pytest.mark.parametrize(
-    ("value", "deviation", "written"),
+    ("value", "deviation", "alone", "written"),
     [
-        (4.7512e-8, 2e-10, "4.75(2)e-8"),
-        (3e-5, 2e-4, "0.0000(2)"),
-        (9.9e-5, 1e-9, "9.90000(10)e-5"),
-        (5e-4, 1e-7, "0.00050000(10)"),
-        (0.0, 3e-9, "0(3)e-9"),
-        (25.0, 0.3, "25.0(3)"),
+        (4.7512e-8, 2e-10, 2e-10, "4.75(2)e-8"),
+        (3e-5, 2e-4, 2e-4, "0.0000(2)"),
+        (9.9e-5, 1e-9, 1e-9, "9.9000(1)e-5"),
+        (25.0, 0.3, 0.2, "25.0(3)"),
+        (25.0312, 0.3, 0.02, "25.03(30)"),
+        (2.955123, 4.12, 0.002, "2.955(±4.1)"),  # its digits are those that the motion needs
+        (2.955123, None, 0.002, "2.955"),
+        (2.955123456789, None, None, "2.955123"),
+        (12345678.9, 30.0, 2.0, "1.2345679(30)e7"),
+        (1234.5, 300.0, 20.0, "1234(±300)"),
     ],
 )
-def test_numbers_with_their_deviations(value, deviation, written):
-    # fails if a small coefficient stands behind a row of zeros, or loses its power of ten
-    assert number(value, deviation) == written
+def test_numbers_with_their_deviations(value, deviation, alone, written):
+    # fails if a small coefficient stands behind a row of zeros, or loses its power of ten, or a number that others can
+    # make up for is rounded by its own deviation
+    assert number(value, deviation, alone) == written
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import torch
 from herglotz.data import Trajectories
 from herglotz.training import FitConfig
 from herglotz.training.baseline import estimate_baseline
-from herglotz.training.equation import own_term
+from herglotz.training.equation_words import own_term
 from herglotz.training.quantities import DIMENSIONS, _unit, rounded
 from herglotz.training.structure import dictionaries, start_of_features
 from herglotz.training.task import drag_starts_the_fit

@@ -1,19 +1,24 @@
 """The verdict of a fit: against the precision of the data, in words that name a remedy."""
 
+import importlib
 import math
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 
+from herglotz.cli.common import exit_code
 from herglotz.data import Trajectories, simulate
 from herglotz.data.roughness import AT_THE_NOISE, precision
 from herglotz.scenes import scene
-from herglotz.training import FitConfig, fit, verdict
+from herglotz.training import FitConfig, fit, objectives, verdict
 from herglotz.training.evaluate import _gain
 from herglotz.training.foresight import Foresight
 from herglotz.training.verdict import Errors, in_words
 
+evaluate_module = importlib.import_module("herglotz.training.evaluate")
 GOOD = {"follows_data": True, "objective": "trajectory"}
 
 
@@ -31,7 +36,16 @@ KNOWN = Foresight(start=0.0, parameters=0.01, hidden=0.02, name="q1^3", horizon=
         (0.011, 0.012, 1.2, None, "does not fit beyond the recording"),
         (0.011, 0.012, 0.013, replace(KNOWN, parameters=0.2), "does not fit: too little was recorded"),
         (0.011, 0.012, 0.013, replace(KNOWN, hidden=0.2), "does not fit: too little was recorded"),
-        (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit: too little was recorded"),
+        (0.011, 0.012, 0.013, replace(KNOWN, reached=False), "does not fit: the model's own motion breaks off"),
+        (0.03, 0.03, 0.03, replace(KNOWN, parameters=0.2), "does not fit: a force is missing"),  # more of it tells none
+        (0.011, 0.012, 0.013, replace(KNOWN, parameters=4.0), "does not fit: such motions do not tell"),
+        (
+            0.011,
+            0.012,
+            math.inf,
+            replace(KNOWN, start=math.inf),
+            "does not fit",
+        ),  # it left the world: no start explains
         (0.2, 0.012, 0.013, KNOWN, "does not fit"),
         (0.011, 0.2, 0.013, KNOWN, "does not fit"),
         (0.011, 0.012, math.inf, KNOWN, "does not fit"),
@@ -45,6 +59,121 @@ def test_words(windows, unseen, free, ahead, expected):
     text = in_words(Errors(windows, unseen, free, noise=0.01, spread=1.0), ahead, GOOD)
     assert text.startswith(expected)
     assert ("Try " in text) == (expected.startswith("does not fit"))
+
+
+@pytest.mark.parametrize(
+    ("noise", "error", "fits"),
+    [
+        (1e-6, 0.04, True),  # 40 000 × the noise, and less than a twentieth of the spread
+        (1e-6, 0.051, False),  # 510 × what counts as exact
+        (0.0025, 0.051, False),
+        (0.003, 0.059, True),  # less than 20 × the noise
+        (0.003, 0.061, False),
+        (0.01, 0.099, True),
+        (0.01, 0.101, False),  # a tenth of the spread is no motion of the model, whatever the noise
+        (0.1, 0.29, True),
+        (0.1, 0.31, False),
+        (math.inf, 0.099, True),  # no multiple of a noise that is unknown
+        (math.inf, 0.101, False),
+    ],
+)
+@pytest.mark.parametrize("where", ["windows", "unseen", "free"])
+def test_an_error_that_is_no_fit(noise, error, fits, where):
+    # fails if a run that misses by 850 × the noise "fits, worse than the noise", or one of the errors may be larger
+    errors = {name: min(noise, 0.01) for name in ("windows", "unseen", "free")} | {where: error}
+    text = in_words(Errors(**errors, noise=noise, spread=1.0), KNOWN, GOOD)
+    assert text.startswith("does not fit") is not fits, text
+    run: Any = SimpleNamespace(metrics={"verdict": text})
+    assert exit_code(run) == (0 if fits else 3)
+
+
+def test_a_precision_that_is_not_known_is_said_to_be_unknown():
+    # fails if recordings that are too short to show their noise are taken for exact ones, "worse than the noise by 120"
+    unknown = Errors(0.012, 0.012, 0.013, noise=math.inf, spread=1.0, unit="m")
+    text = in_words(unknown, KNOWN, GOOD)
+    assert text.startswith("fits to the noise: ")
+    assert "the data's precision is unknown, for no training part has 9 samples, their spread is 1 m" in text
+    worse = in_words(replace(unknown, free=0.036), KNOWN, GOOD)
+    assert worse.startswith(
+        "fits, worse than the noise, for which its misfit of the training data stands, by a factor of 3:"
+    )
+    # fails if a precision of exact data is told as what is asked of a fit to them
+    exact = str(replace(unknown, noise=2e-9))
+    assert "the data's precision is 2e-09 m (errors below 0.0001 m count as none)" in exact
+    assert "count as none" not in str(replace(unknown, noise=0.01))
+
+
+@pytest.mark.parametrize(
+    ("windows", "unseen", "free", "why"),
+    [
+        (0.001, 0.001, 0.026, "in one run by 0.026 (26 times as much, as errors of one run grow with its time)"),
+        (0.001, 0.026, 0.026, "unseen data by 0.026 (26 times as much, where the fit has not been)"),
+        (0.026, 0.001, 0.001, "unseen data by 0.001 (less: that part asks less of the model)"),
+        (0.001, 0.002, 0.019, None),
+    ],
+)  # fmt: skip
+def test_figures_that_are_far_apart_have_a_reason(windows, unseen, free, why):
+    # fails if one sentence has two errors 26 times apart and no word on why
+    text = str(Errors(windows, unseen, free, noise=0.01, spread=1.0))
+    assert (why in text) if why else "(" not in text
+
+
+def test_a_run_that_fails_is_told_as_one():
+    # fails if errors are "inf", beside a training RMS of 0
+    text = in_words(Errors(math.inf, math.inf, math.inf, noise=0.01, spread=1.0), None, GOOD)
+    assert text.startswith(
+        "does not fit: free runs over 20 steps fail on the training data, fail on unseen data, and one"
+    )
+    assert "run over all unseen time breaks off or leaves the world" in text
+    assert "inf" not in text
+
+
+@pytest.mark.parametrize(("open_to", "longer"), [(0.11, 2), (0.2, 4), (0.5, 25)])
+def test_too_little_says_how_much_would_do(open_to, longer):
+    # fails if "a longer recording" is all that is said: what is left open falls with the root of the samples
+    text = in_words(Errors(0.011, 0.012, 0.013, noise=0.01, spread=1.0), replace(KNOWN, parameters=open_to), GOOD)
+    assert f"Try a recording {longer} times as long" in text
+
+
+def test_a_free_run_that_leaves_the_world_is_a_failed_one(monkeypatch):
+    # fails if 2.8e40 rad is an error like others, or the start, which nobody knows so far, excuses it
+    measured = evaluate_module._errors
+
+    def gone(*arguments):
+        numbers, free = measured(*arguments)
+        return numbers | {"extrapolation_rms": 2.8e40}, free
+
+    monkeypatch.setattr(evaluate_module, "_errors", gone)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=60, h=0.2, noise=0.01, seed=3)
+    run = fit(data, FitConfig(departures=(2e-3,)), progress=False)
+    assert run.metrics["extrapolation_rms"] is None
+    assert run.metrics["verdict"].startswith("does not fit: ")
+    assert "one run over all unseen time breaks off or leaves the world" in run.metrics["verdict"]
+    assert exit_code(run) == 3
+    assert "Note: the free run over the unseen samples leaves the world" in " ".join(run.summary().split())
+    assert "2.8e" not in run.summary()
+
+
+def test_a_model_that_follows_no_data_misses_them(monkeypatch):
+    # fails if "training RMS 0" stands beside errors of free runs: the recorded positions are in place of its states
+    monkeypatch.setattr(objectives, "fit_trajectories", lambda *_, **__: None)
+    data = simulate(scene("damped_pendulum"), trajectories=2, steps=40, h=0.2, noise=0.01, seed=3)
+    run = fit(data, FitConfig(departures=(2e-3,), objective="trajectory"), progress=False)
+    assert not run.metrics["follows_data"]
+    assert run.metrics["train_rms"] == run.metrics["window_rms"]
+    assert run.metrics["train_rms"] != 0
+    assert exit_code(run) == 3
+
+
+@pytest.mark.parametrize(("gamma", "pushing"), [(0.2, False), (-0.2, True)])
+def test_friction_that_pushes_is_said(gamma, pushing):
+    # fails if a fit keeps to itself that its friction creates energy, or says so of one that brakes
+    t = 0.1 * torch.arange(200, dtype=torch.float64)
+    noise = 0.002 * torch.randn(200, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    q = 0.3 * (-gamma / 2 * t).exp() * (1.5 * t).cos()
+    run = fit(Trajectories.of(t, (q + noise)[:, None]), progress=False)
+    assert ("Friction pushes: " in run.metrics["verdict"]) is pushing, run.metrics["verdict"]
+    assert exit_code(run) == (3 if run.metrics["verdict"].startswith("does not fit") else 0)
 
 
 def test_a_verdict_on_degrees_is_in_degrees():  # fails if a reader whose file has degrees is told of radians alone

@@ -1,0 +1,129 @@
+"""What stands below an equation so that it can be integrated: arrival of inputs, zeros of sensors, the model's step."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from torch import Tensor
+
+from herglotz.data.trajectories import GAP
+from herglotz.data.units import common_unit, size
+from herglotz.errors import InputError
+from herglotz.training.baseline import JITTER
+from herglotz.training.equation_terms import is_formula, newtonian
+from herglotz.training.equation_words import plain
+from herglotz.training.fitted_run import FittedRun
+from herglotz.training.free_run import free_runs
+from herglotz.training.problems.grid import segment_grid, step_inputs
+
+DIGITS = 7  # of the zero and the scale of a sensor
+# Steps of order 2 leave three quarters of their error when they are halved: forces are of order 2 in rules of order 4.
+HALVED = 4 / 3
+BETWEEN = {
+    "zero": "held from each sample to the next",
+    "first": "straight between the samples",
+    "smooth": "polynomials between the samples",
+}
+# A model's own step, for where exact integration is another motion (`models/terms.py`, `models/order4.py`).
+RULE = (
+    "step it as the model does: c p + ∂L_d/∂q + c (h/2) f = 0, p₊ = ∂L_d/∂q₊ + (h/2) f, s₊ = s + L_d with {parts}, "
+    "c = exp(h ∂L/∂s) and L_d = {L_d}; K, ∂L/∂s and f are taken at q̄ = (q + q₊)/2 and v = (q₊ − q)/h{dry}"
+)
+OF_ORDER = {
+    2: "(c − 1)(s − (h/2) V(q)) + √c h K − (h/2)(V(q) + V(q₊))",
+    4: "(c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − (h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), "
+    "e = K_q − V_q − K_qv v − γ K_v, M = K_vv",
+}
+DRY = ", but dry friction, of q and v, acts by h in place of h/2 in the first of them, and not in the second"
+
+
+def notes_of(run: FittedRun) -> tuple[str, ...]:
+    """The notes of a run, those that it has something for."""
+    return tuple(filter(None, (_inputs(run), _sensors(run), _steps(run))))
+
+
+def _inputs(run: FittedRun) -> str:
+    if not run.model.inputs or run.decided.frequencies:
+        return ""
+    hold, unit = run.arrival.hold, "" if run.data.time_unit == "1" else f" {run.data.time_unit}"
+    names = ", ".join(name for name, _ in run.data.input_labels)
+    delay, lag = run.arrival.late
+    late = [f"acting {delay:.6g}{unit} later"] if delay else []
+    late += [f"through a lag T = {lag:.6g}{unit}, T f′ = {names} − f, f being what acts"] if lag else []
+    return ", ".join([f"{names}: {BETWEEN.get(hold or 'zero', hold)}", *late])
+
+
+def _sensors(run: FittedRun) -> str:
+    """What makes a coordinate of the equation of the reading of its sensor."""
+    told, names, found = run.reading, run.data.names, []
+    zeros = (run.metrics.get("plan") or {}).get("zeros") or ()
+    for of, numbers in (("times the scale", told.get("sensor_scales")), ("less the zero", told.get("sensor_zeros")),
+                        ("less the zero", zeros)):  # fmt: skip
+        values = [plain(float(x), DIGITS) for x in numbers or ()]
+        each = [f"{name} {', '.join(values[i :: len(names)])}" for i, name in enumerate(names)] if values else []
+        several = ", recording after recording" if len(values) > len(names) else ""
+        found += [f"{of} of its sensor ({'; '.join(each)}{several})"] if values else []
+    return f"a coordinate is its reading {', '.join(found)}" if found else ""
+
+
+def _steps(run: FittedRun) -> str:
+    """The model's step and rule, and by how much the exact motion of the equation departs from them."""
+    time, model = "" if run.data.time_unit == "1" else f" {run.data.time_unit}", run.model
+    what = f"the model's steps are {run.h:.7g}{time}, its rule of order {model.config.order}"
+    found = departure(run)
+    if found is None:
+        return what
+    unit = common_unit(run.data.units)
+    by = f"{size(found.moved, unit, bool(run.data.degrees))}, " if unit or run.data.dof == 1 else ""
+    ratio = f"{found.moved / found.missed:.2g} times what it misses the data by"
+    told = f"{what}; integrated exactly, the equation departs from it by {by}{ratio}"
+    if found.moved <= found.missed:
+        return told
+    parts = "L = K − V + s ∂L/∂s, f the forces"
+    if newtonian(model):
+        rate = 0.0 if model.damping is None else float(model.damping.rate.detach())  # type: ignore[operator]
+        loads = ", constants on angles among them" if any(text.startswith("load") for text in model.config.drag) else ""
+        parts = f"L = K − V − γ s, γ = {plain(rate, DIGITS)}, V of the forces by position, f the others without −γ m v"
+        parts += loads
+    dry = DRY if model.friction is not None and model.friction.sticking else ""
+    return f"{told}: {RULE.format(parts=parts, L_d=OF_ORDER[model.config.order], dry=dry)}"
+
+
+class Departure(NamedTuple):
+    """RMS over all coordinates, each over its balance."""
+
+    moved: float  # by which the model's steps miss the exact motion of its equation
+    missed: float  # by which the model misses the data
+
+
+def departure(run: FittedRun) -> Departure | None:
+    """What the model's steps miss of the exact motion, by free runs of all recordings with these and with halved steps.
+
+    None where one breaks off, the model meets the data exactly, or is more than its equation.
+    """
+    data = run.data.unwrapped()
+    if not is_formula(run.model):
+        return None
+    longest = longest_step(run)
+    try:
+        whole, halved = (free_run(run, max_step) for max_step in (longest, longest / 2))
+    except InputError:
+        return None
+    changes = whole - data.q, HALVED * (halved - whole)
+    missed, moved = (float((x / data.balance).square().mean().sqrt()) for x in changes)
+    return Departure(moved, missed) if missed > 0 and math.isfinite(moved) and math.isfinite(missed) else None
+
+
+def longest_step(run: FittedRun) -> float:
+    """The longest step that the model takes along a recording."""
+    return GAP * run.h if run.decided.substeps == 1 else JITTER * run.h
+
+
+def free_run(run: FittedRun, max_step: float) -> Tensor:
+    """Free runs of all recordings from their first states with steps of at most `max_step`, (N, n)."""
+    data = run.data.unwrapped()
+    grid = segment_grid(data, data.samples, max_step)
+    start = run.states.joined[grid.start_sample].detach()
+    nodes = free_runs(run.stepper, data, grid, start, step_inputs(run.model, data, grid))
+    return grid.at_samples(nodes[..., : data.dof]).detach()

@@ -1,0 +1,261 @@
+"""What moves a model, term by term: the left side, the text, the unit and the number of each, as tensors.
+
+A number is a tensor of the model's parameters, so that its derivatives say which of them it is made of. Numbers inside
+a text, such as the width of a tanh or the zero of an input, are rounded by the same rule as those in front of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
+
+import torch
+from torch import Tensor
+
+from herglotz.models import ContactLagrangian
+from herglotz.models.drag import DragFeature, parse_drag
+from herglotz.models.feature_grammar import Feature
+from herglotz.models.feature_kinetic import FeatureKinetic
+from herglotz.models.feature_potential import Combination, baseline_is_named, sorted_features
+from herglotz.models.terms import AffineDamping, Kinetic, LinearDamping
+from herglotz.models.translations import across_in_words
+from herglotz.training.equation_numbers import Numbers
+from herglotz.training.equation_words import (
+    distance,
+    drag_in_words,
+    feature_in_words,
+    own_term,
+    raised,
+    slope,
+    unit_of,
+)
+from herglotz.training.fitted_run import FittedRun
+
+MORE = "what is no formula moves the model, too: these lines alone are another motion; herglotz export writes all of it"
+
+
+@dataclass(frozen=True)
+class Line:
+    """value · what, on the right-hand side of one line."""
+
+    left: str
+    what: str
+    unit: str
+    value: Tensor  # ()
+    of: str = ""  # the coordinate whose line it is; empty: it stands in L
+
+
+def is_formula(model: ContactLagrangian) -> bool:
+    """Whether the lines are the whole model: no network, and no term by name, which may be anything."""
+    networks = (model.potential.network, model.correction, model.action, getattr(model.damping, "network", None))
+    named = model.config.baseline and not model.config.mass_width and not model.config.terms
+    return named and all(network is None for network in networks)
+
+
+def newtonian(model: ContactLagrangian) -> bool:
+    """Whether every coordinate has an equation of its own: one mass each, and no action s in the motion."""
+    made_of, config = model.capabilities, model.config
+    alone = made_of.constant_mass and (config.dof == 1 or config.diagonal or config.alike)
+    return config.baseline and alone and not made_of.carries_s
+
+
+class Reader:
+    """The terms of a run's model: M q̈ = forces, a line a coordinate, or L with the forces beside it."""
+
+    def __init__(self, run: FittedRun, numbers: Numbers):
+        self.model, self.data, self.shown = run.model, run.data, numbers.shown
+        self.config, self.names, self.time = run.model.config, run.data.names, run.data.time_unit
+        self.newton, self.distance = newtonian(run.model), distance(run.data.names)
+        if self.newton:
+            of_each = zip(self._masses().diagonal(), self.names, strict=True)
+            masses = [(self.shown(m, f"the mass of {name}", True), name) for m, name in of_each]
+            self.lefts = self.own = [f"{'' if m == '1' else m + ' '}{name}″" for m, name in masses]
+        else:
+            self.own = [f"force on {name}" for name in self.names]
+            self.lefts = ["L", *self.own]
+        self.line_of = dict(zip(self.own, self.names, strict=True))
+
+    def lines(self) -> Iterator[Line]:
+        """Those of every term whose number is not 0."""
+        parts = (self._kinetic(), self._damping(), self._friction(), self._inputs(), self._springs(), self._features())
+        for part in parts:
+            yield from (
+                replace(line, of=self.line_of.get(line.left, "")) for line in part if float(line.value.detach()) != 0.0
+            )
+
+    def _masses(self) -> Tensor:
+        kinetic = getattr(self.model.kinetic, "base", self.model.kinetic)
+        assert isinstance(kinetic, Kinetic)
+        return kinetic.mass()
+
+    def _kinetic(self) -> Iterator[Line]:
+        """½ vᵀ M v with a constant M, and products of speeds, where L is printed as one function."""
+        kinetic, names = self.model.kinetic, self.names
+        if self.newton or not self.config.baseline:
+            return
+        if isinstance(getattr(kinetic, "base", kinetic), Kinetic):
+            mass = self._masses()
+            for i, j in combinations_with_replacement(range(len(names)), 2):
+                speeds = f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′"
+                yield Line("L", speeds, "", mass[i, j] * (0.5 if i == j else 1.0))
+        if isinstance(kinetic, FeatureKinetic):
+            moving = [sorted_features(x, self.config.angles)[1] for x in (self.config.features, self.config.known)]
+            for feature, value in self._numbers(kinetic.sum, *moving):
+                yield Line("L", feature_in_words(feature, names), "", value)
+
+    def _damping(self) -> Iterator[Line]:
+        """Damping by the action, in L; that of a mass of its own stands with its friction."""
+        damping = self.model.damping
+        if not isinstance(damping, (LinearDamping, AffineDamping)) or self.newton:
+            return
+        yield Line("L", "s", unit_of("1", 0, self.time, 1), -damping.rate)
+        if isinstance(damping, AffineDamping):
+            for i, name in enumerate(self.names):
+                yield Line("L", f"{name}′ s", "", damping.drag[i])
+
+    def _friction(self) -> Iterator[Line]:
+        """Friction of each coordinate, between coordinates, and by name."""
+        model, data = self.model, self.data
+        for i, (left, name) in enumerate(zip(self.own, self.names, strict=True)):
+            viscous = None if model.friction is None else -model.friction.viscous[i]
+            if self.newton and isinstance(model.damping, LinearDamping):  # the contact form damps every momentum alike
+                decay = -model.damping.rate * self._masses()[i, i]
+                viscous = decay if viscous is None else decay + viscous
+            per_time = unit_of(data.units[i], 0, self.time, 1)
+            if viscous is not None:
+                yield Line(left, f"{name}′", per_time, viscous)
+            if model.coupling is not None:
+                between = model.coupling.matrix()
+                others = (j for j in range(len(self.names)) if j != i)
+                yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
+            yield from self._dry(i, left)
+        for g, text in enumerate(self.config.drag):
+            assert model.drag is not None
+            f = parse_drag(text, self.config.angles)
+            for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
+                size = unit_of(data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
+                value = model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
+                yield Line(self.own[i], self._drag_in_words(f, i), size, value)
+
+    def _dry(self, i: int, left: str) -> Iterator[Line]:
+        """Dry friction of one coordinate: set-valued friction that would push is none."""
+        friction, name = self.model.friction, self.names[i]
+        if friction is None or not friction.dry:
+            return
+        unit, coulomb, excess = unit_of(self.data.units[i], 1, self.time, 2), friction.coulomb, friction.breakaway
+        if friction.sticking:
+            coulomb, excess = coulomb if self._dry_by_position(i) else coulomb.relu(), excess.relu()
+        yield Line(left, self._sign(i), unit, -coulomb[i])
+        if float(excess[i].detach()):  # the width of a force that is not there is no number of the equation
+            width = (friction.sharpest + friction.log_stribeck.exp())[i]
+            width = self.shown(width, f"the speed over which breakaway of {name} fades")
+            yield Line(left, f"exp(−({name}′/{width})²) {self._sign(i)}", unit, -excess[i])
+
+    def _dry_by_position(self, i: int) -> bool:
+        found = (parse_drag(text, self.config.angles) for text in self.config.drag)
+        return any(f.dry and f.on == i for f in found)
+
+    def _sign(self, i: int) -> str:
+        """The direction of a speed, as dry friction takes it."""
+        friction, name = self.model.friction, self.names[i]
+        assert friction is not None  # dry friction is part of it
+        if friction.sticking:
+            return f"sgn({name}′)"
+        width = self.shown(friction.widths[0][i], f"the speed below which dry friction of {name} is smooth")
+        return f"tanh({name}′/{width})"
+
+    def _drag_in_words(self, f: DragFeature, i: int) -> str:
+        return drag_in_words(f, i, self.names, self._sign(f.on) if f.dry else "")
+
+    def _inputs(self) -> Iterator[Line]:
+        """Each input less what its sensor shows where nothing acts."""
+        friction = self.model.friction
+        for j in range(self.config.inputs):
+            assert friction is not None
+            zero = None if friction.input_zero is None else friction.input_zero[j]
+            what = self.data.input_labels[j][0]
+            if zero is not None and float(zero.detach()):
+                text = self.shown(zero, f"the zero of {what}")
+                what = f"({what} {f'+ {text[1:]}' if text.startswith('−') else f'− {text}'})"
+            yield from (Line(left, what, "", friction.input_map[i, j]) for i, left in enumerate(self.own))
+
+    def _springs(self) -> Iterator[Line]:
+        """The baseline's k (1 − cos x) + b sin x or k x²/2 + b x, x a coordinate or what translations leave of it."""
+        V, n = self.model.potential, len(self.names)
+        if not self.config.baseline:
+            return
+        k, b = V.stiffness, V.tilt
+        if baseline_is_named(self.config):  # −k, b of an angle; k/2, b of a length
+            assert V.features is not None
+            own = V.features.sum.coefficient[: 2 * n].reshape(n, 2)
+            k, b = own[:, 0] * own.new_tensor([-1.0 if angle else 2.0 for angle in V.angles]), own[:, 1]
+        across = torch.eye(n, dtype=torch.float64) if V.across is None else V.across
+        for j, ((x, w), angle) in enumerate(zip(across_in_words(across, self.names), V.angles, strict=True)):
+            if x and not self.newton:
+                yield from self._spring_in_L(x, w, angle, k[j], b[j])
+            for i in range(n if x and self.newton else 0):
+                by = float(across[j, i])
+                for power, value in ((2, k[j] * (1.0 if angle else w)), (1, b[j])):
+                    size = unit_of(self.data.units[i], 1 if angle else 2 - power, self.time, 2)
+                    what, factor = own_term(x, angle, power, True)
+                    yield Line(self.lefts[i], what, size, value * by * factor)
+
+    def _spring_in_L(self, x: str, w: float, angle: bool, k: Tensor, b: Tensor) -> Iterator[Line]:
+        for power, value in ((2, k * (1.0 if angle else w**2)), (1, b * (1.0 if angle else w))):
+            what, factor = own_term(x, angle, power, False)
+            yield Line("L", what, "", value * factor)
+        if angle and self.model.capabilities.carries_s:  # elsewhere a constant moves nothing
+            yield Line("L", "", "", -k)
+
+    def _features(self) -> Iterator[Line]:
+        """Named features of the potential: their forces on each coordinate, or their part of L."""
+        features, config = self.model.potential.features, self.config
+        if features is None:
+            return
+        first = 2 * config.dof if baseline_is_named(config) else 0
+        learned = sorted_features(config.features, config.angles)[0]
+        known = sorted_features(config.known, config.angles)[0]
+        for feature, value in self._numbers(features.sum, learned, known, first):
+            if not self.newton:
+                yield Line("L", feature_in_words(feature, self.names), "", -value)
+                continue
+            for i in range(len(self.names)):
+                for product in feature:
+                    if product.function == "radius" or product.form[i]:
+                        what, by, power = slope(product, i, self.names)
+                        yield Line(self.lefts[i], what, unit_of(self.data.units[i], power, self.time, 2), -by * value)
+
+    @staticmethod
+    def _numbers(
+        of: Combination, learned: list[Feature], known: list[Feature], first: int = 0
+    ) -> Iterator[tuple[Feature, Tensor]]:
+        """Each feature with its coefficient; those that are known have theirs in their text."""
+        yield from zip(learned, of.coefficient[first:], strict=False)
+        one = of.coefficient.new_ones(())
+        yield from ((feature, one) for feature in known)
+
+    def explained(self) -> list[str]:
+        """What the lines need to be integrated: the symbols in them, and how dry friction holds."""
+        model, names = self.model, self.names
+        found = [] if is_formula(model) else [MORE]
+        if any(p.function == "radius" for p in self._products()):
+            found.append(f"{self.distance} = √({' + '.join(raised(name, 2) for name in names)})")
+        if not self.newton:
+            x, by_s = names[0], model.damping is not None
+            more = f" + (∂L/∂s) ∂L/∂{x}′" if by_s else ""
+            forces = f" + the force on {x}" if model.friction is not None else ""
+            found.append(
+                f"motion: d/dt ∂L/∂{x}′ = ∂L/∂{x}{more}{forces}{', so for every coordinate' * (len(names) > 1)}"
+                + ("; s′ = L" if by_s else "")
+            )
+        if model.friction is not None and model.friction.sticking:
+            held = "where a speed is 0, it stays 0 while the factor of its sgn can balance the other forces"
+            more = "; a factor that would push is 0" if any(map(self._dry_by_position, range(len(names)))) else ""
+            found.append(held + more)
+        return found
+
+    def _products(self) -> Iterator:
+        for text in (self.config.features, self.config.known):
+            for feature in sorted_features(text, self.config.angles)[0]:
+                yield from feature

@@ -1,0 +1,126 @@
+"""Combinations of numbers that data do not determine: eigenvectors of their information with small eigenvalues.
+
+Scaled to a unit diagonal the information has no units, and a small eigenvalue λ is a combination that moves the
+prediction √(λ_max/λ) times less than the best determined one: the condition index of Belsley, Kuh & Welsch (1980), who
+call 30 harmful. Its eigenvector says which numbers are traded. Where eigenvalues are equal, as those of exact null
+directions are, any basis of their span consists of eigenvectors; the span is then described by sparse vectors
+(`sparse_basis`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+HARMFUL = 30.0  # condition index above which parameters are not determined one by one (Belsley, Kuh & Welsch 1980)
+LARGEST = 1e7  # condition index of an exact null direction, up to rounding
+PART = 0.05  # a parameter with a smaller share of a combination is not named
+# Eigenvalues of the scaled information closer than this (of the largest) count as equal: rounding moves them by some
+# 1e-15, which turns eigenvectors across a gap g by 1e-15/g, so that names stay below PART by a margin of 1e4.
+EQUAL = 1e-10
+NEAR_LARGEST = 0.9  # pivots this near the largest are ties, and the first is taken: rounding must not choose
+WORDS = {
+    "kinetic.log_diagonal": "the mass",
+    "kinetic.off_diagonal": "the coupling of masses",
+    "potential.stiffness": "the stiffness k of the potential",
+    "potential.tilt": "the tilt b of the potential (a constant force at q = 0)",
+    "damping.rate": "the damping rate γ",
+    "damping.drag": "the drag",
+    "friction.viscous": "viscous friction",
+    "friction.coulomb": "dry friction",
+    "friction.breakaway": "the excess of dry friction at breakaway",
+    "friction.log_smooth": "the speed below which dry friction is smooth",
+    "friction.log_stribeck": "the speed over which breakaway fades",
+    "friction.input_map": "the map from inputs to forces",
+    "friction.input_zero": "the zero of the input's sensor",
+}
+
+
+@dataclass(frozen=True)
+class Trade:
+    """Parameters of which the data determine some combination, and not each one alone."""
+
+    index: float  # condition index: how many times less the combination moves the prediction than the best known one
+    parts: tuple[tuple[str, float], ...]  # parameters and their shares of the combination, the largest first
+
+    def __str__(self) -> str:
+        names = [in_words(name) for name, _ in self.parts]
+        if len(names) == 1:
+            return f"{names[0]} has next to no effect on these data: its value is the prior's, not a measurement"
+        listed = ", ".join(names[:-1]) + " and " + names[-1]
+        how = "cannot be told apart at all" if self.index >= LARGEST else f"are hard to tell apart ({self.index:.0f}:1)"
+        return f"{listed} {how}: change one, the others make up for it, and the prediction stays the same"
+
+
+def joined(trades: Sequence[Trade]) -> list[Trade]:
+    """Trades that share a parameter as one, with the index of the worst."""
+    found: list[Trade] = []
+    for trade in trades:
+        parts, apart = {name for name, _ in trade.parts}, []
+        for other in found:
+            known = {name for name, _ in other.parts}
+            if parts & known:
+                more = tuple(part for part in trade.parts if part[0] not in known)
+                trade = Trade(max(trade.index, other.index), (*other.parts, *more))
+                parts |= known
+            else:
+                apart.append(other)
+        found = [*apart, trade]
+    return found
+
+
+def in_words(name: str) -> str:
+    """A parameter's name, `friction.viscous[1]`, as a newcomer may read it."""
+    stem, _, entry = name.partition("[")
+    return WORDS.get(stem, stem) + (f", entry {int(entry[:-1]) + 1}" if entry else "")
+
+
+def combinations(M: Tensor, alone: Tensor, names: Sequence[str]) -> list[Trade]:
+    """The combinations of numbers with the information M (K, K) that are not determined, the worst first.
+
+    `alone` (K,) is what there would be of each, prior included, were all others known.
+    """
+    # A parameter of no effect has a diagonal of rounding size, of either sign.
+    seen = M.diagonal() > alone / LARGEST**2
+    found = [Trade(LARGEST, ((names[i], 1.0),)) for i in (~seen).nonzero()[:, 0].tolist()]
+    kept, M = [name for name, is_seen in zip(names, seen.tolist(), strict=True) if is_seen], M[seen][:, seen]
+    if not kept:
+        return found
+    size = M.diagonal().sqrt()
+    M = M / size[:, None] / size
+    values, vectors = torch.linalg.eigh(M)
+    for vector in _within_equal(values, vectors).T:  # values ascend
+        value = vector @ M @ vector
+        condition = float((values[-1] / value.clamp_min(values[-1] / LARGEST**2)).sqrt())
+        if condition < HARMFUL:
+            break
+        share = vector.square()
+        order = [k for k in share.argsort(descending=True).tolist() if share[k] >= PART]
+        found.append(Trade(condition, tuple((kept[k], float(share[k])) for k in order)))
+    return found
+
+
+def _within_equal(values: Tensor, vectors: Tensor) -> Tensor:
+    """The eigenvectors, those of equal eigenvalues replaced by a sparse basis of their span; values ascend."""
+    groups = vectors.tensor_split((values.diff() > EQUAL * values[-1]).nonzero()[:, 0] + 1, 1)
+    return torch.cat([group if group.shape[1] == 1 else sparse_basis(group) for group in groups], 1)
+
+
+def sparse_basis(span: Tensor) -> Tensor:
+    """A basis of the same span, (m, k), in reduced echelon form, columns of length 1: few entries differ from 0.
+
+    Where the span has a basis of vectors that share no entry, this is that basis.
+    """
+    basis = span.clone()
+    for j in range(basis.shape[1]):
+        size = basis[:, j:].norm(dim=1)
+        row = int((size >= NEAR_LARGEST * size.max()).nonzero()[0])
+        column = j + int(basis[row, j:].abs().argmax())
+        basis[:, [j, column]] = basis[:, [column, j]]
+        basis[:, j] /= basis[row, j].clone()
+        others = torch.arange(basis.shape[1]) != j
+        basis[:, others] -= basis[:, j : j + 1] * basis[row, others]
+    return basis / basis.norm(dim=0)
