@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data.checks import check_alike
+from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.csv_dialect import is_row_of_numbers
 from herglotz.data.csv_format import read_csv, write_csv
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
@@ -52,6 +54,7 @@ FORMATS = (
     Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_packed, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
+PROSE = 65536  # bytes of a text file in which a recording has a row of numbers
 SHOWN = 76  # characters of the note that names the files of a folder: a line of a terminal
 
 
@@ -156,10 +159,19 @@ def _files(path: Path) -> list[Path]:
     if (path / "model.pt").exists():
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
     known = {one.suffix for one in FORMATS}
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    every = (file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    found = sorted(file for file in every if not _is_prose(file))
     if not found:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
     return found
+
+
+def _is_prose(file: Path) -> bool:
+    """Whether a text file beside recordings is none itself: a README, or a text without a row of numbers."""
+    if file.suffix.lower() != ".txt" or not file.is_file():
+        return False
+    lines = read_bytes(file, PROSE).decode("utf-8", "replace").splitlines() if file.stat().st_size else []
+    return file.stem.casefold() == "readme" or not any(map(is_row_of_numbers, lines))
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
@@ -171,7 +183,7 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
             raise InputError(f"{file} beside {files[0].name}: {error}") from None
     shared = set(sets[0].notes).intersection(*(one.notes for one in sets))
     named = (
-        replace(one, notes=tuple(note if note in shared else f"{file.name}: {note}" for note in one.notes))
+        replace(one, notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes))
         for file, one in zip(files, sets, strict=True)
     )
     return Trajectories.cat(named)

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, check, check_alike, offsets_of, unnamed
-from herglotz.data.csv_columns import column_table
+from herglotz.data.column_table import column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
