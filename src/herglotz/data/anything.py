@@ -17,6 +17,7 @@ from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, without
+from herglotz.data.jumps import refuse_jumps
 from herglotz.data.readers import angles_like, load
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
@@ -153,6 +154,7 @@ def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): plain(x) for name, x in data.items()})
     found = in_radians_and_seconds(from_frame(frame, wanted, where))
+    refuse_jumps(found, wanted)
     return found if like is None else angles_like(found, like)
 
 

@@ -17,6 +17,7 @@ from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
+from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import measured
@@ -100,7 +101,8 @@ def load(
     Raises
     ------
     InputError
-        If the format is not known (the message lists those that are), or from the reader of that format.
+        If the format is not known (the message lists those that are), a coordinate of a table that nobody named moves
+        in jumps alone, or from the reader of that format.
     """
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns)
@@ -109,6 +111,7 @@ def load(
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
+    refuse_jumps(found, wanted)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = found.with_angles(angles)
