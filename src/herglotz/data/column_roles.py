@@ -47,6 +47,7 @@ _WORDS = {
     "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm",
     "position": "position positions pos angle angles displacement height elongation location coordinate "
                 "winkel weg lage",
+    "angle": "theta phi psi angle alpha beta gamma winkel θ φ ϕ ψ α β",
     "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle",
     "attribute": "motor current input inputs control controls",  # of a position: motor_angle; else of an input
     "reading": "pot potentiometer lvdt encoder laser",  # of a position, in volts
@@ -87,6 +88,11 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
 def kind_of(unit: str) -> str:
     """The kind of a unit, a key of `KINDS`; "" where there is no unit, or one that many quantities have."""
     return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
+
+
+def is_angular(name: str) -> bool:
+    """Whether a name is one that is given to angles."""
+    return bool(words_of(name) & WORDS["angle"])
 
 
 def is_timed(words: frozenset[str]) -> bool:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-import re
+import math
 from typing import Any
 
-ANGULAR = re.compile(r"(theta|phi|psi|angle|alpha|beta)(_?\d+|_.*)?", re.I)  # names that are given to angles
+from herglotz.data.column_roles import is_angular
+
 WARNING = "warning: "  # begins a note that a user should see outside of the table, too
 LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
 
@@ -41,8 +42,9 @@ def column_rows(data: Any) -> list[tuple[str, str, str]]:
         if role == "coordinate" and name in now:
             role = "angle" if now[name][1] else role
             unit = _converted(unit, now[name][0])
-            if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
-                unit = f"- (an angle in rad? --angles {name})"
+            if role == "coordinate" and not unit and is_angular(name):
+                far = float(data.q[:, data.names.index(name)].abs().max()) > 2 * math.pi
+                unit = f"- (an angle in {'deg? --degrees' if far else 'rad? --angles'} {name})"
         elif role == "time":
             unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
         rows.append((name, role, unit or "-"))

@@ -13,6 +13,7 @@ from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted
 from herglotz.data.csv_dialect import is_row_of_numbers
 from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
@@ -62,7 +63,8 @@ SHOWN = 76  # characters of the note that names the files of a folder: a line of
 def load(
     path: PathLike,
     *,
-    angles: Names | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
+    angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
+    degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -78,7 +80,10 @@ def load(
         .csv (or such a table in .txt, .tsv, .dat), .npz, .txt of Schmidt & Lipson, or with the extra `tables` .parquet,
         .h5 or .mat; or a folder of such files: each holds a recording, in the order of their names.
     angles
-        Coordinates that are angles; left out: those in rad or deg; () for none.
+        Coordinates that are angles; True for all; left out: those in rad or deg; () for none.
+    degrees
+        Coordinates in degrees whose header does not say so; left out: those without a unit whose name is that of an
+        angle and whose motion cannot be one in rad, with a warning; () for none.
     unwrap
         Make angles continuous.
     show
@@ -112,14 +117,20 @@ def load(
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
     refuse_jumps(found, wanted)
+    found = in_told_degrees(found, degrees, angles, like)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
-        found = found.with_angles(angles)
+        found = with_angles(found, angles)
     elif like is not None:
         found = angles_like(found, like)
     if show and found.columns:
         tell(found.table())
     return found.unwrapped() if unwrap else found
+
+
+def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:
+    """The set with these coordinates as angles; True for all."""
+    return found.with_angles((found.names if angles else ()) if isinstance(angles, bool) else angles)
 
 
 def angles_like(found: Trajectories, other: Trajectories) -> Trajectories:

@@ -19,7 +19,8 @@ from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time
 from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import InputError, refuse
 
-DEGREES = ("deg", "°", "degree", "degrees")
+TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
+DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
 GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
 

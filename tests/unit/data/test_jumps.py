@@ -74,7 +74,5 @@ def test_gaps_and_ends_of_recordings_are_no_jumps():
     assert jumping(Trajectories.of(np.r_[T[:40], T[:40]], held([0, 1], 40), (40, 40))) == []
     assert jumping(Trajectories.of(np.r_[T[:40], T[:40]], held([0, 3, 3, 1], 20), (40, 40))) == ["q"]
     # The last step of a recording is a jump, and so is the first of the next.
-    ends = np.r_[
-        held([0, 2], 15), held([2], 9), 1.0, np.r_[0.0, held([2], 39)]
-    ]
+    ends = np.r_[held([0, 2], 15), held([2], 9), 1.0, np.r_[0.0, held([2], 39)]]
     assert jumping(Trajectories.of(np.r_[T[:40], T[:40]], ends, (40, 40))) == ["q"]
