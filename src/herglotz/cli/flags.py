@@ -30,6 +30,9 @@ READING = (
     flag("--group", "column that numbers the trajectories", metavar="NAME"),
     flag("--angles", "coordinates that are angles in radians, with commas, or none (default: those with the unit rad "
          "or deg)", type=names, metavar="NAMES"),
+    flag("--degrees", "coordinates in degrees whose header does not say so, or none (default: with a warning, those "
+         "without a unit whose name is that of an angle and whose motion cannot be one in rad)",
+         type=names, metavar="NAMES"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),
     flag("--sensor-scales", f"what one unit of each reading is worth, {EACH}", type=finite, nargs="+", metavar="X"),
@@ -52,7 +55,7 @@ RUN = (
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what the flags say of the columns, for `load`."""
-    roles = ("angles", "time", "coordinates", "inputs", "drop", "group", "sensor_zeros", "sensor_scales")
+    roles = ("angles", "degrees", "time", "coordinates", "inputs", "drop", "group", "sensor_zeros", "sensor_scales")
     given = {name: getattr(arguments, name) for name in roles}
     return {name: value for name, value in given.items() if value is not None}
 

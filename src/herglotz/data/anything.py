@@ -15,9 +15,11 @@ from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
+from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, without
-from herglotz.data.readers import angles_like, load
+from herglotz.data.jumps import refuse_jumps
+from herglotz.data.readers import angles_like, load, with_angles
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
@@ -27,7 +29,7 @@ from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 
 TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
-OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "sensor_zeros", "sensor_scales")
+OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "sensor_zeros", "sensor_scales")
 
 
 def as_trajectories(
@@ -40,6 +42,7 @@ def as_trajectories(
     drop: Names = (),
     group: str | None = None,
     angles: Names | bool | None = None,
+    degrees: Names | None = None,
     sensor_zeros: Sequence[float] | None = (),
     sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
@@ -67,6 +70,8 @@ def as_trajectories(
         Columns of a table that are left aside; the column that numbers its trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
+    degrees
+        Coordinates in degrees whose header does not say so, () for none; left out: as `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
@@ -92,19 +97,23 @@ def as_trajectories(
         found = data
     elif isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
-        return _shown(_marked(load(data, like=like, show=False, **sensors, **columns), angles))
+        read = {"angles": angles, "degrees": degrees, "sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+        return _shown(load(data, like=like, show=False, **read, **columns))
     elif hasattr(data, "columns") and h is not None:
         found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
     elif hasattr(data, "columns") or isinstance(data, Mapping):
-        found = _table(data, Wanted(time, **names), like)
+        found = in_told_degrees(_table(data, Wanted(time, **names), like), degrees, angles, like)
+        found = found if like is None else angles_like(found, like)
         return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
-        return measured(_of_each(data, {"h": h, "time": time, **names, "angles": angles, "like": like}), sensor_zeros)
+        options = {"h": h, "time": time, **names, "angles": angles, "degrees": degrees, "like": like}
+        return measured(_of_each(data, options), sensor_zeros)
     else:
         found = _array(data, h, time, names)
+    if degrees is not None or not isinstance(data, Trajectories):
+        found = in_told_degrees(found, degrees, angles, like)
     return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 
 
@@ -153,7 +162,8 @@ def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): plain(x) for name, x in data.items()})
     found = in_radians_and_seconds(from_frame(frame, wanted, where))
-    return found if like is None else angles_like(found, like)
+    refuse_jumps(found, wanted)
+    return found
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:
@@ -209,9 +219,7 @@ def _floats(name: str, x: Any) -> np.ndarray:
 
 
 def _marked(data: Trajectories, angles: Any) -> Trajectories:
-    if angles is not None:
-        data = data.with_angles((data.names if angles else ()) if isinstance(angles, bool) else angles)
-    return parted(data).unwrapped()
+    return parted(data if angles is None else with_angles(data, angles)).unwrapped()
 
 
 def _noted(found: Trajectories, data: Any) -> Trajectories:

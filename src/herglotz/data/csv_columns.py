@@ -1,42 +1,24 @@
-"""The role of each column of a table: time, trajectory, coordinate, action, momentum, input, left aside; in words."""
+"""The role of each column of a table: time, trajectory, coordinate, action, momentum, input, left aside."""
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+from herglotz.data.column_roles import ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
 HEADER_CELL = re.compile(r"([^\[\]]+?)(?:\s*\[([^\[\]]*)\]|\s+\(([^()]*)\))?\s*")
 # A unit at the end of a name, of angles, their rates and times alone: theta_m may be the angle of a motor.
 SUFFIX = re.compile(r"(?!p_)(.+)_(deg|rad|(?:deg|rad)_s2?)|(t|time|timestamp)_(s|ms|us|ns|min)", re.I)
-ROLES = {
-    "time": re.compile(r"t|time|timestamp|datetime"),
-    "trajectory": re.compile(r"trajectory|trial|run"),
-    "action": re.compile(r"s"),
-    "momentum": re.compile(r"p|p_.*"),
-    "input": re.compile(
-        r"u\d*|u_.*|F|f(\d+|_.*)|(forces?|torques?|tau|motor|efforts?|inputs?|controls?|commands?|cmd|pwm|voltage|current)"
-        r"(\d+|_.*)?"
-    ),
-    # Left aside: logged velocities and accelerations are usually filtered, and counters of rows are no motion.
-    "rate": re.compile(
-        r"v|v[xyz]|a[xyz]|(vel|velocity|speed|acc|acceleration|omega)(_.*)?|.*_(d?dot|velocity|acceleration)"
-        r"|([qxyz]|theta|phi)\d*d?dot"
-    ),
-    "counter": re.compile(r"index|row|sample|frame|unnamed: \d+"),
-}
-LETTERS = re.compile(r"v|[va][xyz]")  # of a velocity or an acceleration, unless the unit is that of a position
-POSITIONS = re.compile(r"rad|deg|°|[kcmµμn]?m|in|ft|px")
 AS_SHOWN = {  # roles by their names in the table of columns
     "time": "time", "trajectory": "trajectory", "coordinate": "q", "input": "input", "left aside": "dropped",
 }  # fmt: skip
-FORCES = re.compile(r"[kmM]?N([ *·.]?m)?")  # units in which no coordinate is measured
-RATES = re.compile(r".+/ ?(s|ms|min|h)(\^?2|²)?")  # nor in these: m/s, rad/s²
+FEW = 5  # names that a warning lists
 Names = str | Sequence[str]
 
 
@@ -106,6 +88,7 @@ class Columns:
     s: int | None = None
     p: tuple[int, ...] = ()
     u: tuple[int, ...] = ()
+    notes: tuple[str, ...] = ()  # warnings of roles that are guesses
 
     @property
     def numeric(self) -> tuple[int, ...]:
@@ -137,10 +120,11 @@ def assign(
     wanted = _dated(wanted.by_name(cells, names), names)
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
-    roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "q", "dropped")}
-    for i, (name, unit) in enumerate(zip(names, units, strict=True)):
-        roles[wanted.role(name) or _by_itself(name, unit, wanted)].append(i)
-    clock = _clock(where, names, roles["time"])
+    guesses = [_guess(name, unit, wanted, place) for name, unit in zip(names, units, strict=True)]
+    roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "rate", "q", "dropped")}
+    for i, guess in enumerate(guesses):
+        roles[guess.role].append(i)
+    clock = _clock(where, names, roles["time"] or _other_clocks(names, units, roles))
     u = wanted.in_order(roles["input"], names)
     q = wanted.in_order(roles["q"], names) or (() if wanted.motion else u[:1])
     q = q if wanted.coordinates is None else tuple(place[x] for x in as_names(wanted.coordinates))
@@ -152,14 +136,14 @@ def assign(
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
-    return Columns(names, units, clock, q, trajectory, action, p, u)
+    found = Columns(names, units, clock, q, trajectory, action, p, u)
+    return replace(found, notes=_warnings(found, guesses, wanted))
 
 
 def _remedy(names: Sequence[str], roles: Mapping[str, list[int]]) -> str:
     """What to do about a table without a coordinate; what its columns are taken for is not printed."""
-    alike = [
-        f"{', '.join(names[i] for i in roles[role])} look like {role}s" for role in ("rate", "input") if roles[role]
-    ]
+    looks = {"rate": "look like rates", "input": "look like inputs", "dropped": "look like no positions"}
+    alike = [f"{', '.join(names[i] for i in roles[role])} {look}" for role, look in looks.items() if roles[role]]
     choose = f"{', '.join(alike)}: choose with --coordinates NAMES (coordinates= in Python)"
     return choose if alike else "add a column such as q[rad]"
 
@@ -169,18 +153,55 @@ def as_names(names: Names) -> Sequence[str]:
     return (names,) if isinstance(names, str) else names
 
 
-def _by_itself(name: str, unit: str, wanted: Wanted) -> str:
-    """The role of a column that the user does not name, by another table or by its name and unit.
+def _guess(name: str, unit: str, wanted: Wanted, others: Collection[str]) -> Guess:
+    """The role of a column by the user's word, by another table, or by its name and unit; with what is in doubt.
 
     It is `dropped` where the user gives that role to others.
     """
-    key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
-    role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "q")
-    measured = "input" if FORCES.fullmatch(unit) else "rate" if RATES.fullmatch(unit) else role
-    moves = role == "rate" and LETTERS.fullmatch(key) and POSITIONS.fullmatch(unit)
-    role = wanted.before(name) or (measured if role == "q" else "q" if moves else role)
+    if said := wanted.role(name):
+        return Guess(said)
+    known = wanted.before(name)
+    guess = Guess(known) if known else role_of(name, unit, others)
     taken = {"time": wanted.time, "trajectory": wanted.group, "q": wanted.coordinates, "input": wanted.inputs}
-    return "dropped" if taken.get(role) is not None else role
+    return Guess("dropped") if taken.get(guess.role) is not None else guess
+
+
+def _other_clocks(names: Sequence[str], units: Sequence[str], roles: dict[str, list[int]]) -> list[int]:
+    """Columns that may be the time where none is called so: by a word of their names, or else by their unit."""
+    free = [i for role in ("q", "dropped") for i in roles[role]]
+    timed = [i for i in free if is_timed(words_of(names[i]))]
+    found = [i for i in timed if kind_of(units[i]) in ("", "time")] or [i for i in free if kind_of(units[i]) == "time"]
+    for role in ("q", "dropped"):
+        roles[role] = [i for i in roles[role] if i not in found]
+    return found
+
+
+def _warnings(found: Columns, guesses: Sequence[Guess], wanted: Wanted) -> tuple[str, ...]:
+    """What is said of columns whose role is a guess, and of coordinates that nothing shows to be one beside others."""
+    doubts: dict[str, list[int]] = {}
+    for i, guess in enumerate(guesses):
+        if guess.doubt:
+            doubts.setdefault(guess.doubt, []).append(i)
+    own = [i for i in found.q if wanted.coordinates is None and wanted.before(found.names[i]) is None]
+    plain = [i for i in own if not is_usual(found.names[i], found.units[i]) and not guesses[i].doubt]
+    if plain and len(plain) < len(own):
+        doubts["no unit and no usual name says so"] = plain
+    return tuple(_warning(found, columns, doubt) for doubt, columns in doubts.items())
+
+
+def _warning(found: Columns, columns: Sequence[int], doubt: str) -> str:
+    """What these columns are taken for, why that may be wrong, and how to say otherwise."""
+    is_q, is_u = columns[0] in found.q, columns[0] in found.u
+    names = [found.names[i] for i in columns]
+    one, some = len(names) == 1, ",".join(names[:FEW])
+    few = ", ".join(names if len(names) <= FEW else [*names[:FEW], f"{len(names) - FEW} more"])
+    role = ("a coordinate" if one else "coordinates") if is_q else ("an input" if one else "inputs") if is_u else ""
+    inputs, coordinates = ([*(found.names[i] for i in other), some] for other in (found.u, found.q))
+    ways = [] if is_u else [f"--inputs {','.join(inputs)}"]
+    ways += [] if is_q else [f"--coordinates {','.join(coordinates)}"]
+    ways += [f"--drop {some}"] if role else []
+    verb = ("is" if one else "are") + (f" taken for {role}" if role else " left aside")
+    return f"warning: {few} {verb}, but {doubt}; else give {' or '.join(ways)}"
 
 
 def _dated(wanted: Wanted, names: Sequence[str]) -> Wanted:
@@ -252,45 +273,3 @@ def is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
-
-
-ANGULAR = re.compile(r"(theta|phi|psi|angle|alpha|beta)(_?\d+|_.*)?", re.I)  # names that are given to angles
-
-
-LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
-
-
-def column_table(data: Any) -> str:
-    """Return of `Trajectories` a line a column: its role, its unit with the conversion that was made; then the notes.
-
-    Of more than `LISTED` columns the first and the last ones are shown, and the number of the others.
-    """
-    rows = [("column", "is taken for", "unit"), *column_rows(data)]
-    left = len(rows) - 1 - LISTED
-    if left > 0:
-        rows[1 + LISTED // 2 : 1 + LISTED // 2 + left] = [("…", f"{left} more", "")]
-    widths = [max(len(row[k]) for row in rows) for k in range(2)]
-    lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
-    return "\n".join([f"{data.source or 'table'}:", *lines, *(f"  {note}" for note in data.notes)])
-
-
-def column_rows(data: Any) -> list[tuple[str, str, str]]:
-    """Name, role and unit of each column of `Trajectories`, in words, after all that was said of it and made of it."""
-    now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
-    rows = []
-    for name, role, unit in data.columns:
-        if role == "coordinate" and name in now:
-            role = "angle" if now[name][1] else role
-            unit = _converted(unit, now[name][0])
-            if role == "coordinate" and not unit and ANGULAR.fullmatch(name):
-                unit = f"- (an angle in rad? --angles {name})"
-        elif role == "time":
-            unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
-        rows.append((name, role, unit or "-"))
-    return rows
-
-
-def _converted(unit: str, now: str) -> str:
-    """The unit of a column, and what it became; of a column without a unit the one that it was given since."""
-    given = "" if now == "1" else now
-    return unit if unit == now else f"{unit}, converted to {now}" if unit else given

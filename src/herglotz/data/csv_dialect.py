@@ -60,6 +60,12 @@ def in_commas(
     return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
 
 
+def is_row_of_numbers(line: str) -> bool:
+    """Whether a line has two numbers or more, and nothing else, between separators of any kind."""
+    rows = (cells_of(line.rstrip(f" {separator}"), separator) for separator in SEPARATORS)
+    return any(len(cells) > 1 and all(is_number(x.replace(",", ".")) for x in cells) for cells in rows)
+
+
 def _with_points(path: Path, table: Sequence[tuple[int, list[str]]]) -> tuple[Rows, bool]:
     """Rows below the header with decimal points, and whether they had commas."""
     commas = any("," in cell for _, cells in table for cell in cells)

@@ -9,12 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data.checks import check_alike
+from herglotz.data.column_table import of_file
 from herglotz.data.csv_columns import Names, Wanted
+from herglotz.data.csv_dialect import is_row_of_numbers
 from herglotz.data.csv_format import read_csv, write_csv
+from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import read_packed
 from herglotz.data.files import PathLike, read_bytes
 from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
+from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import measured
@@ -52,13 +56,15 @@ FORMATS = (
     Format("arrays t, q, ... of MATLAB (.mat)", ".mat", read_packed, True),
 )  # fmt: skip
 WRITES = ".csv and .npz"
+PROSE = 65536  # bytes of a text file in which a recording has a row of numbers
 SHOWN = 76  # characters of the note that names the files of a folder: a line of a terminal
 
 
 def load(
     path: PathLike,
     *,
-    angles: Names | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
+    angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
+    degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -74,7 +80,10 @@ def load(
         .csv (or such a table in .txt, .tsv, .dat), .npz, .txt of Schmidt & Lipson, or with the extra `tables` .parquet,
         .h5 or .mat; or a folder of such files: each holds a recording, in the order of their names.
     angles
-        Coordinates that are angles; left out: those in rad or deg; () for none.
+        Coordinates that are angles; True for all; left out: those in rad or deg; () for none.
+    degrees
+        Coordinates in degrees whose header does not say so; left out: those without a unit whose name is that of an
+        angle and whose motion cannot be one in rad, with a warning; () for none.
     unwrap
         Make angles continuous.
     show
@@ -97,7 +106,8 @@ def load(
     Raises
     ------
     InputError
-        If the format is not known (the message lists those that are), or from the reader of that format.
+        If the format is not known (the message lists those that are), a coordinate of a table that nobody named moves
+        in jumps alone, or from the reader of that format.
     """
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns)
@@ -106,14 +116,21 @@ def load(
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
+    refuse_jumps(found, wanted)
+    found = in_told_degrees(found, degrees, angles, like)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
-        found = found.with_angles(angles)
+        found = with_angles(found, angles)
     elif like is not None:
         found = angles_like(found, like)
     if show and found.columns:
         tell(found.table())
     return found.unwrapped() if unwrap else found
+
+
+def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:
+    """The set with these coordinates as angles; True for all."""
+    return found.with_angles((found.names if angles else ()) if isinstance(angles, bool) else angles)
 
 
 def angles_like(found: Trajectories, other: Trajectories) -> Trajectories:
@@ -156,10 +173,19 @@ def _files(path: Path) -> list[Path]:
     if (path / "model.pt").exists():
         raise InputError(f"{path}: is the folder of a run, not data; name a recording, or a folder of them")
     known = {one.suffix for one in FORMATS}
-    found = sorted(file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    every = (file for file in path.iterdir() if file.suffix.lower() in known and file.name[0] != ".")
+    found = sorted(file for file in every if not _is_prose(file))
     if not found:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
     return found
+
+
+def _is_prose(file: Path) -> bool:
+    """Whether a text file beside recordings is none itself: a README, or a text without a row of numbers."""
+    if file.suffix.lower() != ".txt" or not file.is_file():
+        return False
+    lines = read_bytes(file, PROSE).decode("utf-8", "replace").splitlines() if file.stat().st_size else []
+    return file.stem.casefold() == "readme" or not any(map(is_row_of_numbers, lines))
 
 
 def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories:
@@ -171,7 +197,7 @@ def _joined(files: Sequence[Path], sets: Sequence[Trajectories]) -> Trajectories
             raise InputError(f"{file} beside {files[0].name}: {error}") from None
     shared = set(sets[0].notes).intersection(*(one.notes for one in sets))
     named = (
-        replace(one, notes=tuple(note if note in shared else f"{file.name}: {note}" for note in one.notes))
+        replace(one, notes=tuple(note if note in shared else of_file(file.name, note) for note in one.notes))
         for file, one in zip(files, sets, strict=True)
     )
     return Trajectories.cat(named)

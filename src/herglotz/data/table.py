@@ -104,7 +104,7 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
     )
     refuse({since_1970: last > CENTURIES and not columns.units[columns.time]})
     units = tuple(columns.units[i] or "1" for i in columns.q)
-    return Trajectories.of(
+    found = Trajectories.of(
         t[:, 0],
         q,
         lengths,
@@ -118,6 +118,7 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
         source=path.name,
         columns=columns.roles(),
     )
+    return replace(found, notes=columns.notes)
 
 
 def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("DataFrame")) -> Trajectories:

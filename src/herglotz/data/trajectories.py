@@ -13,13 +13,14 @@ import torch
 from torch import Tensor
 
 from herglotz.data.checks import ARRAYS, DTYPES, check, check_alike, offsets_of, unnamed
-from herglotz.data.csv_columns import column_table
+from herglotz.data.column_table import column_table
 from herglotz.data.holds import Arrival, check_arrival, held
 from herglotz.data.splits import every_mth, inputs_of_kept, liveliest_rows, time_split
 from herglotz.data.windows import Steps, Triples, triples, unwrap
 from herglotz.errors import InputError, refuse
 
-DEGREES = ("deg", "°", "degree", "degrees")
+TAKEN_FOR_DEGREES = "taken for deg"  # in the place of a unit that the header had not, or had wrong
+DEGREES = ("deg", "°", "degree", "degrees", TAKEN_FOR_DEGREES)
 GAP = 1.5  # a step longer than this many typical (median) steps counts as a gap
 IRREGULAR = 0.05  # standard deviation of the steps over their median; clocks of loggers stay below 0.02
 

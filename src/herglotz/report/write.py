@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from herglotz.data import Trajectories
-from herglotz.data.csv_columns import column_rows
+from herglotz.data.column_table import column_rows
 from herglotz.data.files import folder_at, write_atomically
 from herglotz.data.units import as_recorded, common_unit, size, span
 from herglotz.errors import InputError

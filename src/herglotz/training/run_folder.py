@@ -255,6 +255,7 @@ class Reading(TypedDict, total=False):
     inputs: str | list[str]
     drop: str | list[str]
     angles: str | list[str]
+    degrees: str | list[str]
     sensor_zeros: list[float]
     sensor_scales: list[float]
     hold: Literal["zero", "first", "smooth"]

@@ -57,7 +57,7 @@ def test_units_below_are_converted(tmp_path):  # fails if ms and degrees of such
         ("t[s],x[m]\ns,mm\n", r"row 1: two units of one column, 'x\[m\]' and below it 'mm'"),
         ("t,x\ns,5\n", "row 2, column 't': 's' is not a number"),
         ("t,x\nfoo,bar\n", "row 2, column 't': 'foo' is not a number"),
-        ("t,x\nm,s\n", "row 2, column 't': 'm' is not a number"),
+        ("t,x\nm,s\n", "row 1: no coordinate column, only t, x; x look like no positions"),
         ("t,x\n,m\n", "row 2, column 't': a blank cell is not a number"),
     ],
 )

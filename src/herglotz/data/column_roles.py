@@ -1,0 +1,179 @@
+"""What the name and the unit of a column say of its role: an explicit unit first, then the words of the name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection
+from typing import NamedTuple
+
+ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
+# Kinds of units, in the order in which they are tried. Others, such as counts or 1, leave the role to the name.
+KINDS = {
+    "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
+    "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
+    "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf|[kmµμ]?[AV]|Vdc|VDC|%|percent"),
+    "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
+    "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|.+[ ·*]s(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
+    "pressure": re.compile(r"[kMh]?Pa|m?bar|psi"),
+    "other": re.compile(r"°? ?[CF]|℃|degC|K|[kMGm]?(Hz|W|J|Ω|g)|[Oo]hms?|kg|dB|T|VA|m?[AW]h|bool"),
+}
+NUMBERED = r"(_?\d+|_.*)?"
+# Names that have a role whatever their words, unless the unit is of another kind.
+ROLES = {
+    "time": re.compile(
+        r"t|times?|timestamps?|datetime|secs?|seconds|zeit|zeitstempel|uhrzeit|temps|tiempo|tempo|tijd|tid|czas|čas|aika"
+    ),
+    "trajectory": re.compile(r"trajectory|trial|run"),
+    "action": re.compile(r"s"),
+    "momentum": re.compile(r"p|p_.*"),
+    # Left aside, as are rates: logged velocities are usually filtered, and counters of rows are no motion.
+    "counter": re.compile(r"index|row|sample|frame|step|dt|unnamed: \d+"),
+    "input": re.compile(rf"u{NUMBERED}|F|f(\d+|[xyz]|_.*)|i_?[qd]"),
+}
+SYMBOL = r"(?:[qxyzr]|theta|phi|psi|alpha|beta|gamma|th|θ|φ|ϕ|ψ|α|β|pos|position|angle|joint)"
+RATE = re.compile(
+    rf"v\d*|[va]_?[xyz]|w[xyz]|d?d?{SYMBOL}_?\d*_?(d?dot|vel|velocity|speed|acc)(_?\d+)?|{SYMBOL}_?d?d_?\d+|{SYMBOL}dd"
+    rf"|dd?_?{SYMBOL}{NUMBERED}|d\d?.+?_?/?dt(\^?2)?|(vel|acc|gyro)[xyz]\d*"
+)
+LETTERS = re.compile(r"[vaw]_?([xyz]|\d*)")  # of a velocity or an acceleration, unless the unit is that of a position
+DESIRED = re.compile(rf"{SYMBOL}\d*_?d(_\d+)?")  # a desired value, or a derivative: q_d
+KNOWN = re.compile(rf"{SYMBOL}\d*(_.*)?|[qxyz]\(.*|.+_[xyz]\d*")  # usual names of coordinates
+_WORDS = {
+    "goal": "goal target setpoint setpoints sp desired des reference ref command commands commanded cmd demand "
+            "demanded soll sollwert consigne consigna",
+    # Of what is measured beside a motion.
+    "side": "error err std sd stderr variance var covariance cov uncertainty residual quality confidence likelihood "
+            "temperature temp battery batt supply humidity status valid checksum crc",
+    "rate": "velocity velocities vel speed rate acceleration acc accel omega gyro jerk dot ddot rpm",
+    "position": "position positions pos angle angles displacement height elongation location coordinate "
+                "winkel weg lage",
+    "angle": "theta phi psi angle alpha beta gamma winkel θ φ ϕ ψ α β",
+    "effort": "force forces torque torques tau effort efforts voltage volt pwm duty throttle",
+    "attribute": "motor current input inputs control controls",  # of a position: motor_angle; else of an input
+    "reading": "pot potentiometer lvdt encoder laser",  # of a position, in volts
+    "excitation": "road ground floor shaker excitation disturbance seismic",  # where a motion comes from
+    "support": "base pivot support platform",  # places that may be moved from outside
+}  # fmt: skip
+WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
+GIVEN = frozenset(("input", "inputs", "control", "controls"))
+BY_NAME = "by its name alone"
+
+
+class Guess(NamedTuple):
+    """The role of a column, and why it may be another one; "" where name and unit leave no doubt."""
+
+    role: str  # a key of `ROLES`, "rate", "dropped" or "q"
+    doubt: str = ""
+
+
+def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
+    """The role that a column has by itself; `others` are the names of all columns, which `dx` is understood from."""
+    kind = kind_of(unit)
+    key = name.casefold() if len(name) > 1 else name  # "Time" means time, but a single "V" may be a volume
+    words = words_of(name)
+    if whole := _whole(key, kind):
+        return Guess(whole, _letter(key) if kind == "position" else "")
+    if words & WORDS["side"] or {"set", "point"} <= words:
+        return Guess("dropped" if words & WORDS["side"] else "input")
+    if words & WORDS["goal"]:
+        return Guess("input")
+    if DESIRED.fullmatch(key) and kind in ("", "position"):
+        role = "input" if kind else "dropped"
+        return Guess(role, "it may be a desired value or a derivative")
+    if not kind:
+        return _by_words(key, words, others)
+    return _in_place(key, unit, words, others) if kind == "position" else _by_unit(kind, words)
+
+
+def kind_of(unit: str) -> str:
+    """The kind of a unit, a key of `KINDS`; "" where there is no unit, or one that many quantities have."""
+    return next((kind for kind, pattern in KINDS.items() if pattern.fullmatch(unit)), "")
+
+
+def is_angular(name: str) -> bool:
+    """Whether a name is one that is given to angles."""
+    return bool(words_of(name) & WORDS["angle"])
+
+
+def is_timed(words: frozenset[str]) -> bool:
+    """Whether a word of a name is that of a time, `elapsed_time`; a letter is none."""
+    return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)
+
+
+def is_usual(name: str, unit: str) -> bool:
+    """Whether the unit or the name is one that coordinates usually have."""
+    usual = KNOWN.fullmatch(name.casefold()) or words_of(name) & WORDS["position"]
+    return kind_of(unit) == "position" or bool(usual)
+
+
+def words_of(name: str) -> frozenset[str]:
+    """The words of a name, in lower case: `ActCurrent`, `goal_position` and `x vel` have two each."""
+    parts = re.findall(r"[^\W\d_]+", name)
+    found = [word for part in parts for word in re.findall(r"[A-ZÄÖÜ]?[^A-ZÄÖÜ]+|[A-ZÄÖÜ]+(?![^A-ZÄÖÜ])", part)]
+    return frozenset(word.casefold() for word in found)
+
+
+def _whole(key: str, kind: str) -> str:
+    """The role of a name as a whole, where its unit is not of another kind; "" for none."""
+    role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
+    if role in ("action", "momentum"):
+        return "" if kind in ("position", "pressure", "other") else role
+    meant = kind in ("", "effort") or (kind == "position" and key[0] == "u")
+    return "" if role == "input" and not meant else role
+
+
+def _letter(key: str) -> str:
+    """What is in doubt of an input by its letter alone, whose unit is that of a position."""
+    return "it has the unit of a position" if re.fullmatch(r"u_?([xyz]|\d*)", key) else ""
+
+
+def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str]) -> Guess:
+    """The role of a column in the unit of a position: a coordinate, unless the name says what moves from outside."""
+    if words and words <= GIVEN:
+        return Guess("input", "it has the unit of a position")
+    if _is_rate(key, words, others, "position"):
+        return Guess("rate", "it has the unit of a position")
+    if words & WORDS["excitation"]:
+        return Guess("input", BY_NAME)
+    moved = words & WORDS["support"] and not ANGLES.fullmatch(unit)
+    alone = words <= WORDS["support"] | WORDS["position"]
+    return Guess("input", BY_NAME) if moved and alone else Guess("q", "it may be moved from outside" if moved else "")
+
+
+def _by_unit(kind: str, words: frozenset[str]) -> Guess:
+    """The role of a column with a unit that no position has."""
+    if kind == "acceleration" and words & (WORDS["excitation"] | WORDS["support"]):
+        return Guess("input", BY_NAME)
+    if kind == "effort":
+        read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
+        return Guess("dropped", "it may be the reading of a position") if read else Guess("input")
+    if kind == "pressure":
+        return Guess("dropped", "it may be an input")
+    return Guess("rate" if kind in ("rate", "acceleration") else "dropped")
+
+
+def _by_words(key: str, words: frozenset[str], others: Collection[str]) -> Guess:
+    """The role of a column without a unit that tells it."""
+    shaken = words & {"acceleration", "acc", "accel"} and words & WORDS["support"]
+    if shaken or words & WORDS["excitation"]:
+        return Guess("input", BY_NAME)
+    if is_timed(words):
+        return Guess("dropped")
+    if _is_rate(key, words, others, ""):
+        return Guess("rate")
+    attribute = words & WORDS["attribute"]
+    if words & WORDS["position"] and not words & WORDS["effort"]:
+        return Guess("q", "its name may be that of an input" if words & GIVEN else "")
+    last = re.split(r"[\W\d_]+", key.rstrip("0123456789_"))[-1]
+    if attribute and re.fullmatch(SYMBOL, last):
+        return Guess("q", "its name may be that of an input")
+    return Guess("input" if attribute or words & WORDS["effort"] else "q")
+
+
+def _is_rate(key: str, words: frozenset[str], others: Collection[str], kind: str) -> bool:
+    """Whether a name is that of a rate; letters such as vx are none in the unit of a position, nor dx without x."""
+    if kind == "position":
+        of = re.fullmatch(r"dd?_?(.+)", key)
+        if LETTERS.fullmatch(key) or (of and of[1] not in {name.casefold() for name in others}):
+            return False
+    return bool(RATE.fullmatch(key) or words & WORDS["rate"])

@@ -1,0 +1,57 @@
+"""What was read of a table, in words: a line a column, then notes, then warnings."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+from herglotz.data.column_roles import is_angular
+
+WARNING = "warning: "  # begins a note that a user should see outside of the table, too
+LISTED = 200  # columns of a table that is printed; a recording has fewer, and 100 000 fill a terminal for minutes
+
+
+def column_table(data: Any) -> str:
+    """Return of `Trajectories` a line a column: its role, its unit with the conversion that was made.
+
+    Notes and warnings follow. Of more than `LISTED` columns the first and the last ones are shown, and the number of
+    the others.
+    """
+    rows = [("column", "is taken for", "unit"), *column_rows(data)]
+    left = len(rows) - 1 - LISTED
+    if left > 0:
+        rows[1 + LISTED // 2 : 1 + LISTED // 2 + left] = [("…", f"{left} more", "")]
+    widths = [max(len(row[k]) for row in rows) for k in range(2)]
+    lines = [f"  {a:<{widths[0]}}  {b:<{widths[1]}}  {c}" for a, b, c in rows]
+    source = data.source or "table"
+    notes = [f"  {note}" for note in data.notes if not note.startswith(WARNING)]
+    warnings = [f"{WARNING}{source}: {note[len(WARNING) :]}" for note in data.notes if note.startswith(WARNING)]
+    return "\n".join([f"{source}:", *lines, *notes, *warnings])
+
+
+def of_file(name: str, note: str) -> str:
+    """A note that holds for one file of several."""
+    return f"{WARNING}{name}: {note[len(WARNING) :]}" if note.startswith(WARNING) else f"{name}: {note}"
+
+
+def column_rows(data: Any) -> list[tuple[str, str, str]]:
+    """Name, role and unit of each column of `Trajectories`, in words, after all that was said of it and made of it."""
+    now = dict(zip(data.names, zip(data.units, data.angles, strict=True), strict=True))
+    rows = []
+    for name, role, unit in data.columns:
+        if role == "coordinate" and name in now:
+            role = "angle" if now[name][1] else role
+            unit = _converted(unit, now[name][0])
+            if role == "coordinate" and not unit and is_angular(name):
+                far = float(data.q[:, data.names.index(name)].abs().max()) > 2 * math.pi
+                unit = f"- (an angle in {'deg? --degrees' if far else 'rad? --angles'} {name})"
+        elif role == "time":
+            unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
+        rows.append((name, role, unit or "-"))
+    return rows
+
+
+def _converted(unit: str, now: str) -> str:
+    """The unit of a column, and what it became; of a column without a unit the one that it was given since."""
+    given = "" if now == "1" else now
+    return unit if unit == now else f"{unit}, converted to {now}" if unit else given

@@ -1,0 +1,164 @@
+"""Roles of columns by their units and words: what a logger calls its columns, and what is said of guesses."""
+
+import numpy as np
+import pytest
+
+from herglotz.data import load, save
+from herglotz.data.csv_columns import Wanted, assign
+from herglotz.errors import InputError
+
+ROLES = {
+    # An explicit unit says more than a word.
+    "motor_pos[deg]": "coordinate", "current_height[mm]": "coordinate", "motor[rad]": "coordinate",
+    "torque_arm_angle[deg]": "coordinate", "control_surface[deg]": "coordinate", "Actual Position [mm]": "coordinate",
+    "input_gear[rad]": "coordinate", "s[m]": "coordinate", "p_x[mm]": "coordinate", "F[mm]": "coordinate",
+    "motor_rate[rad/s]": "left aside", "current_speed[km/h]": "left aside", "shaft[rpm]": "left aside",
+    "tau[rad/s]": "left aside", "command[m]": "input", "ServoCurrent [mA]": "input", "drive[%]": "input",
+    "push[lbf]": "input", "armature[A]": "input", "housing[°C]": "left aside", "oil[bar]": "left aside",
+    "supply_voltage[V]": "left aside", "MotorTemp[C]": "left aside", "loop[ms]": "left aside", "power[W]": "left aside",
+    # What is wanted of a motion is an input.
+    "q_cmd": "input", "thetaRef": "input", "Set Point [mm]": "input", "x_desired[m]": "input", "demand": "input",
+    "angle_sp[deg]": "input", "Sollwert[mm]": "input", "target_vel[m/s]": "input", "commanded_angle": "input",
+    # Words without a unit.
+    "motor_position": "coordinate", "ActPos": "coordinate", "left_motor": "input", "friction_torque": "input",
+    "Fx": "input", "throttle": "input", "iq": "input", "quality": "left aside", "position_std": "left aside",
+    # Rates and counters.
+    "qd1": "left aside", "qdd": "left aside", "dq2": "left aside", "yvel": "left aside", "phi_vel": "left aside",
+    "ddx": "left aside", "dphi/dt": "left aside", "wz": "left aside", "v2": "left aside", "a_x": "left aside",
+    "joint_speed": "left aside", "alphadot": "left aside", "dt": "left aside",
+    # No rates: there is no column ist or x, or the unit is that of a position.
+    "dist": "coordinate", "dz[mm]": "coordinate", "v1[m]": "coordinate", "depth": "coordinate",
+    "base_angle[rad]": "coordinate", "elbow_x": "coordinate",
+}  # fmt: skip
+
+
+def read(folder, text, **options):
+    path = folder / "motion.csv"
+    path.write_text(text)
+    return load(path, **options)
+
+
+def table(header, rows=8):
+    """Text of a csv file: numbers that grow differently in every column."""
+    count = header.count(",") + 1
+    lines = (",".join(f"{k ** (1 + j / 3):.5g}" for j in range(count)) for k in range(rows))
+    return "\n".join([header, *lines]) + "\n"
+
+
+@pytest.mark.parametrize("cell", ROLES)
+def test_units_and_words_give_roles(cell):
+    # fails if a first word decides against the unit, a set point is a second coordinate, or a rate is one
+    assert assign(["t[s]", "theta[rad]", cell], "header").roles()[2][1] == ROLES[cell]
+
+
+def test_a_position_and_its_goal(tmp_path):  # fails if both are coordinates, or the position is left to be an input
+    data = read(tmp_path, table("t[s],goal_angle[rad],current_angle[rad]"))
+    assert data.names == ("current_angle",)
+    assert data.input_labels == (("goal_angle", "rad"),)
+
+
+GUESSES = {
+    "road[mm]": "is taken for an input, but by its name alone; else give --coordinates x,road or --drop road",
+    "pivot_acceleration[m/s^2]": "is taken for an input, but by its name alone",
+    "support[m]": "is taken for an input, but by its name alone",
+    "pivot_y[m]": "is taken for a coordinate, but it may be moved from outside; else give --inputs pivot_y or",
+    "u_x[m]": "is taken for an input, but it has the unit of a position",
+    "control[rad]": "is taken for an input, but it has the unit of a position",
+    "q_d": "is left aside, but it may be a desired value or a derivative; else give --inputs q_d or",
+    "q_d[rad]": "is taken for an input, but it may be a desired value or a derivative",
+    "x_dot[m]": "is left aside, but it has the unit of a position",
+    "dx[m]": "is left aside, but it has the unit of a position",
+    "valve[bar]": "is left aside, but it may be an input",
+    "pot[V]": "is left aside, but it may be the reading of a position",
+    "motor_x": "is taken for a coordinate, but its name may be that of an input",
+    "input_angle": "is taken for a coordinate, but its name may be that of an input",
+    "load": "is taken for a coordinate, but no unit and no usual name says so; else give --inputs load or --drop load",
+}
+
+
+@pytest.mark.parametrize("cell", GUESSES)
+def test_what_is_a_guess_is_said_in_a_warning(tmp_path, capsys, cell):
+    # fails if a role that may be wrong stands in the table of columns alone, or the remedy is another file's
+    name = cell.split("[")[0]
+    data = read(tmp_path, table(f"t[s],x[m],{cell}"))
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last.startswith(f"warning: motion.csv: {name} {GUESSES[cell]}")
+    read(tmp_path, table(f"t[s],x[m],{cell}"), like=data)
+    told = {"inputs": name} if "--inputs" in GUESSES[cell] else {"coordinates": ["x", name]}
+    read(tmp_path, table(f"t[s],x[m],{cell}"), **told)
+    assert "warning" not in capsys.readouterr().err  # it is known by then, or the user has said it
+
+
+@pytest.mark.parametrize(
+    "header", ["t,a,b", "t[s],theta[rad],x[m],F[N]", "t,q1,q2,u", "Zeit,Winkel[°],Moment[Nm],T[°C]"]
+)
+def test_nothing_is_said_of_what_is_clear(tmp_path, capsys, header):  # fails if every table is warned of
+    read(tmp_path, table(header))
+    assert "warning" not in capsys.readouterr().err
+
+
+def test_many_columns_without_a_usual_name_are_one_warning(tmp_path, capsys):  # fails if a wide table fills a terminal
+    read(tmp_path, table("t,x[m]," + ",".join(f"node{k}" for k in range(30))))
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("warning")]
+    assert len(lines) == 1
+    assert "node0, node1, node2, node3, node4, 25 more are taken for coordinates" in lines[0]
+
+
+@pytest.mark.parametrize(
+    "name", ["Zeit", "Zeit[s]", "temps", "tiempo", "Zeitstempel", "elapsed_time", "simTime[s]", "seconds", "clock[s]"]
+)
+def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinate, and the user is told there is none
+    data = read(tmp_path, table(f"x[m],{name},u_t[N]"))
+    assert data.columns[1][1] == "time"
+    assert data.t.tolist() == pytest.approx([k ** (4 / 3) for k in range(8)], rel=1e-4, abs=1e-9)
+
+
+def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen unsaid
+    with pytest.raises(InputError, match="two time columns, sim_time and wall_time; choose one with --time NAME"):
+        read(tmp_path, table("sim_time,wall_time,x[m]"))
+    assert read(tmp_path, table("t,loop_time,x[m]")).names == ("x",)
+
+
+def test_no_coordinate_says_what_the_columns_look_like():
+    # fails if a table of voltages alone is refused without the way to take one of them
+    with pytest.raises(InputError, match=r"pot look like no positions: choose with --coordinates NAMES"):
+        assign(["t", "pot[V]"], "header")
+    assert assign(["t", "pot[V]"], "header", Wanted(coordinates="pot")).q == (1,)
+
+
+def test_names_of_inputs_survive_writing(tmp_path):  # fails if a coordinate that is written comes back as an input
+    data = read(tmp_path, table("t[s],motor_angle[rad],target[rad]"), unwrap=False)
+    save(tmp_path / "again.csv", data)
+    again = load(tmp_path / "again.csv", unwrap=False)
+    assert (again.names, again.u.tolist()) == (data.names, data.u.tolist())
+
+
+def test_a_readme_beside_recordings(tmp_path, capsys):
+    # fails if a folder is refused for a text in it, a recording in .txt is taken for one, or a warning of one file is
+    # said of all
+    for name, header in (("a.csv", "t[s],x[m]"), ("b.txt", "t[s],x[m]"), ("c.csv", "t[s],x[m]")):
+        (tmp_path / name).write_text(table(header))
+    (tmp_path / "README.txt").write_text("Two columns:\nt,x\n0,1\n1,2\n")
+    (tmp_path / "names.txt").write_text("x[m]   the cart\nt[s]   time\n")
+    (tmp_path / "empty.txt").write_text("")
+    (tmp_path / "readme.md").write_text("# Recordings\n")
+    assert len(load(tmp_path)) == 3
+    (tmp_path / "c.csv").write_text(table("t[s],x[m],road[m]"))
+    for name in ("a.csv", "b.txt"):
+        (tmp_path / name).write_text(table("t[s],x[m],u_road[m]"))
+    capsys.readouterr()
+    load(tmp_path)
+    err = capsys.readouterr().err
+    assert f"warning: {tmp_path.name}: c.csv: road is taken for an input" in err
+    for name in ("a.csv", "c.csv"):
+        (tmp_path / name).unlink()
+    (tmp_path / "b.txt").write_text("no numbers")
+    with pytest.raises(InputError, match="is a folder without recordings"):
+        load(tmp_path)
+
+
+def test_a_frame_is_warned_of_too(capsys):  # fails if only files are
+    from herglotz.data import as_trajectories
+
+    as_trajectories({"t": np.arange(5.0), "x[m]": np.arange(5.0) ** 2, "road[m]": np.arange(5.0)})
+    assert "warning: dict: road is taken for an input" in capsys.readouterr().err
