@@ -10,6 +10,7 @@ from torch import Tensor
 
 from herglotz.training.kernel import Placed
 from herglotz.training.problems.grid import SegmentGrid
+from herglotz.training.sums import Sums
 
 CHUNK = 64 * 2**20  # bytes of rows of J at once
 
@@ -24,25 +25,6 @@ class Piece(NamedTuple):
     starts: bool  # whether it has the starts of its segments
     samples: int  # that are observed
     offset: int  # the first of them
-
-
-class Sums(NamedTuple):
-    """What the rows of J and the residuals r of the data add up to, and the derivatives of the ends of segments."""
-
-    corner: Tensor  # (P, P)
-    border: Tensor  # (S, d, P)
-    blocks: Tensor  # (S, d, d)
-    by_theta: Tensor  # (P,) Jᵀr
-    by_state: Tensor  # (S, d)
-    slopes: Tensor  # (S, d, P + d)
-
-    @classmethod
-    def zeros(cls, P: int, S: int, d: int, like: Tensor) -> Sums:
-        """Sums of no rows."""
-        slopes = like.new_zeros(S, d, P + d)
-        slopes[..., P:] = torch.eye(d, dtype=like.dtype, device=like.device)
-        zero = like.new_zeros
-        return cls(zero(P, P), zero(S, d, P), zero(S, d, d), zero(P), zero(S, d), slopes)
 
 
 class Observed(NamedTuple):

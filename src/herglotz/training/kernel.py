@@ -205,7 +205,7 @@ class Functions:
                 own = x[None, self.n : 2 * self.n]
                 return torch.cat([momentum_residual(P, own), momentum_plus(P)], -1)[0]
 
-            _, back = vjp(of_sample, theta)
+            back: Any = vjp(of_sample, theta)[1]
             return torch.stack([back(e)[0] for e in self.basis])
 
         point = self.equation(x, h, u, theta, sharpest)(delta, True)

@@ -53,6 +53,17 @@ def problem_of(config, *, length=5, freedom=None, samples=24):
     return problem, problem.pack(problem.parameters.get(), states)
 
 
+def slopes(problem, x):
+    assert problem.path is not None
+    return problem.slopes_at_samples(x[: problem.P], problem.path)
+
+
+def kernel(config):
+    placed = kernel_of(ContactLagrangian(config))
+    assert placed is not None
+    return placed.kernel
+
+
 def eager(config, **settings):
     problem, x = problem_of(config, **settings)
     problem.compiled = None
@@ -71,7 +82,7 @@ def test_compiled_equations_are_those_of_torch(config, freedom):
     for a, b in ((dense(mine[1]), dense(its[1])), (mine[2], its[2])):
         assert float((a - b).abs().max()) <= 1e-10 * float(b.abs().max())
     assert float(problem.cost(x)) == pytest.approx(float(mine[0]), rel=1e-13)
-    rows, own = (p.slopes_at_samples(x[: p.P], p.path) for p in (other, problem))
+    rows, own = slopes(other, x), slopes(problem, x)
     assert float((rows - own).abs().max()) <= 1e-10 * float(rows.abs().max())
 
 
@@ -108,11 +119,9 @@ def test_a_motion_that_has_no_step_costs_infinity():
 
 def test_one_kernel_serves_every_subset_of_its_terms():
     # fails if a model of fewer terms is compiled again: a search would take seconds for each
-    kernels = {kernel_of(ContactLagrangian(MODELS[name])).kernel for name in ("joints", "joints without a number")}
     fewer = replace(JOINTS, features=(), coulomb=False)
-    kernels.add(kernel_of(ContactLagrangian(fewer)).kernel)
-    assert len(kernels) == 1
-    assert kernel_of(ContactLagrangian(PENDULUM)).kernel is kernel_of(ContactLagrangian(MODELS["one rate"])).kernel
+    assert len({kernel(config) for config in (JOINTS, MODELS["joints without a number"], fewer)}) == 1
+    assert kernel(PENDULUM) is kernel(MODELS["one rate"])
 
 
 def test_numbers_go_by_their_terms():

@@ -24,17 +24,18 @@ from herglotz.stepping import Stepper, state_of
 from herglotz.stepping.block_tridiagonal import eliminate
 from herglotz.training.arrowhead import Arrowhead
 from herglotz.training.distributed import everywhere, world
-from herglotz.training.flow import CompiledFlow, Observed, Sums
+from herglotz.training.flow import CompiledFlow, Observed
 from herglotz.training.kernel import kernel_of
 from herglotz.training.problems.grid import SegmentGrid
 from herglotz.training.problems.least_squares import StatesProblem
 from herglotz.training.solvers.lifted_newton import (
     Path,
     linear_recurrence,
-    linear_steps,
     parameter_derivatives,
     solve_path,
+    step_derivatives,
 )
+from herglotz.training.sums import Sums
 
 START = 3  # samples that a free run starts from: they tell q and q̇, and too little of a force to tell it
 KNOWN = 1e3  # times σ: a start that is known so much better is known
@@ -172,11 +173,14 @@ class ShootingProblem(StatesProblem):
         fit, joints = self._residuals(path.x)
         sums = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
         if self.compiled is None:
-            self._add_rows(sums, self._slopes_of(theta, path, held=held), fit)
+            root = self.root_weights(fit)
+            by = root * self.weight / self.deviations
+            sums.add_samples(self.grid, self._slopes_of(theta, path, held=held), by, root * fit)
         elif self.compiled.run(theta, path.x[:, 0], self._observed(), sums) is None:
             raise AssertionError("a motion that was run has no steps")
-        upper = torch.zeros_like(sums.blocks)
-        self._join(sums, upper, joints)
+        to = self.grid.joined.nonzero()[:, 0]
+        root = self.root_weights(joints[to])
+        upper = sums.add_joints(to, root / self.joint_weight, root * joints[to])
         anchored, anchor = self._anchored() - self.P, self._anchor(x)
         segment, at = anchored // self.d, anchored % self.d
         sums.blocks[segment, at, at] += 1 / self._anchor_weight**2
@@ -193,41 +197,6 @@ class ShootingProblem(StatesProblem):
         """What the kernel has to know of the samples."""
         y, weight = self.data.q - self.zeros, self.weight / self.deviations
         return Observed(y.contiguous(), weight.contiguous(), float(self.freedom or 0.0))
-
-    def _add_rows(self, sums: Sums, Z: Tensor, fit: Tensor) -> None:
-        """Add the data's rows to the sums, from the derivatives Z (S, K+1, d, P + d) at all nodes."""
-        P, root = len(sums.corner), self.root_weights(fit)
-        rows = Z.flatten(0, 1)[self.grid.node][:, : self.n] * (root * self.weight / self.deviations)[..., None]
-        r, segment = root * fit, self.grid.node // (self.grid.h.shape[1] + 1)
-        for k in range(self.grid.segments):
-            own, right = rows[segment == k].flatten(0, 1), r[segment == k].flatten()
-            by_theta, by_state = own[:, :P], own[:, P:]
-            sums.corner.addmm_(by_theta.T, by_theta)
-            sums.by_theta.addmv_(by_theta.T, right)
-            sums.border[k] += by_state.T @ by_theta
-            sums.blocks[k] += by_state.T @ by_state
-            sums.by_state[k] += by_state.T @ right
-        ends = torch.arange(self.grid.segments, device=Z.device), self.grid.end
-        sums.slopes.copy_(Z[ends])
-
-    def _join(self, sums: Sums, upper: Tensor, joints: Tensor) -> None:
-        """Add the rows of the joints to the sums."""
-        to = self.grid.joined.nonzero()[:, 0]
-        if not len(to):
-            return
-        P, by = len(sums.corner), self.root_weights(joints[to])  # (J, d)
-        own, r = by / self.joint_weight, by * joints[to]  # −own stands in the rows at the start
-        rows = sums.slopes[to - 1] * own[..., None]  # (J, d, P + d) by the parameters and the segment before
-        by_theta, before = rows[..., :P], rows[..., P:]
-        sums.corner.addmm_(by_theta.flatten(0, 1).T, by_theta.flatten(0, 1))
-        sums.by_theta.addmv_(by_theta.flatten(0, 1).T, r.flatten())
-        sums.blocks[to - 1] += before.mT @ before
-        sums.border[to - 1] += before.mT @ by_theta
-        sums.by_state[to - 1] += (before.mT @ r[..., None])[..., 0]
-        sums.blocks[to] += torch.diag_embed(own.square())
-        sums.border[to] -= own[..., None] * by_theta
-        sums.by_state[to] -= own * r
-        upper[to - 1] = -before.mT * own[:, None, :]
 
     def _eliminate(self, diagonal: Tensor, upper: Tensor, columns: Tensor) -> Tensor | None:
         """T⁻¹ columns of a block tridiagonal T, (S, d, R)."""
@@ -373,19 +342,10 @@ class ShootingProblem(StatesProblem):
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
         S, K = self.grid.h.shape
         d = self.d
-        q1, A = path.x[:, 1:, : self.n], self._step_derivatives(theta, path)[..., :d, :d]
+        q1, A = path.x[:, 1:, : self.n], step_derivatives(self.parameters.at(theta, self.u), path, self.grid)[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
             B = parameter_derivatives(self.parameters.at(theta, self.u), path.x, q1, A, self.grid.h)
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
         return linear_recurrence(A, torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)
-
-    def _step_derivatives(self, theta: Tensor, path: Path) -> Tensor:
-        """DΦ̃ of every step, (S, K, 2n+1, 2n+1)."""
-        if path.A is not None:
-            return path.A
-        x = torch.where((torch.arange(path.x.shape[1]) <= self.grid.end[:, None])[..., None], path.x, path.x[:, :1])
-        stepped = linear_steps(self.parameters.at(theta, self.u), x, self.grid.h)
-        assert stepped is not None  # a linear step has a solution
-        return stepped[1]

@@ -25,6 +25,7 @@ from herglotz.progress import beat
 from herglotz.stepping import State, Status, solve, solve_step
 from herglotz.training.distributed import add_over_processes, own_parts
 from herglotz.training.parameter_vector import FixedModel
+from herglotz.training.problems.grid import SegmentGrid
 
 NEAR = 1e-7  # defects whose next ones need not be looked at where quadratic convergence makes them rounding
 CURVED = 1e4  # taken for the next defect over the square of the first, which no earlier one tells
@@ -163,6 +164,16 @@ def _linear_inclusion(P: Partials, p0: Tensor, delta: Tensor) -> tuple[Tensor, P
         z = z - solve(slope, G)
     moved = soft_threshold(z, bound)
     return moved - delta, replace(P, force=replace(P.force, held=torch.where(moved == 0, w, 0.0)))
+
+
+def step_derivatives(L_d: FixedModel, path: Path, grid: SegmentGrid) -> Tensor:
+    """DΦ̃ of every step of a path, (S, K, 2n+1, 2n+1); those behind the end of a segment mean nothing."""
+    if path.A is not None:
+        return path.A
+    there = torch.arange(path.x.shape[1], device=path.x.device) <= grid.end[:, None]
+    stepped = linear_steps(L_d, torch.where(there[..., None], path.x, path.x[:, :1]), grid.h)
+    assert stepped is not None  # an equation that is linear has a solution
+    return stepped[1]
 
 
 def parameter_derivatives(
