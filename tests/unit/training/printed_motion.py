@@ -14,6 +14,11 @@ NUMBER = re.compile(r"(\d+(?:\.\d+)?)(?:\((?:±)?[\d.e+-]+\))?(e[-+]?\d+)?")
 POWER = re.compile(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
 FUNCTIONS = {"sin": "np.sin", "cos": "np.cos", "tanh": "np.tanh", "exp": "np.exp", "sgn": "sgn", "√": "np.sqrt"}
 SIGNS = {"+": "+", "−": "-"}
+RULES = {  # what `Printed.action` computes
+    2: "L_d = (c − 1)(s − (h/2) V(q)) + √c h K − (h/2)(V(q) + V(q₊));",
+    4: "L_d = (c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − "
+    "(h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), e = K_q − V_q − K_qv v − γ K_v, M = K_vv;",
+}
 FAR = 1e6  # a motion beyond is lost
 
 
@@ -132,6 +137,7 @@ class Printed:
         self.held = "stays 0" in self.words
         self.steps = float(self.said(r"steps are ([\d.e-]+)")) if "step it as" in self.words else None
         self.order = int(self.said(r"rule of order (\d)"))
+        assert not self.steps or RULES[self.order] in self.words
         rate = re.search(r"γ = (−?[\d.e-]+), V", self.words)
         self.damps = 0.0 if rate is None else float(rate[1].replace("−", "-"))
         self._of_q = function(f"[{', '.join(of_q)}]", "q")
