@@ -275,7 +275,7 @@ MUTANTS = [
     ("training/named_terms.py", 'NamedTerms(absolute, (), True, apart=True)', 'NamedTerms(absolute, (), True)'),
     ("training/problems/shooting.py", 'self.mass * self.speed * relative', 'self.speed * relative'),
     ("training/problems/smoothing.py", 'self.mass * v', 'v'),
-    ("training/equation.py", '-float(run.model.kinetic.mass().detach()[i, i])', '-1.0'),
+    ("training/equation_terms.py", 'decay = -model.damping.rate * self._masses()[i, i]', 'decay = -model.damping.rate'),
     ("mechanics/partials.py", 'if L.numel() < 2:', 'if L.numel() < 99:'),
     ("models/translations.py", 'config.mass_width > 0', 'False'),
     ("models/translations.py", 'any("q" in text for text in config.drag)', 'False'),

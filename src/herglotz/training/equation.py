@@ -18,7 +18,7 @@ import torch
 from herglotz.models.jet import coordinates
 from herglotz.training.equation_numbers import Joint, Numbers
 from herglotz.training.equation_terms import Reader
-from herglotz.training.equation_words import number
+from herglotz.training.equation_words import BESIDE, UNKNOWN, number
 from herglotz.training.fitted_run import FittedRun
 
 WIDTH = 78  # two blanks stand before each line on screen
@@ -37,13 +37,13 @@ class Term:
     unit: str
     alone: float | None = None  # standard deviation with all other numbers held, which rounds the value
 
-    @property
-    def size(self) -> str:
-        """The number without its sign, as it is printed."""
-        return number(abs(self.value), self.deviation, self.alone or self.deviation)
+    def size(self, digits: int = UNKNOWN) -> str:
+        """The number without its sign, as it is printed; `digits` where nothing tells how many the motion needs."""
+        return number(abs(self.value), self.deviation, self.alone or self.deviation, digits)
 
-    def __str__(self) -> str:
-        return f"{'−' if self.value < 0 else '+'} {self.size} {self.what}".rstrip()
+    def told(self, digits: int = UNKNOWN) -> str:
+        """The term with its sign."""
+        return f"{'−' if self.value < 0 else '+'} {self.size(digits)} {self.what}".rstrip()
 
 
 @dataclass(frozen=True, repr=False)
@@ -58,12 +58,13 @@ class Equation:
 
     def __str__(self) -> str:
         lines, bracketed = [], any("(" in left for left in self.lefts)
+        digits = BESIDE if self.network else UNKNOWN
         for left in self.lefts:
             own = [term for term in self.terms if term.left == left]
             if not own and left.startswith("force on "):
                 continue
-            bracketed = bracketed or any("(" in term.size for term in own)
-            right = " ".join(str(term).replace(" ", TOGETHER) for term in own) or "0"
+            bracketed = bracketed or any("(" in term.size(digits) for term in own)
+            right = " ".join(term.told(digits).replace(" ", TOGETHER) for term in own) or "0"
             minus = f"−{TOGETHER}"
             right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
             wrapped = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
@@ -96,7 +97,8 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
     Standard deviations, and the digits that the motion needs, come from what the data say of all numbers together.
     More `notes` stand behind those of the model.
     """
-    numbers = Numbers(run.model, joint)
+    network = network_of(run)
+    numbers = Numbers(run.model, joint, BESIDE if network else UNKNOWN)
     reader, terms = Reader(run, numbers), []
     for x in reader.lines():
         words = (x.what or "the constant") + (f" of {x.of or 'L'}" if len(reader.lefts) > 1 else "")
@@ -109,7 +111,7 @@ def equation_of(run: FittedRun, joint: Joint | None = None, notes: Sequence[str]
         units.append(f"{', '.join(data.degrees)} recorded in deg (1 rad = 57.3 deg)")
     units += [f"t in {data.time_unit}"] if data.time_unit != "1" else []
     every = (*reader.explained(), *notes, *map(str, numbers.trades()))
-    return Equation(tuple(terms), tuple(reader.lefts), ", ".join(units) or "plain numbers", network_of(run), every)
+    return Equation(tuple(terms), tuple(reader.lefts), ", ".join(units) or "plain numbers", network, every)
 
 
 def network_of(run: FittedRun) -> str | None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from herglotz.models import ContactLagrangian
-from herglotz.training.equation_words import number
+from herglotz.training.equation_words import UNKNOWN, number
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.trades import Trade, combinations, joined
 
@@ -32,8 +32,8 @@ class Numbers:
     than if one of its parameters took the change: it is rounded as that of them asks which the motion depends on most.
     """
 
-    def __init__(self, model: ContactLagrangian, joint: Joint | None):
-        self.joint, self.named = joint, dict(model.named_parameters())
+    def __init__(self, model: ContactLagrangian, joint: Joint | None, digits: int = UNKNOWN):
+        self.joint, self.digits, self.named = joint, digits, dict(model.named_parameters())
         self.at = {entry: k for k, entry in enumerate(ParameterVector(model).entries)}
         self.told: dict[str, dict[int, float]] = {}  # the slopes of every number, by the words for it
 
@@ -66,7 +66,7 @@ class Numbers:
     def shown(self, value: Tensor, words: str, bracketed: bool = False) -> str:
         """A number beside those in front of terms, with its deviation in brackets or without one."""
         x, deviation, alone = self.known(value, words)
-        return ("−" if x < 0 else "") + number(abs(x), deviation if bracketed else None, alone)
+        return ("−" if x < 0 else "") + number(abs(x), deviation if bracketed else None, alone, self.digits)
 
     def trades(self) -> list[Trade]:
         """The combinations of the numbers that were told which the data do not determine, those that overlap as one.

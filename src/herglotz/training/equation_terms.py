@@ -100,8 +100,10 @@ class Reader:
                 speeds = f"{names[i]}′²" if i == j else f"{names[i]}′ {names[j]}′"
                 yield Line("L", speeds, "", mass[i, j] * (0.5 if i == j else 1.0))
         if isinstance(kinetic, FeatureKinetic):
-            moving = [sorted_features(x, self.config.angles)[1] for x in (self.config.features, self.config.known)]
-            for feature, value in self._numbers(kinetic.sum, *moving):
+            learned, known = (
+                sorted_features(x, self.config.angles)[1] for x in (self.config.features, self.config.known)
+            )
+            for feature, value in self._numbers(kinetic.sum, learned, known):
                 yield Line("L", feature_in_words(feature, names), "", value)
 
     def _damping(self) -> Iterator[Line]:

@@ -11,6 +11,7 @@ from herglotz.models.feature_grammar import Feature, Product
 SMALL, LARGE = 1e-4, 1e7  # beyond them a number has its power of ten: its zeros are not counted at a glance
 EXACT = 10  # digits of a number that is told, and no more than rounding
 UNKNOWN = 7  # digits of a number of which nothing says how much the motion depends on it
+BESIDE = 4  # digits of a number beside a network, which is no formula: nobody integrates the lines
 LAST = 100  # units of the last digit: larger deviations are told as ±, for brackets of three digits are not read
 _RAISED = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 

@@ -85,7 +85,7 @@ def combinations(M: Tensor, alone: Tensor, names: Sequence[str]) -> list[Trade]:
     """
     # A parameter of no effect has a diagonal of rounding size, of either sign.
     seen = M.diagonal() > alone / LARGEST**2
-    found = [Trade(LARGEST, ((names[i], 1.0),)) for i in (~seen).nonzero()[:, 0].tolist()]
+    found = [Trade(LARGEST, ((name, 1.0),)) for name, is_seen in zip(names, seen.tolist(), strict=True) if not is_seen]
     kept, M = [name for name, is_seen in zip(names, seen.tolist(), strict=True) if is_seen], M[seen][:, seen]
     if not kept:
         return found

@@ -5,6 +5,7 @@ shorter than the samples', with set-valued friction by Moreau's, or by the steps
 """
 
 import re
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,11 @@ NUMBER = re.compile(r"(\d+(?:\.\d+)?)(?:\((?:±)?[\d.e+-]+\))?(e[-+]?\d+)?")
 POWER = re.compile(r"[⁻⁰¹²³⁴⁵⁶⁷⁸⁹]+")
 FUNCTIONS = {"sin": "np.sin", "cos": "np.cos", "tanh": "np.tanh", "exp": "np.exp", "sgn": "sgn", "√": "np.sqrt"}
 SIGNS = {"+": "+", "−": "-"}
+RULES = {  # what `Printed.action` computes
+    2: "L_d = (c − 1)(s − (h/2) V(q)) + √c h K − (h/2)(V(q) + V(q₊));",
+    4: "L_d = (c − 1) s + √c (h K + (h³/24)(K_qq[v, v] + 2γ K_q v + γ² K − eᵀM⁻¹e)) − "
+    "(h/6)(c V(q) + 4 √c V(q̄) + V(q₊)), e = K_q − V_q − K_qv v − γ K_v, M = K_vv;",
+}
 FAR = 1e6  # a motion beyond is lost
 
 
@@ -110,7 +116,8 @@ class Printed:
             symbols["s"] = "s"
         for distance in re.findall(r"(\S+) = √\(", self.words):
             symbols[distance] = f"np.sqrt({'+'.join(f'q[{i}]**2' for i in range(self.n))})"
-        self.mass, forces, self.L = np.ones(self.n), ["0.0"] * self.n, None
+        self.mass, forces = np.ones(self.n), ["0.0"] * self.n
+        self.L: Any = None  # a function of q, v and s where one is printed
         of_q = list(forces)
         for left, right in lines.items():
             code = Reader(right, symbols)
@@ -128,8 +135,9 @@ class Printed:
                 self.mass[i] = float(match[1] + (match[2] or ""))
         self.slope = None
         self.held = "stays 0" in self.words
-        self.steps = float(re.search(r"steps are ([\d.e-]+)", self.words)[1]) if "step it as" in self.words else None
-        self.order = int(re.search(r"rule of order (\d)", self.words)[1])
+        self.steps = float(self.said(r"steps are ([\d.e-]+)")) if "step it as" in self.words else None
+        self.order = int(self.said(r"rule of order (\d)"))
+        assert not self.steps or RULES[self.order] in self.words
         rate = re.search(r"γ = (−?[\d.e-]+), V", self.words)
         self.damps = 0.0 if rate is None else float(rate[1].replace("−", "-"))
         self._of_q = function(f"[{', '.join(of_q)}]", "q")
@@ -138,6 +146,12 @@ class Printed:
         self._grip = function(
             f"[{', '.join(grip(x, i) if self.held else '0.0' for i, x in enumerate(forces))}]", "q, v, u"
         )
+
+    def said(self, pattern):
+        """What stands in these words below the lines."""
+        found = re.search(pattern, self.words)
+        assert found is not None, f"{pattern} is not in {self.words!r}"
+        return found[1]
 
     def force(self, q, v, u):
         """All forces but set-valued friction, (n, ...)."""
@@ -287,10 +301,13 @@ def runge_kutta(printed, q, v, s, h, u):
         a, rate = printed.acceleration(q + dq, v + dv, s + ds, u(share))
         return v + dv, a, rate
 
+    def beside(share, k):
+        return slope(*(share * h * x for x in k), share)  # pyright: ignore[reportCallIssue]
+
     k1 = slope(0, 0, 0, 0.0)
-    k2 = slope(*(h / 2 * x for x in k1), 0.5)
-    k3 = slope(*(h / 2 * x for x in k2), 0.5)
-    k4 = slope(*(h * x for x in k3), 1.0)
+    k2 = beside(0.5, k1)
+    k3 = beside(0.5, k2)
+    k4 = beside(1.0, k3)
     return tuple(x + h / 6 * (a + 2 * b + 2 * c + d) for x, a, b, c, d in zip((q, v, s), k1, k2, k3, k4, strict=True))
 
 

@@ -196,7 +196,7 @@ def closed_loop():
     with torch.no_grad():
         model.friction.input_map.fill_(4.58731)
         model.potential.features.sum.coefficient.fill_(0.51317)
-        state, states, inputs = State(*(draw(3, 1) * x for x in (0.1, 0.2)), draw(3) * 0), [], []
+        state, states, inputs = State(0.1 * draw(3, 1), 0.2 * draw(3, 1), 0 * draw(3)), [], []
         for k in range(150):
             states.append(state.joined)
             wanted = 0.1 + 0.05 * math.sin(2 * H * k)

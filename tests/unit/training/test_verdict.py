@@ -80,8 +80,9 @@ def test_words(windows, unseen, free, ahead, expected):
 @pytest.mark.parametrize("where", ["windows", "unseen", "free"])
 def test_an_error_that_is_no_fit(noise, error, fits, where):
     # fails if a run that misses by 850 × the noise "fits, worse than the noise", or one of the errors may be larger
-    errors = {name: min(noise, 0.01) for name in ("windows", "unseen", "free")} | {where: error}
-    text = in_words(Errors(**errors, noise=noise, spread=1.0), KNOWN, GOOD)
+    small = min(noise, 0.01)
+    errors: Any = {where: error}
+    text = in_words(replace(Errors(small, small, small, noise=noise, spread=1.0), **errors), KNOWN, GOOD)
     assert text.startswith("does not fit") is not fits, text
     run: Any = SimpleNamespace(metrics={"verdict": text})
     assert exit_code(run) == (0 if fits else 3)

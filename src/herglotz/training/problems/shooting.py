@@ -340,12 +340,11 @@ class ShootingProblem(StatesProblem):
 
     def sensitivities(self, theta: Tensor, path: Path, *, held: bool = False) -> Tensor:
         """dX_k/d(θ, own start), (S, K+1, d, P + d), by Z_{k+1} = A_k Z_k + [B_k, 0]; `held`: by the start alone."""
-        S, K = self.grid.h.shape
-        d = self.d
-        q1, A = path.x[:, 1:, : self.n], step_derivatives(self.parameters.at(theta, self.u), path, self.grid)[..., :d, :d]
+        (S, K), d, L_d = self.grid.h.shape, self.d, self.parameters.at(theta, self.u)
+        q1, A = path.x[:, 1:, : self.n], step_derivatives(L_d, path, self.grid)[..., :d, :d]
         B = theta.new_zeros(S, K, d, 0)
         if not held:
-            B = parameter_derivatives(self.parameters.at(theta, self.u), path.x, q1, A, self.grid.h)
+            B = parameter_derivatives(L_d, path.x, q1, A, self.grid.h)
         eye = torch.eye(d, dtype=theta.dtype, device=theta.device).expand(S, d, d)
         first = torch.cat([torch.zeros_like(B[:, 0]), eye], -1)
         return linear_recurrence(A, torch.cat([B, theta.new_zeros(S, K, d, d)], -1), first)
