@@ -41,7 +41,7 @@ def read(folder, text, **options):
 def table(header, rows=8):
     """Text of a csv file: numbers that grow differently in every column."""
     count = header.count(",") + 1
-    lines = (",".join(f"{k ** (1 + j / 3):.5g}" for j in range(count)) for k in range(rows))
+    lines = (",".join(f"{(k / 8) ** (1 + j / 3):.5g}" for j in range(count)) for k in range(rows))
     return "\n".join([header, *lines]) + "\n"
 
 
@@ -110,7 +110,7 @@ def test_many_columns_without_a_usual_name_are_one_warning(tmp_path, capsys):  #
 def test_times_in_other_words(tmp_path, name):  # fails if a time is a coordinate, and the user is told there is none
     data = read(tmp_path, table(f"x[m],{name},u_t[N]"))
     assert data.columns[1][1] == "time"
-    assert data.t.tolist() == pytest.approx([k ** (4 / 3) for k in range(8)], rel=1e-4, abs=1e-9)
+    assert data.t.tolist() == pytest.approx([(k / 8) ** (4 / 3) for k in range(8)], rel=1e-4, abs=1e-9)
 
 
 def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen unsaid
