@@ -130,6 +130,7 @@ def test_names_of_inputs_survive_writing(tmp_path):  # fails if a coordinate tha
     data = read(tmp_path, table("t[s],motor_angle[rad],target[rad]"), unwrap=False)
     save(tmp_path / "again.csv", data)
     again = load(tmp_path / "again.csv", unwrap=False)
+    assert again.u is not None and data.u is not None  # noqa: PT018
     assert (again.names, again.u.tolist()) == (data.names, data.u.tolist())
 
 
