@@ -216,7 +216,7 @@ def of_mean_and_velocity(
         ends, sides, across = same + move, mixed + turned, same - move + turned - mixed
         every = torch.cat([torch.cat([ends - sides, across], 1), torch.cat([across.transpose(0, 1), ends + sides], 1)])
         i, j = pairs(2 * n, value.device)
-        rows.append(every[i, j])
+        rows.append(every.flatten(0, 1)[2 * n * i + j])  # one index: ONNX takes entries along one axis
     return Jet(torch.cat(rows), 2 * n, 1 if second is None else 2)
 
 
