@@ -63,7 +63,8 @@ def verify(
     Hamilton–Jacobi equation. A time-dependent L_d (`theory.TimeDependent`) steps at its own times, and the form
     η + E dt is measured beside. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
     scene with an exact L_d its closed-form flow, a run its data. The step of an L_d with forces is not a contact map:
-    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out.
+    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. What set-valued
+    friction holds is judged by `herglotz.verify.dry_friction`.
 
     Parameters
     ----------
@@ -77,8 +78,8 @@ def verify(
         Number of states, number of steps from each state, and seed of the drawn states.
     tolerance
         Bound on every identity, relative to the size of its terms, instead of 1e-11 (contact, with L_d) and 1e-10 in
-        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (ONNX, machine code, C), whose
-        map is differentiated by differences.
+        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (machine code, C beyond 8
+        coordinates), whose map is differentiated by differences.
     model
         The model that a file was exported from. The map of a forced file is no contact map, and its steps do not tell
         the forces: with the model it is checked as a forced map, without it by the checks that need no forces.
