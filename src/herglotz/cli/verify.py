@@ -15,7 +15,7 @@ from herglotz.errors import InputError
 DESCRIPTION = """\
 Measure every identity that a discrete contact Lagrangian must satisfy on a scene, a run or an exported file, and
 compare each with its tolerance. The exit code is 0 when all pass and 1 when one fails. A file without derivatives
-(ONNX, aoti, C) is differentiated by differences of order 8, with wider tolerances.
+(aoti) is differentiated by differences of order 8, with wider tolerances.
 A file is also stepped beside its run, 1, 7 and 4096 samples over 1000 steps. The run is the one that --against
 names, or a folder with the same weights beside the file, in the current folder, or in runs/ of either.
 

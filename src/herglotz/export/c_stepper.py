@@ -12,7 +12,6 @@ from torch import Tensor
 
 from herglotz.codegen.c_compiler import build
 from herglotz.data.files import PathLike
-from herglotz.errors import InputError
 from herglotz.export.c_header import MAX_DERIVATIVES, read_metadata, runtime
 from herglotz.export.exported import ExportedStepper
 from herglotz.stepping import Status
@@ -48,8 +47,6 @@ class CLibrary:
 
     def linearise(self, q: Tensor, p: Tensor, s: Tensor, h: Tensor, u: Tensor | None = None) -> tuple[Tensor, ...]:
         """A step and its derivative (B, 2n+1, 2n+2+m); NaN where the step failed."""
-        if self.dof > MAX_DERIVATIVES:
-            raise InputError(f"C has no derivatives beyond {MAX_DERIVATIVES} coordinates; use Stepper.linearise")
         if self.differentiates is None:  # built on first use: most steppers are not differentiated
             assert self.whole is not None
             self.differentiates = build(self.whole(), library_of(self.metadata["name"]))
@@ -103,5 +100,5 @@ def _arguments(*values: Tensor | int | None) -> list[Any]:
 def compiled(header: str, path: PathLike = "header", whole: Callable[[], str] | None = None) -> ExportedStepper:
     """The stepper of a header; arguments and errors as of `CLibrary`."""
     library = CLibrary(header, path, whole)
-    programs = {"init": library.init, "linearise": library.linearise}
+    programs = {"init": library.init} | ({"linearise": library.linearise} if library.dof <= MAX_DERIVATIVES else {})
     return ExportedStepper(programs, library.metadata, str(path), "c", library)

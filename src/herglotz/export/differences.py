@@ -1,4 +1,4 @@
-"""Derivatives of a step map that autograd cannot enter (ONNX, machine code, C), by central differences."""
+"""Derivatives of a step map that autograd cannot enter (ONNX, machine code, C): its file's own, or differences."""
 
 from __future__ import annotations
 
@@ -16,6 +16,25 @@ WEIGHTS = (4 / 5, -1 / 5, 4 / 105, -1 / 280)
 OFFSET = {torch.float64: 0.01, torch.float32: 0.1}
 
 
+class LinearisedStepper:
+    """A stepper whose `step` gives autograd the derivative that a file holds (`ExportedStepper.linearise`).
+
+    For verification only.
+
+    Parameters
+    ----------
+    stepper
+        Anything with `step(state, h) -> Step` and `linearise(state, h) -> Linearised`.
+    """
+
+    def __init__(self, stepper: Any):
+        self.stepper = stepper
+
+    def step(self, state: State, h: float) -> Step:
+        """One step; differentiable in the state, not in h."""
+        return _differentiable(self.stepper, state, h, lambda x: self.stepper.linearise(state_of(x), h).by_state)
+
+
 class DifferencedStepper:
     """A stepper whose `step` gives autograd a derivative, measured on the map itself by 8 (2n + 1) further steps.
 
@@ -26,19 +45,20 @@ class DifferencedStepper:
     ----------
     stepper
         Anything with `step(state, h) -> Step`.
+    sticks
+        Whether dry friction can hold a coordinate: see `central_differences`.
     """
 
-    def __init__(self, stepper: Any):
-        self.stepper = stepper
+    def __init__(self, stepper: Any, sticks: bool = False):
+        self.stepper, self.sticks = stepper, sticks
 
     def step(self, state: State, h: float) -> Step:
         """One step; differentiable in the state, not in h."""
-        x = state.joined
-        found = self.stepper.step(state_of(x.detach()), h)
-        if not (torch.is_grad_enabled() and x.requires_grad):
-            return found
-        y = _Differenced.apply(x, self.stepper, h)
-        return Step(state_of(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
+        return _differentiable(self.stepper, state, h, lambda x: self._slopes(x, h))
+
+    def _slopes(self, x: Tensor, h: float) -> Tensor:
+        offset = OFFSET[x.dtype] * (1 + x.abs())
+        return central_differences(lambda y: stepped(self.stepper.step, y, h), x, offset, self.sticks)
 
 
 def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor:
@@ -46,21 +66,47 @@ def stepped(step: Callable[[State, float], Step], x: Tensor, h: float) -> Tensor
     return step(state_of(x), h).state.joined
 
 
-def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor) -> Tensor:
-    """The derivative (..., m, m) of f: (N, m) → (N, m) at x (..., m); in one batch; x_j moves by 1 … 4 offsets."""
+def central_differences(f: Callable[[Tensor], Tensor], x: Tensor, offset: Tensor, sticks: bool = False) -> Tensor:
+    """The derivative (..., m, m) of f: (N, m) → (N, m) at x (..., m); in one batch; x_j moves by 1 … 4 offsets.
+
+    A map with set-valued dry friction (`sticks`) is smooth where no coordinate changes between sliding forward, sliding
+    back and standing still. Elsewhere it has no derivative: NaN where the points around x differ in that.
+    """
     move = torch.stack([torch.diag_embed(k * offset.expand_as(x)) for k in range(1, len(WEIGHTS) + 1)])
     points = torch.stack([x[..., None, :] + move, x[..., None, :] - move])  # row j moves x_j
-    ahead, behind = f(points.reshape(-1, x.shape[-1])).reshape(points.shape)
-    columns = torch.stack([w * change for w, change in zip(WEIGHTS, ahead - behind, strict=True)]).sum(0)
-    return (columns / offset[..., None]).mT
+    ends = f(points.reshape(-1, x.shape[-1])).reshape(points.shape)
+    columns = torch.stack([w * change for w, change in zip(WEIGHTS, ends[0] - ends[1], strict=True)]).sum(0)
+    slopes = (columns / offset[..., None]).mT
+    if not sticks:
+        return slopes
+    ways = directions(points, ends)  # (2, 4, ..., m, n)
+    alike = (ways == ways[:1, :1, ..., :1, :]).all(-1).all(-1).all(0).all(0)
+    return torch.where(alike[..., None, None], slopes, torch.nan)
 
 
-class _Differenced(torch.autograd.Function):
+def directions(x: Tensor, y: Tensor) -> Tensor:
+    """Where each coordinate goes in a step from x to y, (..., 2n+1) each: 1, −1 or, where it stands still, 0."""
+    n = x.shape[-1] // 2
+    return (y - x)[..., :n].sign()
+
+
+def _differentiable(stepper: Any, state: State, h: float, slopes: Callable[[Tensor], Tensor]) -> Step:
+    """One step, with `slopes` (q, p, s) → DΦ̃ for autograd where it asks for a derivative."""
+    x = state.joined
+    found = stepper.step(state_of(x.detach()), h)
+    if not (torch.is_grad_enabled() and x.requires_grad):
+        return found
+    y = _Given.apply(x, found.state.joined, slopes(x.detach()))
+    return Step(state_of(y), found.c, found.status, found.residual, found.iterations)  # pyright: ignore
+
+
+class _Given(torch.autograd.Function):
+    """y, a function of x with the derivative D, (..., m, m)."""
+
     @staticmethod
-    def forward(ctx: Any, x: Tensor, stepper: Any, h: float) -> Tensor:  # pyright: ignore
-        offset = OFFSET[x.dtype] * (1 + x.detach().abs())
-        ctx.save_for_backward(central_differences(lambda y: stepped(stepper.step, y, h), x.detach(), offset))
-        return stepped(stepper.step, x.detach(), h)
+    def forward(ctx: Any, x: Tensor, y: Tensor, D: Tensor) -> Tensor:  # noqa: ARG004  # pyright: ignore
+        ctx.save_for_backward(D)
+        return y.clone()
 
     @staticmethod
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None, None]:

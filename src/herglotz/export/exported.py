@@ -101,7 +101,9 @@ class ExportedStepper(OneStepMethod):
         no derivative.
         """
         if "linearise" not in self.programs:
-            raise InputError(f"{self.path}: {self._file} file holds no derivative; use a .pt2, ONNX or C file")
+            many = f" of {self.dof} coordinates" if self.kind == "c" else ""
+            message = f"{self._file} file{many} holds no derivative; use a .pt2 or ONNX file, or Stepper.linearise"
+            raise InputError(f"{self.path}: {message}")
         with torch.no_grad():
             self._check(*state)
             state = State(*(x.detach() for x in state))

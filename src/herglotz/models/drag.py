@@ -173,7 +173,8 @@ class Drag(nn.Module):
     def _through_air(self, v: Tensor) -> tuple[Tensor, Tensor]:
         """−θ |v| v, (..., n), and its slope −θ (|v| I + v vᵀ/|v|), (..., n, n)."""
         theta, eye = self.coefficient[self.air].sum(), torch.eye(v.shape[-1], dtype=v.dtype, device=v.device)
-        size = ((v * v).sum(-1, keepdim=True) + torch.finfo(v.dtype).tiny).sqrt()  # with a derivative at rest
+        # With a derivative at rest; onnxruntime leaves out what is added where its 32 bits are 0.
+        size = ((v * v).sum(-1, keepdim=True) + torch.finfo(torch.float32).tiny).sqrt()
         bend = size[..., None] * eye + v[..., None] * (v / size)[..., None, :]
         return -theta * size * v, -theta * bend
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import reduce
 from typing import Any
 
 import torch
@@ -61,7 +62,7 @@ class Combination(nn.Module):
         )  # fmt: skip
         parts = zip(functions, x.split(self.counts[: len(RIDGES)], -1), strict=True)
         found = [function(part) for function, part in parts if part.shape[-1]]
-        return found[0] if len(found) == 1 else torch.cat(found or [x], -1)
+        return found[0] if len(found) == 1 else torch.cat(found, -1)
 
     def _powers(self, x: Tensor, k: int, function: str = "power") -> Tensor:
         """Return the k-th derivatives of the powers, or of those that have a sign."""
@@ -89,29 +90,35 @@ class FeaturePotential(nn.Module):
 
     def forward(self, q: Tensor, order: int, along: Tensor | None = None) -> Jet:
         """Return V as a jet over the n components of q, or V′y for a constant y = `along`, (..., n)."""
-        c, n = self.sum, self.sum.dof
+        c = self.sum
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
-        x = q @ c.form.T
-        k = 0 if along is None else 1
-        if along is not None:
-            ridge = ridge * (along @ c.form.T)
-        f = [c.ridge(x, k + j) * ridge for j in range(order + 1)]
-        rows = [f[0].sum(-1)[None], (f[1] @ c.form).movedim(-1, 0)]
-        if order == 2:
-            rows.append((f[2] @ c.outer).movedim(-1, 0))
-        jet = Jet(torch.cat(rows), n, order)
-        return jet if c.ridges == len(c.products) else jet + self._radial(q, radial, order, along)
+        parts = [self._of_forms(q, ridge, order, along)] if c.ridges else []  # a file takes no tensor without entries
+        parts += [self._radial(q, radial, order, along)] if c.ridges < len(c.products) else []
+        return reduce(Jet.__add__, parts)
 
     def value_and_slope(self, q: Tensor) -> tuple[Tensor, Tensor]:
         """Return V (...) and V′ (..., n), without a jet."""
-        c = self.sum
+        c, parts = self.sum, []
         ridge, radial = c.weights().split([c.ridges, len(c.products) - c.ridges])
-        x = q @ c.form.T
-        V, slope = c.ridge(x, 0) @ ridge, (c.ridge(x, 1) * ridge) @ c.form
-        if c.ridges == len(c.products):
-            return V, slope
-        square = (q * q).sum(-1)
-        return V + c.radial(square, 0) @ radial, slope + 2 * (c.radial(square, 1) @ radial)[..., None] * q
+        if c.ridges:
+            x = q @ c.form.T
+            parts.append((c.ridge(x, 0) @ ridge, (c.ridge(x, 1) * ridge) @ c.form))
+        if c.ridges < len(c.products):
+            square = (q * q).sum(-1)
+            parts.append((c.radial(square, 0) @ radial, 2 * (c.radial(square, 1) @ radial)[..., None] * q))
+        V, slope = (reduce(torch.add, x) for x in zip(*parts, strict=True))
+        return V, slope
+
+    def _of_forms(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:
+        """Return the sum of the functions of w·q as a jet, or its derivative along y."""
+        c, x, k = self.sum, q @ self.sum.form.T, 0 if y is None else 1
+        if y is not None:
+            weights = weights * (y @ c.form.T)
+        f = [c.ridge(x, k + j) * weights for j in range(order + 1)]
+        rows = [f[0].sum(-1)[None], (f[1] @ c.form).movedim(-1, 0)]
+        if order == 2:
+            rows.append((f[2] @ c.outer).movedim(-1, 0))
+        return Jet(torch.cat(rows), c.dof, order)
 
     def _radial(self, q: Tensor, weights: Tensor, order: int, y: Tensor | None) -> Jet:
         """Return F(r²) as a jet, or 2F′ q·y where y is given."""

@@ -38,6 +38,13 @@ def _unpack_index(d: int, device: torch.device) -> Tensor:
 
 
 @lru_cache(maxsize=64)
+def _upper_index(d: int, device: torch.device) -> Tensor:
+    """Where ∂_i ∂_j f, i ≤ j, stand among all d² of them: one index, for ONNX takes entries along one axis."""
+    i, j = pairs(d, device)
+    return d * i + j
+
+
+@lru_cache(maxsize=64)
 def _embed_index(d: int, size: int, offset: int, order: int, device: torch.device) -> Tensor:
     """Row numbers that place a jet over d tangents inside one over `size`; the last row (zeros) fills the rest."""
     slot = {offset + k: k for k in range(d)}
@@ -215,8 +222,7 @@ def of_mean_and_velocity(
         turned = mixed.transpose(0, 1)
         ends, sides, across = same + move, mixed + turned, same - move + turned - mixed
         every = torch.cat([torch.cat([ends - sides, across], 1), torch.cat([across.transpose(0, 1), ends + sides], 1)])
-        i, j = pairs(2 * n, value.device)
-        rows.append(every[i, j])
+        rows.append(every.flatten(0, 1)[_upper_index(2 * n, value.device)])
     return Jet(torch.cat(rows), 2 * n, 1 if second is None else 2)
 
 

@@ -54,7 +54,9 @@ class PositionKinetic(nn.Module):
         """Return K as a jet over (q0, q1)."""
         diagonal, below = self._factors(phase.position)
         w = phase.velocity.linear(self.constant.factor().T)  # C̄ᵀ v
-        turned = diagonal * w + (below * w.select(self.row)).linear(self.place)
+        turned = diagonal * w
+        if len(self.row):  # a file takes no tensor without entries
+            turned = turned + (below * w.select(self.row)).linear(self.place)
         return (turned * turned).sum() * (phase.h / 2)
 
     def _factors(self, x: Jet) -> tuple[Jet, Jet]:

@@ -266,7 +266,8 @@ class ContactLagrangian(nn.Module):
         assert features is not None  # the baseline at least
         assert not isinstance(kinetic, PositionKinetic)
         assert not isinstance(damping, AffineDamping)
-        rate = phase.q0.new_zeros(()) if damping is None else damping.rate
+        # A constant, and no function of q0: ONNX has matrices of a sample apart from those of the model.
+        rate = torch.zeros((), dtype=phase.q0.dtype, device=phase.q0.device) if damping is None else damping.rate
         return missing(Slope(features, kinetic, rate, phase), V0, V1, (-rate * phase.h / 2).exp())
 
     def _forces(self, phase: Phase, u: Tensor | None) -> Forces | None:

@@ -31,41 +31,43 @@ def derivative(subject: Subject, w: SampledRollout) -> Check:
 
     A jump is seen where a stencil meets it, so there are many points: each covers 8 % of a spread. A map that bends
     within that (near a wall, a collision) is compared with narrower differences, and by `COARSE` with the wide ones.
-    The error is the largest |ΔDΦ̃_ij| spread_j, over the largest |DΦ̃_ij| spread_j of row i. Forces that hold and slide
-    (set-valued friction) have kinks, at which no derivative exists: with forces the median of the samples is judged.
+    The error is the largest |ΔDΦ̃_ij| spread_j, over the largest |DΦ̃_ij| spread_j of row i.
+
+    Set-valued friction has kinks, at which no derivative exists. Samples are judged whose stencil, wide or narrow,
+    stays on one branch of the map; the wide ones have no say where narrow ones do, for Stribeck's curve bends sharply.
+    Of other forces nobody knows where the kinks are: the median of the samples is judged.
     """
     x = torch.cat([w.q[:, :-1], w.p[:, :-1], w.s[:, :-1, None]], -1)[w.ok]
     count, make = MOST // (2 * len(WEIGHTS) * x.shape[-1]), torch.Generator().manual_seed(0)
     spread, keep = _spread(x), torch.randperm(len(x), generator=make)[: max(4, count)].to(x.device)
     x, D = x[keep], w.derivative[w.ok][keep]
-    of_sample, sound = _errors(subject, x, D, spread, OFFSET[x.dtype])
+    wide = _errors(subject, x, D, spread, OFFSET[x.dtype])
     bound = max(AGREES[x.dtype], rounded(0.0, w) / OFFSET[x.dtype])
-    bent = (of_sample > bound).nonzero()[:, 0]
-    if len(bent):
-        least = of_sample[bent]
-        for share in NARROW:
-            narrow, fine = _errors(subject, x[bent], D[bent], spread, share * OFFSET[x.dtype])
-            least = torch.where(fine, torch.minimum(narrow, least), least)
-        of_sample[bent] = torch.maximum(least, bound / COARSE * of_sample[bent])
-    of_sample = of_sample[sound]
-    left_out = int((~sound).sum())
-    note = f"{left_out} of {len(x)} samples left out: a step beside them failed" if left_out else ""
-    if subject.forced or _has_forces(subject):
-        value = float(of_sample.median()) if len(of_sample) else float("nan")
-        claim = "autograd DΦ̃ is the derivative (median of differences)"
-    else:
-        value, claim = worst(of_sample), "autograd DΦ̃ is the derivative: central differences"
+    of_sample, bent = wide.clone(), ~(wide <= bound)
+    if bool(bent.any()):
+        widths = (share * OFFSET[x.dtype] for share in NARROW)
+        for narrow in (_errors(subject, x[bent], D[bent], spread, width) for width in widths):
+            of_sample[bent] = torch.fmin(of_sample[bent], narrow)
+        if not subject.sticks:
+            of_sample[bent] = torch.maximum(of_sample[bent], bound / COARSE * wide[bent])
+    found = of_sample[~of_sample.isnan()]
+    left_out = len(x) - len(found)
+    beside = "a step beside them failed" + (", or changes between sliding and standing still" if subject.sticks else "")
+    note = f"{left_out} of {len(x)} samples left out: {beside}" if left_out else ""
+    value, how = worst(found), ": central differences"
+    if (subject.forced or _has_forces(subject)) and not subject.sticks:
+        value, how = float(found.median()) if len(found) else float("nan"), " (median of differences)"
+    claim = f"{subject.derivative_of} DΦ̃ is the derivative{how}"
     return Check.at_most("derivative", claim, value, bound, note)
 
 
-def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> tuple[Tensor, Tensor]:
-    """The largest error of a sample, (B), over the largest entry of its row; and where differences exist, (B)."""
+def _errors(subject: Subject, x: Tensor, D: Tensor, spread: Tensor, offset: float) -> Tensor:
+    """The largest error of a sample, (B), over the largest entry of its row; NaN where no differences exist."""
     with torch.no_grad():
-        found = central_differences(lambda y: stepped(subject.step, y, subject.h), x, offset * spread)
-    sound = found.isfinite().all(-1).all(-1)
+        found = central_differences(lambda y: stepped(subject.step, y, subject.h), x, offset * spread, subject.sticks)
     scaled, error = D.abs() * spread, (D - found).abs() * spread
     error = error / scaled.amax((0, -1))[:, None] if len(scaled) else error
-    return error.flatten(1).amax(-1), sound
+    return error.flatten(1).amax(-1)
 
 
 def _spread(x: Tensor) -> Tensor:

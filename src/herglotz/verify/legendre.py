@@ -9,6 +9,7 @@ from herglotz.mechanics import herglotz_residual, mixed_hessian, momentum_jacobi
 from herglotz.mechanics.regularity import left_hessian, scaled_margin
 from herglotz.stepping import solve
 from herglotz.theory import LeftHamiltonian, left_equations
+from herglotz.verify.dry_friction import on_sliding
 from herglotz.verify.report import Check
 from herglotz.verify.sampled_rollout import SampledRollout, worst
 from herglotz.verify.subject import Subject
@@ -100,40 +101,49 @@ def regularity(subject: Subject, w: SampledRollout) -> Check:
     """Check det M ≠ 0 with a margin: the smallest singular value of M, scaled so that D11, D22 and M have size 1.
 
     Each coordinate is scaled by its own diagonal entries, so the margin does not depend on units. Determinants of both
-    signs among the samples mean that M is singular between them.
+    signs among the samples mean that M is singular between them. M is that of the coordinates that slide: where dry
+    friction holds one, the step does not answer to its momentum (`herglotz.verify.dry_friction`).
     """
     with torch.no_grad():
-        if subject.L_d is None:
-            M, sizes, note = _map_hessians(w)
-        else:
-            M, sizes, note = _hessians(subject, w)
-        margin = scaled_margin(M, *sizes).nan_to_num(0.0)
-        sign = torch.linalg.det(M[torch.isfinite(M).all(-1).all(-1)]).sign()
-    same = bool((sign == sign[:1]).all()) and bool(sign.abs().min() > 0) if len(sign) else False
+        M, sizes, slides, note = _map_hessians(w) if subject.L_d is None else _hessians(subject, w)
+        slides = slides[moves := slides.any(-1)]
+        M, sizes = on_sliding(M[moves], slides, 1.0), [on_sliding(x[moves], slides, 0.0) for x in sizes]
+        margin = scaled_margin(M, M, *sizes).nan_to_num(0.0)
+        same = _one_sign(M, slides)
     if not same:
         note = "; ".join(x for x in (note, "det M vanishes or changes sign over the samples") if x)
     value = float(margin.min()) if margin.numel() else float("nan")
     return Check.more_than("regularity", "regular: margin of det M ≠ 0", value, MARGIN, note, also=same)
 
 
-def _hessians(subject: Subject, w: SampledRollout) -> tuple[Tensor, list[Tensor], str]:
-    """Return M and the blocks that scale it, at every step; rest, q1 = q0, replaces a step that failed."""
+def _one_sign(M: Tensor, slides: Tensor) -> bool:
+    """Return whether det M has one sign, and not 0, over all samples in which the same coordinates slide."""
+    finite = torch.isfinite(M).all(-1).all(-1)
+    sign, sets = torch.linalg.det(M[finite]).sign(), slides[finite]
+    if not len(sign) or bool((sign == 0).any()):
+        return False
+    which = torch.unique(sets, dim=0, return_inverse=True)[1]
+    return all(bool((own == own[0]).all()) for own in (sign[which == k] for k in which.unique()))
+
+
+def _hessians(subject: Subject, w: SampledRollout) -> tuple[Tensor, list[Tensor], Tensor, str]:
+    """Return M, the blocks that scale it and what slides, at every step; rest, q1 = q0, replaces a step that failed."""
     q0, q1 = w.q[:, :-1], w.q[:, 1:]
     q1 = torch.where(w.ok[..., None], q1, q0)
     assert subject.L_d is not None
     P = partials(subject.L_d, q0.flatten(0, 1), q1.flatten(0, 1), w.s[:, :-1].flatten(0, 1), subject.h, 2)
-    M = mixed_hessian(P)
     note = "" if bool(w.ok.all()) else "M at q1 = q0 where the step failed"
-    return M, [M, P.D11, P.D22], note
+    return mixed_hessian(P), [P.D11, P.D22], (w.slides | ~w.ok[..., None]).flatten(0, 1), note
 
 
-def _map_hessians(w: SampledRollout) -> tuple[Tensor, list[Tensor], str]:
-    """Return M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map."""
+def _map_hessians(w: SampledRollout) -> tuple[Tensor, list[Tensor], Tensor, str]:
+    """Return M = −c (∂q1/∂p0)⁻¹ and D22 = ∂p1/∂p0 (∂q1/∂p0)⁻¹ from the derivative of the map, and what slides."""
     n = w.q.shape[-1]
-    D = w.derivative[w.ok]
-    inverse = torch.linalg.inv_ex(D[..., :n, n : 2 * n])[0]
+    D, slides = w.derivative[w.ok], w.slides[w.ok]
+    by_p = D[..., : 2 * n, n : 2 * n]
+    inverse = torch.linalg.inv_ex(on_sliding(by_p[..., :n, :], slides, 1.0))[0]
     M = -w.c[w.ok][..., None, None] * inverse
-    return M, [M, D[..., n : 2 * n, n : 2 * n] @ inverse], "no L_d in the file: M from the derivative of the map"
+    return M, [by_p[..., n:, :] @ inverse], slides, "no L_d in the file: M from the derivative of the map"
 
 
 def _from_map(w: SampledRollout) -> tuple[Tensor, Tensor, Tensor]:

@@ -26,12 +26,19 @@ class SampledRollout:
     c: Tensor  # (B, K) as the stepper reports it
     status: Tensor  # (B, K)
     derivative: Tensor  # (B, K, 2n+1, 2n+1) DΦ̃ at entry k
+    sticks: bool = False  # whether set-valued dry friction can hold a coordinate
 
     @property
     def ok(self) -> Tensor:
         """Return whether each step converged with finite c and derivative, (B, K)."""
         finite = torch.isfinite(self.derivative).all(-1).all(-1) & torch.isfinite(self.c)
         return (self.status == Status.CONVERGED) & finite
+
+    @property
+    def slides(self) -> Tensor:
+        """Return whether each coordinate moves in each step, or no friction can hold it, (B, K, n)."""
+        moves = self.q[:, 1:] != self.q[:, :-1]
+        return moves if self.sticks else torch.ones_like(moves)
 
     @property
     def starts(self) -> State:
@@ -56,7 +63,7 @@ def sampled_rollout(subject: Subject, steps: int) -> SampledRollout:
         out = held.rollout(*subject.states, h=subject.h, steps=steps)
     _, D = flow_derivative(subject.flow(), *(x[:, :-1].flatten(0, 1) for x in (out.q, out.p, out.s)))
     c = torch.stack(held.factors, 1)
-    return SampledRollout(out.q, out.p, out.s, c, out.status, D.unflatten(0, (-1, steps)))
+    return SampledRollout(out.q, out.p, out.s, c, out.status, D.unflatten(0, (-1, steps)), subject.sticks)
 
 
 class _Held(Map):

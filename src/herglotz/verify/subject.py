@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +15,10 @@ from herglotz.data.simulate import uniform
 from herglotz.errors import InputError, did_you_mean
 from herglotz.export import DifferencedStepper, ExportedStepper, load_exported
 from herglotz.export.compare import draw
+from herglotz.export.differences import LinearisedStepper
 from herglotz.mechanics import DiscreteLagrangian
 from herglotz.mechanics.contact import Flow
+from herglotz.models import capabilities
 from herglotz.scenes import Scene, scene, scene_names
 from herglotz.stepping import OneStepMethod, Rollout, State, Step, Stepper
 from herglotz.stepping.state import check_batch
@@ -43,13 +45,29 @@ class Subject:
     L_d: DiscreteLagrangian | None = None  # None: only the map itself is known
     scene: Scene | None = None
     run: Run | None = None
-    forced: bool = False  # whether the target is a file of the forced level, whose map is no contact map
-    differenced: bool = False  # whether derivatives of the map are differences, because autograd cannot enter it
+    metadata: Mapping[str, Any] = field(default_factory=dict)  # of a file
+    differenced: bool = False  # whether derivatives of the map are differences: nothing else gives the file's
 
     @property
     def dof(self) -> int:
         """Number of coordinates n."""
         return self.states.q.shape[-1]
+
+    @property
+    def forced(self) -> bool:
+        """Whether the target is a file of the forced level, whose map is no contact map."""
+        return self.metadata.get("level") == "forced"
+
+    @property
+    def sticks(self) -> bool:
+        """Whether set-valued dry friction can hold a coordinate."""
+        made_of = capabilities(self.L_d)
+        return made_of.sticking if made_of is not None else bool(self.metadata.get("model", {}).get("sticking"))
+
+    @property
+    def derivative_of(self) -> str:
+        """Whose derivative of the map is judged."""
+        return "the file's" if self.metadata and self.kind != "pt2" else "autograd"
 
     def flow(self, k: int = 1) -> Flow:
         """Return the k-step map (q, p, s) → (q_k, p_k, s_k); a sample whose step failed is NaN."""
@@ -89,11 +107,7 @@ def subject(target: Any, h: float | None, samples: int, seed: int) -> Subject:
         states, size, step = _run_states(target, samples, make), _step_size(h, target.h), Stepper(target.model).step
         return Subject(f"run on {target.data.source or 'data'}", "run", step, states, size, target.model, run=target)
     if isinstance(target, ExportedStepper):
-        closed = not target.differentiable
-        smooth = DifferencedStepper(target) if closed else target
-        states, size = draw(target, samples, make), _step_size(h, target.h)
-        forced = target.metadata.get("level") == "forced"
-        return Subject(target.path, target.kind, smooth.step, states, size, forced=forced, differenced=closed)
+        return _file(target, draw(target, samples, make), _step_size(h, target.h))
     if isinstance(target, tuple) and len(target) == 2:
         return _pair(*target, h)
     if hasattr(target, "step"):
@@ -123,6 +137,16 @@ def named(target: Any) -> Any:
     known = scene_names()
     near = did_you_mean(str(target), known)
     raise InputError(f"{target}: no such scene ({', '.join(known)}), run folder or .pt2, .onnx or .h file{near}")
+
+
+def _file(target: ExportedStepper, states: State, h: float) -> Subject:
+    """Return the subject of a file: its map has the derivative of autograd, or the file's own, or differences."""
+    whole = Subject(target.path, target.kind, target.step, states, h, metadata=target.metadata)
+    if target.differentiable:
+        return whole
+    if "linearise" in target.programs:
+        return replace(whole, step=LinearisedStepper(target).step)
+    return replace(whole, step=DifferencedStepper(target, whole.sticks).step, differenced=True)
 
 
 def _pair(source: Any, states: Any, h: float | None) -> Subject:

@@ -8,13 +8,13 @@ from typing import Any
 import torch
 
 from herglotz.errors import InputError
-from herglotz.mechanics import DiscreteLagrangian, Forces, partials
-from herglotz.mechanics.legendre import soft_threshold, unheld_residual
+from herglotz.mechanics import DiscreteLagrangian
 from herglotz.theory import TimeDependent
 from herglotz.threads import one_thread
 from herglotz.verify.action import Fan, derivatives, fan, hamilton_jacobi, left_hamilton_jacobi
 from herglotz.verify.data_checks import data_checks
 from herglotz.verify.derivative import derivative
+from herglotz.verify.dry_friction import forces, holding
 from herglotz.verify.explicit_time import in_time
 from herglotz.verify.legendre import (
     NO_H_MINUS,
@@ -63,7 +63,8 @@ def verify(
     Hamilton–Jacobi equation. A time-dependent L_d (`theory.TimeDependent`) steps at its own times, and the form
     η + E dt is measured beside. A known L_d adds the left Hamilton equations and the left Hamilton–Jacobi equation, a
     scene with an exact L_d its closed-form flow, a run its data. The step of an L_d with forces is not a contact map:
-    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out.
+    then DΦ̃ᵀη = cη − F⁻dq0 − F⁺dq1 is measured, and the checks of generating functions are left out. What set-valued
+    friction holds is judged by `herglotz.verify.dry_friction`.
 
     Parameters
     ----------
@@ -77,8 +78,8 @@ def verify(
         Number of states, number of steps from each state, and seed of the drawn states.
     tolerance
         Bound on every identity, relative to the size of its terms, instead of 1e-11 (contact, with L_d) and 1e-10 in
-        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (ONNX, machine code, C), whose
-        map is differentiated by differences.
+        float64, 5e-4 and 1e-3 in float32; 1e-9 and 2e-3 for a file without derivatives (machine code, C beyond 8
+        coordinates), whose map is differentiated by differences.
     model
         The model that a file was exported from. The map of a forced file is no contact map, and its steps do not tell
         the forces: with the model it is checked as a forced map, without it by the checks that need no forces.
@@ -104,15 +105,16 @@ def verify(
         return Report(known.name, tuple(in_time(known, known.L_d, steps, strict, identity)), details)
     w = sampled_rollout(known, steps)
     behind = replace(known, L_d=model) if known.forced else known
-    force = _forces(behind, w)
+    force = forces(behind, w)
     checks = [convergence(w), positive_factor(w), regularity(known, w)]
     missing: tuple[str, ...] = ()
     if not known.differenced:  # else DΦ̃ is made of differences
         checks.append(derivative(known, w))
     if force is not None:  # not a contact map: no generating function, and the volume is not c^{n+1}
         checks += [contact(w, strict, force), momentum_matching(behind, w, identity)]
+        checks += [holding(behind, w, identity)] if force.held is not None else []
     elif known.forced:
-        missing = ("contact", "momentum")
+        missing = ("contact", "momentum", *(("holding",) if known.sticks else ()))
         checks[2] = replace(checks[2], note=f"{checks[2].note}. {FORCED}")
     else:
         fixed = tolerance is not None
@@ -174,23 +176,6 @@ def _not_judged(known: Subject) -> str:
         return "other parameters and states than these."
     physics = "whether the motion is that of the physical system"
     return f"{physics}: the rows hold for every regular L_d, at this h alone."
-
-
-def _forces(known: Subject, w: SampledRollout) -> Forces | None:
-    """Return F⁻ and F⁺ at the steps that are ok; None where the subject has no forces.
-
-    Of a coordinate that dry friction holds, F⁻ has what holds it: all of D1 + c p0 + F⁻ that friction can.
-    """
-    if known.L_d is None:
-        return None
-    q0, p0, s0 = w.starts
-    with torch.no_grad():
-        P = partials(known.L_d, q0, w.ends.q, s0, known.h)
-        force = P.force
-        if force is None or force.held is None:
-            return force
-        F = unheld_residual(P, p0)
-        return replace(force, minus=force.minus - F + soft_threshold(F, force.held))
 
 
 def _exact_flow(known: Subject, w: SampledRollout, bound: float) -> Check:

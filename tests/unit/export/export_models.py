@@ -58,20 +58,9 @@ def states_of(n, batch, dtype=torch.float64, seed=0):
 
 TERMS: dict[str, tuple[int, dict[str, Any]]] = {
     "order 4": (1, {"order": 4}),
-    "order 4, features": (2, {"order": 4, "features": ("cos(q1 - q2) v1 v2", "q2 v1")}),
-    "order 4, three coordinates": (3, {"order": 4, "features": ("r^-1", "q3 v1 v2")}),
-    "features": (2, {"features": ("cos(q1 - q2)", "sin(q1) v2^2", "q2^3")}),
-    "bent springs": (3, {"features": ("|q2| q2", "|q3|^3", "q2^4")}),
-    "m(q)": (2, {"mass_width": 3}),
     "m(q), coupled": (2, {"mass_width": 3, "level": "forced", "coupled": True}),
-    "coupled": (2, {"level": "forced", "coupled": True, "coulomb": True}),
     "drag": (3, {"level": "forced", "drag": ("|v1| v1", "q2^2 v2", "(v1 - v2)^3", "|v| v", "load 1")}),
     "sticking": (1, {"level": "forced", "coulomb": True, "sticking": True, "inputs": 1}),
-    "sticking by position": (
-        2,
-        {"level": "forced", "coulomb": True, "sticking": True, "drag": ("q2^2 sgn(v2)", "cos(q1) sgn(v1)", "v2^3")},
-    ),
-    "sticking, two joints": (2, {"level": "forced", "coulomb": True, "sticking": True, "coupled": True}),
 }
 
 

@@ -5,7 +5,6 @@ from typing import Any
 
 import pytest
 import torch
-from export_models import beside, near, with_terms
 
 from herglotz.export import compile_c
 from herglotz.models import ContactLagrangian, ModelConfig
@@ -56,18 +55,3 @@ def test_features_step_in_c_as_they_do_in_eager(tmp_path, monkeypatch, name, dty
     torch.testing.assert_close(out.p, expected.p, rtol=tol, atol=tol)
     torch.testing.assert_close(out.s, expected.s, rtol=tol, atol=10 * tol)
     CASES[name].double()
-
-
-@needs_cc
-def test_dry_friction_by_position_holds_in_c_as_in_eager(tmp_path, monkeypatch):
-    # fails if the positive part of set-valued friction has no form in C, or its slope is that of the negative part
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    model = with_terms("sticking by position")
-    compiled, eager, start = compile_c(model, h=0.1), beside(model), near(2, 6)
-    with torch.no_grad():
-        out, expected = (x.rollout(*start, h=0.1, steps=60) for x in (compiled, eager))
-        slopes, expected_slopes = (x.linearise(start, 0.1)[1] for x in (compiled, eager))
-    assert bool((out.q[:, 1:] == out.q[:, :-1]).any())  # a joint stands still
-    torch.testing.assert_close(out.q, expected.q, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(out.p, expected.p, rtol=1e-12, atol=1e-12)
-    torch.testing.assert_close(slopes, expected_slopes, rtol=1e-11, atol=1e-11)

@@ -1,11 +1,14 @@
-"""Every format beside the eager stepper on every kind of model: steps, rollouts, starts, inputs and derivatives."""
+"""Files of every format beside the eager stepper: steps, rollouts, starts, inputs and derivatives.
+
+test_every_term.py has the terms that a model may be made of.
+"""
 
 import functools
 from typing import Any
 
 import pytest
 import torch
-from export_models import SMALL, TERMS, beside, damped, near, states_of, with_terms
+from export_models import SMALL, beside, damped, near, states_of, with_terms
 
 from herglotz.errors import InputError
 from herglotz.export import compare, export_aoti, export_onnx, export_pt2, load_exported
@@ -16,15 +19,17 @@ from herglotz.stepping import State, Status
 
 WRITE = {"pt2": export_pt2, "onnx": export_onnx, "aoti": export_aoti}
 SUFFIX = {"pt2": "pt2", "onnx": "onnx", "aoti": "pt2"}
-EVERY = [*LEVELS, *TERMS]
-# Always tested; the others are slow tests. test_pt2.py and test_onnx.py have Newton's iteration at the affine level:
-# rollouts of every batch size, starts and derivatives.
-ALWAYS = {"pt2": ("forced",), "onnx": ("conservative", "forced", "order 4", "sticking"), "aoti": ()}
+# A closed form, Newton's iteration by jets, and what sticks; test_pt2.py and test_onnx.py have the iteration at the
+# affine level: rollouts of every batch size, starts and derivatives.
+FILES = {
+    "pt2": ("forced",),
+    "onnx": ("conservative", "forced", "order 4", "sticking"),
+    "aoti": ("affine", "forced", "order 4", "sticking"),  # a compiler run of 20–60 s for each
+}
 MATRIX = [
-    pytest.param(form, name, marks=[] if name in ALWAYS[form] else pytest.mark.slow)
-    for form in WRITE
-    for name in EVERY
-    if form != "aoti" or name in ("affine", "forced", "order 4", "sticking")  # a compiler run of 20–60 s for each
+    pytest.param(form, name, marks=pytest.mark.slow if form == "aoti" else [])
+    for form, names in FILES.items()
+    for name in names
 ]
 
 

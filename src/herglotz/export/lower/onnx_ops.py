@@ -58,7 +58,10 @@ def write_item(w: Writer, node: Any) -> str:
     if source.target == aten.linalg_inv_ex.default:
         require(index == 0, source)
         return write_inverse(w, source.args[0])
-    require(source.target == aten.log_sigmoid_forward.default and index == 0, source)
+    require(source.target == aten.log_sigmoid_forward.default, source)
+    if index == 1:  # torch's own working memory, which `write_log_sigmoid_backward` does without
+        require(all(x.target == aten.log_sigmoid_backward.default for x in node.users), source)
+        return ""
     return onnx_functions.write_log_sigmoid(w, source.args[0])
 
 
