@@ -15,8 +15,9 @@ import pytest
 import torch
 from export_models import randomise
 
+from herglotz.codegen import c_compiler
 from herglotz.data import Trajectories
-from herglotz.export import ExportedStepper, c_wrapper
+from herglotz.export import ExportedStepper
 from herglotz.export.c_header import c_source, described
 from herglotz.export.c_stepper import compiled
 from herglotz.export.equation import Equations
@@ -152,7 +153,7 @@ def _quick_compiler(tmp_path_factory):
     """An own cache, and no optimisation: a compiler run a case."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        patch.setattr(c_wrapper, "FLAGS", tuple("-O0" if flag.startswith("-O") else flag for flag in c_wrapper.FLAGS))
+        patch.setattr(c_compiler, "FLAGS", tuple("-O0" if flag.startswith("-O") else flag for flag in c_compiler.FLAGS))
         yield
 
 
