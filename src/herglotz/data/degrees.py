@@ -36,12 +36,13 @@ def in_told_degrees(
                 where = data.source or "data"
                 raise InputError(f"{where}: degrees names {name!r}, but the coordinates are {data.names}")
         return _converted(data, set(as_names(degrees)) - set(data.degrees), ())
-    found, notes = [], []
+    found, notes, told = [], [], set(data.degrees)
+    known = {} if like is None else dict.fromkeys(like.names, "") | {name: unit for name, _, unit in like.columns}
     for name, unit, q in zip(data.names, data.units, data.q.T, strict=True):
         said = unit == "rad" or angles is True or (not isinstance(angles, bool) and name in as_names(angles or ()))
-        if like is not None and name in like.names:
-            found += [name] if unit == "1" and (name, "coordinate", TAKEN_FOR_DEGREES) in like.columns else []
-        elif name not in data.degrees and (said or (unit == "1" and angles is None and is_angular(name))):
+        if name in known:
+            found += [name] if unit == "1" and known[name] == TAKEN_FOR_DEGREES else []
+        elif name not in told and (said or (unit == "1" and angles is None and is_angular(name))):
             note = _judged(data, name, q, said)
             found += [name] if note and not said and is_in_degrees(data, q) else []
             notes += [note] if note else []

@@ -146,7 +146,7 @@ class Trajectories:
     @property
     def degrees(self) -> tuple[str, ...]:
         """Coordinates that the table had in degrees: they are rad here, and reported in degrees too."""
-        return tuple(name for name, _, unit in self.columns if name in self.names and unit in DEGREES)
+        return tuple(name for name, _, unit in self.columns if unit in DEGREES and name in self.names)
 
     @property
     def input_labels(self) -> tuple[tuple[str, str], ...]:
