@@ -296,9 +296,8 @@ def _atoms(x: Any) -> np.ndarray:
     """Numbers as an array of atoms."""
     if isinstance(x, np.ndarray):
         return x if x.dtype == object else x.astype(float).astype(object)
-    out = np.empty((), object)
-    out[()] = float(x)
-    return out
+    # A `Ref` is what remains of an array without axes; numpy would take it for a row.
+    return _array([x if isinstance(x, Ref) else float(x)]).reshape(())
 
 
 def _expand(x: np.ndarray, shape: Sequence[int]) -> np.ndarray:

@@ -218,7 +218,7 @@ class Recorder(TorchDispatchMode):
         """
         if id(value) not in self.current.get(_storage(value), {id(value)}):
             raise InputError(
-                "a tensor is read whose numbers were written in place through a view of it, which a trace does not "
+                "a tensor is read whose numbers an operation writes in place through a view of it, which a trace does not "
                 "follow; write the form that returns a new tensor (x.diagonal().fill_(1): torch.eye)"
             )
         if id(value) in self.nodes:

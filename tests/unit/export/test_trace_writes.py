@@ -34,7 +34,7 @@ def test_what_is_written_through_a_view_is_not_read_from_its_base(write):
         write(y)
         return (y + x[:, :, None],)
 
-    with pytest.raises(InputError, match="written in place through a view"):
+    with pytest.raises(InputError, match="writes in place through a view"):
         traced(function, (BATCH,))
 
 
@@ -57,5 +57,5 @@ def test_numbers_of_inputs_written_into_constants_are_not_lost():
         y[:, 0] = x
         return (y + 0.0 * x[:, :, None],)
 
-    with pytest.raises(InputError, match="written in place through a view"):
+    with pytest.raises(InputError, match="writes in place through a view"):
         traced(function, (BATCH,))
