@@ -218,8 +218,8 @@ class Recorder(TorchDispatchMode):
         """
         if id(value) not in self.current.get(_storage(value), {id(value)}):
             raise InputError(
-                "a tensor is read whose numbers an operation writes in place through a view of it, which a trace does not "
-                "follow; write the form that returns a new tensor (x.diagonal().fill_(1): torch.eye)"
+                "a tensor is read whose numbers an operation writes in place through a view of it, which a trace does "
+                "not follow; write the form that returns a new tensor (x.diagonal().fill_(1): torch.eye)"
             )
         if id(value) in self.nodes:
             return self.nodes[id(value)]
