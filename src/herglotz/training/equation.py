@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import torch
@@ -77,7 +77,7 @@ class Equation:
         return "\n".join(lines)
 
     def __repr__(self) -> str:
-        return f"Equation({' '.join(str(self).split())})"
+        return f"Equation({' '.join(str(replace(self, notes=())).split())})"  # what stands below it is long
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""
