@@ -57,27 +57,31 @@ class Equation:
     notes: tuple[str, ...] = ()  # what the lines need to be integrated, and what the data do not determine
 
     def __str__(self) -> str:
-        lines, bracketed = [], any("(" in left for left in self.lefts)
-        digits = BESIDE if self.network else UNKNOWN
-        for left in self.lefts:
-            own = [term for term in self.terms if term.left == left]
-            if not own and left.startswith("force on "):
-                continue
-            bracketed = bracketed or any("(" in term.size(digits) for term in own)
-            right = " ".join(term.told(digits).replace(" ", TOGETHER) for term in own) or "0"
-            minus = f"−{TOGETHER}"
-            right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
-            wrapped = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
-            lines += [line.replace(TOGETHER, " ") for line in wrapped]
+        lines = [line for left in self.lefts for line in self._lines_of(left)]
         if self.network:
             lines += textwrap.wrap(f"    and {self.network}", WIDTH, subsequent_indent="    ")
+        bracketed = any("(" in x for x in (*self.lefts, *(term.size(self._digits) for term in self.terms)))
         told = f"with {self.units}; {BRACKETS}" if bracketed else f"with {self.units}"
         for note in (told, *self.notes):
             lines += textwrap.wrap(note, WIDTH, break_long_words=False)
         return "\n".join(lines)
 
+    @property
+    def _digits(self) -> int:
+        return BESIDE if self.network else UNKNOWN
+
+    def _lines_of(self, left: str) -> list[str]:
+        """The line with this left side, broken between terms; nothing of a force that is 0."""
+        own = [term.told(self._digits).replace(" ", TOGETHER) for term in self.terms if term.left == left]
+        if not own and left.startswith("force on "):
+            return []
+        right, minus = " ".join(own) or "0", f"−{TOGETHER}"
+        right = "−" + right.removeprefix(minus) if right.startswith(minus) else right.removeprefix(f"+{TOGETHER}")
+        wrapped = textwrap.wrap(f"{left} = {right}", WIDTH, subsequent_indent="    ", break_long_words=False)
+        return [line.replace(TOGETHER, " ") for line in wrapped]
+
     def __repr__(self) -> str:
-        return f"Equation({' '.join(str(replace(self, notes=())).split())})"  # `str` has the notes
+        return f"Equation({' '.join(str(replace(self, notes=())).split())})"  # what stands below it is long
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON: the terms, and the same as text."""

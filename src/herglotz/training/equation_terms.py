@@ -78,8 +78,8 @@ class Reader:
 
     def lines(self) -> Iterator[Line]:
         """Those of every term whose number is not 0."""
-        parts = (self._kinetic(), self._damping(), self._friction(), self._inputs(), self._springs(), self._features())
-        for part in parts:
+        friction = (*self._friction(), *self._drag())
+        for part in (self._kinetic(), self._damping(), friction, self._inputs(), self._springs(), self._features()):
             yield from (
                 replace(line, of=self.line_of.get(line.left, "")) for line in part if float(line.value.detach()) != 0.0
             )
@@ -117,27 +117,33 @@ class Reader:
                 yield Line("L", f"{name}′ s", "", damping.drag[i])
 
     def _friction(self) -> Iterator[Line]:
-        """Friction of each coordinate, between coordinates, and by name."""
-        model, data = self.model, self.data
-        for i, (left, name) in enumerate(zip(self.own, self.names, strict=True)):
-            viscous = None if model.friction is None else -model.friction.viscous[i]
-            if self.newton and isinstance(model.damping, LinearDamping):  # the contact form damps every momentum alike
-                decay = -model.damping.rate * self._masses()[i, i]
-                viscous = decay if viscous is None else decay + viscous
-            per_time = unit_of(data.units[i], 0, self.time, 1)
-            if viscous is not None:
-                yield Line(left, f"{name}′", per_time, viscous)
-            if model.coupling is not None:
-                between = model.coupling.matrix()
-                others = (j for j in range(len(self.names)) if j != i)
-                yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
+        """Friction of each coordinate, and between coordinates."""
+        for i, left in enumerate(self.own):
+            yield from self._viscous(i, left)
             yield from self._dry(i, left)
+
+    def _viscous(self, i: int, left: str) -> Iterator[Line]:
+        """What is linear in the speeds: of a mass of its own with what the contact form damps, which is all alike."""
+        model, per_time = self.model, unit_of(self.data.units[i], 0, self.time, 1)
+        parts = [] if model.friction is None else [-model.friction.viscous[i]]
+        if self.newton and isinstance(model.damping, LinearDamping):
+            decay = -model.damping.rate * self._masses()[i, i]
+            parts.append(decay)
+        if parts:
+            yield Line(left, f"{self.names[i]}′", per_time, torch.stack(parts).sum())
+        if model.coupling is not None:
+            between = model.coupling.matrix()
+            others = (j for j in range(len(self.names)) if j != i)
+            yield from (Line(left, f"{self.names[j]}′", per_time, -between[i, j]) for j in others)
+
+    def _drag(self) -> Iterator[Line]:
+        """Friction by name, of one coordinate, between two, or through air."""
         for g, text in enumerate(self.config.drag):
-            assert model.drag is not None
+            assert self.model.drag is not None
             f = parse_drag(text, self.config.angles)
             for i in (i for i in range(len(self.names)) if f.air or i in (f.on, f.of)):
-                size = unit_of(data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
-                value = model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
+                size = unit_of(self.data.units[i], 1 - f.a - f.b - f.c, self.time, 2 - f.b - f.c)
+                value = self.model.drag.coefficient[g] * (1.0 if f.of == i else -1.0)
                 yield Line(self.own[i], self._drag_in_words(f, i), size, value)
 
     def _dry(self, i: int, left: str) -> Iterator[Line]:

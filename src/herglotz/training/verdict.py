@@ -185,13 +185,15 @@ def in_words(errors: Errors, ahead: Foresight | None, metrics: dict[str, Any]) -
         return f"{FAILS} beyond the recording: {errors}. Try {_remedy(metrics, False)}"
     if ahead is not None and ahead.open > UNCERTAIN:
         return f"{FAILS}: {_left_open(ahead, errors, metrics)}"
-    times = errors.worst / errors.limit
-    if times <= AT_THE_NOISE:
-        return f"{FITS}: {errors}"
+    return f"{FITS}: {errors}" if errors.worst <= AT_THE_NOISE * errors.limit else _worse(errors, metrics)
+
+
+def _worse(errors: Errors, metrics: dict[str, Any]) -> str:
+    """By how much a model that fits misses more than the noise, or what stands for it."""
     apart = metrics.get("apart")
     apart = f". The recordings may differ: {apart}. Try each by itself, or --sensor-zeros" if apart else ""
     known = "" if math.isfinite(errors.noise) else ", for which its misfit of the training data stands,"
-    return f"{WORSE}{known} by a factor of {times:.2g}: {errors}{apart}"
+    return f"{WORSE}{known} by a factor of {errors.worst / errors.limit:.2g}: {errors}{apart}"
 
 
 def _left_open(ahead: Foresight, errors: Errors, metrics: dict[str, Any]) -> str:
