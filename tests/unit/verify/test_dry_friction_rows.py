@@ -166,6 +166,22 @@ def test_a_null_model_fails(null, rows):
     assert rows <= failed(report), report.table()
 
 
+def test_a_sample_at_the_edge_of_what_is_held_is_left_out():
+    # fails if a stencil that meets two branches, however narrow, is compared with a derivative: there is none
+    model = held()
+    step, x = Stepper(model).step, torch.randn(32, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    low, high = torch.zeros(32, 1, dtype=torch.float64), torch.ones(32, 1, dtype=torch.float64)
+    q, s = 0.1 * x[:, :1], x[:, 2]
+    for _ in range(40):  # p between standing still and sliding
+        p = (low + high) / 2
+        moves = step(State(q, p, s), H).state.q != q
+        low, high = torch.where(moves, low, p), torch.where(moves, p, high)
+    few = torch.arange(32)[:, None] < 4
+    row = verify((model, State(q, torch.where(few, high, x[:, 1:2]), s)), h=H, steps=2)["derivative"]
+    assert row.passed, row
+    assert "changes between sliding and standing still" in row.note
+
+
 def test_differences_stay_on_one_branch():
     # fails if a stencil with points on two branches gives a number: q1 = q0 + soft(p0), with edges at ±1
     def step(x):
