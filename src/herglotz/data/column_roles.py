@@ -95,6 +95,11 @@ def is_angular(name: str) -> bool:
     return bool(words_of(name) & WORDS["angle"])
 
 
+def is_time(name: str, unit: str) -> bool:
+    """Whether a column is called as times are, or is in a unit of time."""
+    return kind_of(unit) == "time" or bool(ROLES["time"].fullmatch(name.casefold() if len(name) > 1 else name))
+
+
 def is_timed(words: frozenset[str]) -> bool:
     """Whether a word of a name is that of a time, `elapsed_time`; a letter is none."""
     return any(len(word) > 1 and ROLES["time"].fullmatch(word) for word in words)

@@ -32,6 +32,7 @@ class Wanted:
     drop: Names = ()  # left aside
     group: str | None = None  # numbers the trajectories
     known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
+    positions: tuple[str, ...] = ()  # coordinates as well, unless `coordinates` says exactly which
     motion: bool = True  # False: times and inputs suffice; without coordinates the first input stands in for one
 
     def role(self, name: str) -> str | None:
@@ -40,7 +41,7 @@ class Wanted:
         for role, wanted in (*given, ("input", self.inputs)):
             if name in as_names(wanted or ()):
                 return role
-        return None
+        return "q" if name in self.positions and self.coordinates is None else None
 
     def __bool__(self) -> bool:
         return bool(self.names) or self.inputs is not None or self.coordinates is not None
@@ -48,7 +49,7 @@ class Wanted:
     @property
     def names(self) -> tuple[str, ...]:
         """All columns that the user names."""
-        every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
+        every = (self.time, self.group, self.drop, self.coordinates, self.inputs, self.positions)
         return tuple(name for wanted in every if wanted for name in as_names(wanted))
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
@@ -60,7 +61,7 @@ class Wanted:
             of = [called.get(name, name) for name in as_names(wanted or ())]
             return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
 
-        who = ("time", "group", "drop", "coordinates", "inputs")
+        who = ("time", "group", "drop", "coordinates", "inputs", "positions")
         return replace(self, **{field: named(getattr(self, field)) for field in who})
 
     def before(self, name: str) -> str | None:

@@ -20,6 +20,7 @@ from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
+from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import measured
 from herglotz.data.trajectories import Trajectories
@@ -65,6 +66,7 @@ def load(
     *,
     angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
+    polar: Names | None = None,  # pairs of positions, "x,y", that become one angle each; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -84,6 +86,10 @@ def load(
     degrees
         Coordinates in degrees whose header does not say so; left out: those without a unit whose name is that of an
         angle and whose motion cannot be one in rad, with a warning; () for none.
+    polar
+        Pairs of positions that become one angle each (`herglotz.data.polar`): "x,y" of a body on a circle, or
+        ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
+        "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     unwrap
         Make angles continuous.
     show
@@ -110,14 +116,13 @@ def load(
         in jumps alone, or from the reader of that format.
     """
     columns.setdefault("known", () if like is None else like.columns)
-    wanted = Wanted(**columns)
+    wanted = Wanted(**columns, positions=named_by(polar))
     files = _files(path := Path(path))
     found = _joined(files, [in_radians_and_seconds(_read(file, wanted)) for file in files])
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
-    refuse_jumps(found, wanted)
-    found = in_told_degrees(found, degrees, angles, like)
+    found = as_told(found, wanted, polar, degrees, angles, like)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = with_angles(found, angles)
@@ -126,6 +131,22 @@ def load(
     if show and found.columns:
         tell(found.table())
     return found.unwrapped() if unwrap else found
+
+
+def as_told(
+    found: Trajectories,  # as recorded, in rad and s where the header says so
+    wanted: Wanted,
+    polar: Names | None,
+    degrees: Names | None,
+    angles: Names | bool | None,
+    like: Trajectories | None,
+) -> Trajectories:
+    """The coordinates that the columns are meant for: angles of bodies, and of degrees; refused where one jumps."""
+    pairs = pairs_of(polar, like)
+    chosen = polar is not None or wanted.coordinates is not None or wanted.known
+    found = in_polar(found, pairs) if pairs or chosen else with_hints(found)
+    refuse_jumps(found, wanted)
+    return in_told_degrees(found, degrees, angles, like)
 
 
 def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:
