@@ -33,6 +33,7 @@ class Wanted:
     group: str | None = None  # numbers the trajectories
     known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
     positions: tuple[str, ...] = ()  # coordinates as well, unless `coordinates` says exactly which
+    hold: str = ""  # what the inputs do between samples, whatever the file says of it; "": as the file says
     motion: bool = True  # False: times and inputs suffice; without coordinates the first input stands in for one
 
     def role(self, name: str) -> str | None:
@@ -89,6 +90,7 @@ class Columns:
     s: int | None = None
     p: tuple[int, ...] = ()
     u: tuple[int, ...] = ()
+    hold: str = ""  # what the user says of the inputs between samples
     notes: tuple[str, ...] = ()  # warnings of roles that are guesses
 
     @property
@@ -137,7 +139,7 @@ def assign(
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
-    found = Columns(names, units, clock, q, trajectory, action, p, u)
+    found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
     return replace(found, notes=_warnings(found, guesses, wanted))
 
 

@@ -34,7 +34,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.csv_columns.Wanted`.
 
     Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
-    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
+    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs. An
+    input that is empty is held from the row before, or goes in a straight line where its hold is "first" or "smooth".
+    Rows of stacked tables are sorted by time, and those of one time joined.
 
     The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
     behind #, as `numpy.savetxt` writes it, and the units in a row of their own below it. `t`, `time`, `timestamp`,
@@ -128,6 +130,8 @@ def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
             sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
         else:
             said.setdefault(name, text if name == "hold" else number(text, where))
+    if found.hold:  # the user has said it
+        said.pop("hold", None)
     return replace(measured(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
 
 
@@ -164,7 +168,7 @@ def _parse_rows(
     """Return line number, trajectory label and numbers of every row."""
     width, labels, values = len(columns.names), [], []
     first = None  # date of the first row, where times are dates
-    parse = {i: number if i in (columns.time, *columns.u) else number_or_none for i in columns.numeric}
+    parse = {i: number if i == columns.time else number_or_none for i in columns.numeric}
     for at, line in rows:
         cells = cells_of(line)
         if len(cells) != width:

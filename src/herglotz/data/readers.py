@@ -102,7 +102,8 @@ def load(
         same, in the same order, and its angles are angles, where nothing else is said.
     **columns
         Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
-        motion=False where inputs alone are needed.
+        hold="zero", "first" or "smooth": what inputs do between samples, whatever the file says. motion=False where
+        inputs alone are needed.
 
     Returns
     -------
@@ -232,7 +233,10 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
         if one.first_line(line):
             if wanted and not one.is_table:
                 raise InputError(f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}")
-            return one.read(path, wanted) if one.is_table else one.read(path)
+            if one.is_table:
+                return one.read(path, wanted)
+            found = one.read(path)
+            return replace(found, hold=wanted.hold) if wanted.hold else found
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
     known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
     raise InputError(f"{path}: cannot read {what}; known formats: {known}")

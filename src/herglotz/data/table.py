@@ -15,6 +15,7 @@ import torch
 from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import without
+from herglotz.data.rates import Recording, completed, in_order
 from herglotz.data.rows import group_rows, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import refuse_unknown, with_units
@@ -34,30 +35,50 @@ def from_table(
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
-    Rows in which a value is missing are left out, and a note says how many: the step over them is longer, with the mean
-    of their inputs. Raise InputError if the time of a trajectory does not increase, or a trajectory is too short.
+    Rows in which a coordinate is missing are left out, and a note says how many: the step over them is longer, with the
+    mean of its inputs, which go on between the rows that have them (`herglotz.data.rates`). Raise InputError if the
+    time of a trajectory does not increase, or a trajectory is too short.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
-    groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
-    order, lengths = [i for group in groups for i in group], tuple(map(len, groups))
-    missing = np.isnan(values).any(1)
+    recordings = _recordings(path, _one_spelling(labels), np.asarray(at), values)
+    if blank := bool(np.isnan(values).any()):
+        recordings = [in_order(one) for one in recordings]
+    for one in recordings:
+        group_rows(path, one.at.tolist(), [one.label] * len(one.at), one.values[:, 0].tolist(), _called(columns))
+    if not blank:
+        return said(_trajectories(path, columns, recordings))
+    hold = said(_trajectories(path, columns, recordings)).hold
+    whole, notes, hold = completed(recordings, columns, hold)
+    for one in whole:
+        _check_enough(path, columns, one)
+    found = said(_trajectories(path, columns, whole))
+    found = replace(found, hold=hold, notes=(*found.notes, *notes))
+    missing = np.concatenate([np.isnan(one.values).any(1) for one in whole])
     if not missing.any():
-        return said(_trajectories(path, columns, values[order], lengths))
-    for group in groups:
-        _check_enough(path, columns, at, values, group)
-    first = int(missing.argmax())
-    name = columns.names[columns.numeric[int(np.isnan(values[first]).argmax())]]
-    found = said(_trajectories(path, columns, np.nan_to_num(values[order]), lengths))
-    return without(found, torch.from_numpy(missing[order]), f"row {at[first]}, column '{name}'")
+        return found
+    one = next(one for one in whole if np.isnan(one.values).any())
+    row, column = np.argwhere(np.isnan(one.values))[0]
+    first = f"row {one.at[row]}, column '{columns.names[columns.numeric[column]]}'"
+    return without(found, torch.from_numpy(missing), first)
 
 
-def _check_enough(path: Path, columns: Columns, at: Sequence[int], values: np.ndarray, group: list[int]) -> None:
+def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.ndarray) -> list[Recording]:
+    """The rows of each trajectory, in order of first appearance; raise InputError where there is none."""
+    refuse({f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows": not len(at)})
+    _, first, place = np.unique(np.asarray(labels), return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))[place.reshape(-1)]
+    order = np.argsort(rank, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(rank[order])) + 1)
+    return [Recording(str(labels[int(rows[0])]), at[rows], values[rows]) for rows in groups]
+
+
+def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
     """Raise unless three rows of this trajectory have all their values."""
-    gone = np.isnan(values[group])
+    gone = np.isnan(one.values)
     if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
         name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
         raise InputError(
-            f"{path}, row {at[group[0]]}: of the {len(group)} rows from here, {known} have a value in every column, at "
+            f"{path}, row {one.at[0]}: of the {len(gone)} rows from here, {known} have a value in every column, at "
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"
         )
@@ -91,11 +112,14 @@ def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values
     same[np.cumsum(lengths)[:-1] - 1] = False
     if min(lengths) < MIN_SAMPLES or not np.all(np.diff(values[:, 0])[same] > 0):
         return None
-    return _trajectories(path, columns, values, lengths)
+    parts = np.split(values, np.cumsum(lengths)[:-1])
+    return _trajectories(path, columns, [Recording("", np.empty(0), part) for part in parts])
 
 
-def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tuple[int, ...]) -> Trajectories:
-    """The set whose samples are the rows of the table, (N, columns.numeric), trajectory after trajectory."""
+def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
+    """The set whose samples are the rows of these recordings; 0 where a value is missing."""
+    table = np.nan_to_num(np.concatenate([one.values for one in recordings]))
+    lengths = tuple(len(one.values) for one in recordings)
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
     name, last = columns.names[columns.time], float(t[-1, 0])
@@ -115,6 +139,7 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
         p=p if p.size else None,
         u=u if u.size else None,
         time_unit=columns.units[columns.time] or "s",
+        hold=columns.hold if columns.u else "",
         source=path.name,
         columns=columns.roles(),
     )
@@ -133,10 +158,10 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
     if all(column.ndim == 1 and len(column) for column in raw):
         refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
-    clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
+    clock = seconds(raw[columns.time])
     told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock
-    every = [_numbers(where, columns.names[i], raw[i], i in known, first) for i in columns.numeric]
+    every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
     labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
     return found if told is None else in_dates(found, told)
