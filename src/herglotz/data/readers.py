@@ -21,8 +21,10 @@ from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_doubl
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
 from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
+from herglotz.data.rows import Unusable
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import measured
+from herglotz.data.table import left_out
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError
@@ -119,7 +121,9 @@ def load(
     columns.setdefault("known", () if like is None else like.columns)
     wanted = Wanted(**columns, positions=named_by(polar))
     files = _files(path := Path(path))
-    found = _joined(files, [in_radians_and_seconds(_read(file, wanted)) for file in files])
+    files, sets, left = _usable(path, files, wanted)
+    found = _joined(files, sets)
+    found = replace(found, notes=(*found.notes, *left))
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
@@ -200,6 +204,22 @@ def _files(path: Path) -> list[Path]:
     if not found:
         raise InputError(f"{path}: is a folder without recordings; files end in {', '.join(sorted(known))}")
     return found
+
+
+def _usable(
+    path: Path, files: Sequence[Path], wanted: Wanted
+) -> tuple[list[Path], list[Trajectories], tuple[str, ...]]:
+    """The files that hold a recording, what they hold, and a warning of those whose recording is too short."""
+    kept: list[Path] = []
+    sets: list[Trajectories] = []
+    wrong: list[Unusable] = []
+    for file in files:
+        try:
+            sets.append(in_radians_and_seconds(_read(file, wanted)))
+            kept.append(file)
+        except Unusable as error:
+            wrong.append(error)
+    return kept, sets, left_out(path, wrong, len(files))
 
 
 def _is_prose(file: Path) -> bool:

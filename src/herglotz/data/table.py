@@ -13,10 +13,11 @@ import numpy as np
 import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
+from herglotz.data.clock import without_repeats
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import without
 from herglotz.data.rates import Recording, completed, in_order
-from herglotz.data.rows import group_rows, quote
+from herglotz.data.rows import Unusable, group_rows, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.data.units import in_seconds
@@ -36,23 +37,23 @@ def from_table(
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
     Rows in which a coordinate is missing are left out, and a note says how many: the step over them is longer, with the
-    mean of its inputs, which go on between the rows that have them (`herglotz.data.rates`). Raise InputError if the
-    time of a trajectory does not increase, or a trajectory is too short.
+    mean of its inputs, which go on between the rows that have them (`herglotz.data.rates`). A trajectory that is too
+    short or whose time does not increase is left out with a warning, as long as most can be used. Raise InputError if
+    they cannot.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
     recordings = _recordings(path, _one_spelling(labels), np.asarray(at), values)
-    if blank := bool(np.isnan(values).any()):
-        recordings = [in_order(one) for one in recordings]
-    for one in recordings:
-        group_rows(path, one.at.tolist(), [one.label] * len(one.at), one.values[:, 0].tolist(), _called(columns))
+    blank = bool(np.isnan(values).any())
+    recordings, notes = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
+    recordings, left = _usable(path, recordings, lambda one: _check_times(path, columns, one))
     if not blank:
-        return said(_trajectories(path, columns, recordings))
+        found = said(_trajectories(path, columns, recordings))
+        return replace(found, notes=(*found.notes, *notes, *left))
     hold = said(_trajectories(path, columns, recordings)).hold
-    whole, notes, hold = completed(recordings, columns, hold)
-    for one in whole:
-        _check_enough(path, columns, one)
+    whole, made, hold = completed(recordings, columns, hold)
+    whole, gone = _usable(path, whole, lambda one: _check_enough(path, columns, one))
     found = said(_trajectories(path, columns, whole))
-    found = replace(found, hold=hold, notes=(*found.notes, *notes))
+    found = replace(found, hold=hold, notes=(*found.notes, *notes, *left, *made, *gone))
     missing = np.concatenate([np.isnan(one.values).any(1) for one in whole])
     if not missing.any():
         return found
@@ -60,6 +61,40 @@ def from_table(
     row, column = np.argwhere(np.isnan(one.values))[0]
     first = f"row {one.at[row]}, column '{columns.names[columns.numeric[column]]}'"
     return without(found, torch.from_numpy(missing), first)
+
+
+def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
+    """The recordings by time, without stamps that repeat; and what was made of those, once for several recordings."""
+    made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
+    notes = [note for _, note in made if note]
+    more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
+    return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]
+
+
+def _usable(
+    path: Path, recordings: list[Recording], check: Callable[[Recording], None]
+) -> tuple[list[Recording], tuple[str, ...]]:
+    """The recordings that pass a check, and a warning of the others; raise what it says where most do not pass."""
+    kept: list[Recording] = []
+    wrong: list[Unusable] = []
+    for one in recordings:
+        try:
+            check(one)
+            kept.append(one)
+        except Unusable as error:
+            wrong.append(error)
+    return kept, left_out(path, wrong, len(recordings))
+
+
+def left_out(path: Path, wrong: Sequence[Unusable], count: int) -> tuple[str, ...]:
+    """A warning of the recordings, of so many, that are wrong; raise the first error where most are."""
+    if not wrong:
+        return ()
+    if 2 * len(wrong) > count:
+        raise wrong[0]
+    why = str(wrong[0]).removeprefix(f"{path}, ").removeprefix(f"{path}: ").partition(";")[0]
+    plural = ("is", "") if len(wrong) == 1 else ("are", "the first: ")
+    return (f"warning: {len(wrong)} of {count} recordings {plural[0]} left out: {plural[1]}{why}",)
 
 
 def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.ndarray) -> list[Recording]:
@@ -72,12 +107,19 @@ def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.nd
     return [Recording(str(labels[int(rows[0])]), at[rows], values[rows]) for rows in groups]
 
 
+def _check_times(path: Path, columns: Columns, one: Recording) -> None:
+    """Raise unless this trajectory has three rows, in order of time."""
+    t = one.values[:, 0]
+    if len(t) < MIN_SAMPLES or not (np.diff(t) > 0).all():
+        group_rows(path, one.at.tolist(), [one.label] * len(t), t.tolist(), _called(columns))
+
+
 def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
     """Raise unless three rows of this trajectory have all their values."""
     gone = np.isnan(one.values)
     if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
         name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
-        raise InputError(
+        raise Unusable(
             f"{path}, row {one.at[0]}: of the {len(gone)} rows from here, {known} have a value in every column, at "
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"

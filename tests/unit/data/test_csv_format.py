@@ -125,8 +125,11 @@ def test_blank_trajectory_column_is_one_trajectory(tmp_path):  # fails if a blan
             "t,q\n0,1\n2,2\n1,3\n",
             r"row 4, column 't': 1.0 does not increase on 2.0 in row 3; sort the rows, delete one, or number the traj",
         ),
-        (GOOD + "1,3,9\n", r"data.csv, row 8, column 't': 3.0 does not increase on 3.0 in row 7"),
-        (GOOD + "x,0,9\n", r"data.csv, row 8, column 'trajectory': 'x' has 1 sample, at least 3 are needed; delete it"),
+        ("trial,t,q\n5,0,1\n5,3,1\n5,2,1\n", r"data.csv, row 4, column 't': 2.0 does not increase on 3.0 in row 3"),
+        (
+            GOOD + "x,0,9\ny,0,9\nz,0,9\n",
+            r"data.csv, row 8, column 'trajectory': 'x' has 1 sample, at least 3 are needed; delete it",
+        ),
         ("t,q\n0,1\n1,2\n", r"data.csv, row 2: the file has 2 samples, at least 3 are needed; add rows"),
         ("trajectory,t,q\n1,0,0\n,1,1\n", r"row 3, column 'trajectory': blank, but other rows name a trajectory; fill"),
         (b"t,q\n0,1\n\xff,2\n", r"data.csv, row 3: not UTF-8 text \(byte 0xff\); save the file as UTF-8"),
