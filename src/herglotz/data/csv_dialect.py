@@ -40,8 +40,8 @@ def header_cells(line: str, separator: str = ",") -> list[str]:
 def in_commas(
     path: Path,  # begins messages
     lines: Sequence[str],  # of the file
-) -> tuple[Rows, tuple[str, ...]]:
-    """Rows of a table, header first, with commas between columns and decimal points; and notes on what was changed.
+) -> tuple[Rows, tuple[str, ...], str]:
+    """Rows of a table, header first, with commas and decimal points; notes on what was changed, and the separator.
 
     Lines without a value and comments are left out, unless a comment is the header: the last one before rows of numbers
     alone, in as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points in
@@ -55,7 +55,7 @@ def in_commas(
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
     elif not any('"' in line for _, line in rows):
-        return _without_empty_ends(rows), tuple(notes)
+        return _without_empty_ends(rows), tuple(notes), separator
     table = [(i, cells_of(line, separator)) for i, line in rows[1:]]
     if separator == ",":
         _check_thousands(path, table)
@@ -63,7 +63,7 @@ def in_commas(
     if changed:
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
     names = ",".join(header_cells(rows[0][1], separator))
-    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
+    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes), separator
 
 
 def is_row_of_numbers(line: str) -> bool:

@@ -30,7 +30,7 @@ def from_table(
     path: Path,  # begins messages
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
-    labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one; whole numbers, or else names
+    labels: Sequence[str] | np.ndarray | None,  # (N,) trajectory of each sample, names or whole numbers; None: of one
     values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s or a momentum is missing
     said: Callable[[Trajectories], Trajectories] = lambda found: found,  # adds what the file says beside the table
 ) -> Trajectories:
@@ -42,7 +42,7 @@ def from_table(
     they cannot.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
-    recordings = _recordings(path, _one_spelling(labels), np.asarray(at), values)
+    recordings = _recordings(path, labels, np.asarray(at), values)
     blank = bool(np.isnan(values).any())
     recordings, notes = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
     recordings, left = _usable(path, recordings, lambda one: _check_times(path, columns, one))
@@ -97,14 +97,20 @@ def left_out(path: Path, wrong: Sequence[Unusable], count: int) -> tuple[str, ..
     return (f"warning: {len(wrong)} of {count} recordings {plural[0]} left out: {plural[1]}{why}",)
 
 
-def _recordings(path: Path, labels: Sequence[str], at: np.ndarray, values: np.ndarray) -> list[Recording]:
+def _recordings(
+    path: Path, labels: Sequence[str] | np.ndarray | None, at: np.ndarray, values: np.ndarray
+) -> list[Recording]:
     """The rows of each trajectory, in order of first appearance; raise InputError where there is none."""
     refuse({f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows": not len(at)})
-    _, first, place = np.unique(np.asarray(labels), return_index=True, return_inverse=True)
+    if labels is None:
+        return [Recording("", at, values)]
+    named = labels if isinstance(labels, np.ndarray) else _one_spelling(labels)
+    _, first, place = np.unique(np.asarray(named), return_index=True, return_inverse=True)
     rank = np.argsort(np.argsort(first))[place.reshape(-1)]
     order = np.argsort(rank, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(rank[order])) + 1)
-    return [Recording(str(labels[int(rows[0])]), at[rows], values[rows]) for rows in groups]
+    words = [f"{x:.0f}" if isinstance(x, float) else x for x in (named[int(rows[0])] for rows in groups)]
+    return [Recording(word, at[rows], values[rows]) for word, rows in zip(words, groups, strict=True)]
 
 
 def _check_times(path: Path, columns: Columns, one: Recording) -> None:
@@ -127,7 +133,7 @@ def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
 
 
 def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
-    """Where all labels are whole numbers, those of equal value are one trajectory, as in `from_numbers`: 1, 01, 1.0."""
+    """Where all labels are whole numbers, those of equal value are one trajectory, as in a table of numbers: 1, 01."""
     if any("_" in label for label in set(labels)):  # Python reads 1_000 as a number, and numpy does not
         return labels
     try:
@@ -138,24 +144,6 @@ def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
         return labels
     first: dict[float, str] = {}
     return [first.setdefault(value[label], label) for label in labels]
-
-
-def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values: np.ndarray) -> Trajectories | None:
-    """As `from_table` of a large table, whose labels are numbers, (N,); None where `from_table` would raise."""
-    lengths = (len(values),)
-    if labels is not None:
-        _, first, place, counts = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
-        order = np.argsort(first)  # of first appearance
-        rank = np.argsort(order)[place]
-        if np.any(np.diff(rank) < 0):
-            values = values[np.argsort(rank, kind="stable")]
-        lengths = tuple(counts[order].tolist())
-    same = np.ones(max(len(values) - 1, 0), dtype=bool)
-    same[np.cumsum(lengths)[:-1] - 1] = False
-    if min(lengths) < MIN_SAMPLES or not np.all(np.diff(values[:, 0])[same] > 0):
-        return None
-    parts = np.split(values, np.cumsum(lengths)[:-1])
-    return _trajectories(path, columns, [Recording("", np.empty(0), part) for part in parts])
 
 
 def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
@@ -204,7 +192,7 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock
     every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
-    labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
+    labels = None if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
     return found if told is None else in_dates(found, told)
 
