@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from herglotz.data.column_roles import ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
+from herglotz.data.column_roles import READING, ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -124,6 +124,9 @@ def assign(
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     guesses = [_guess(name, unit, wanted, place) for name, unit in zip(names, units, strict=True)]
+    if wanted.motion and wanted.coordinates is None and not any(guess.role == "q" for guess in guesses):
+        # Volts of a sensor are the motion where no other column is.
+        guesses = [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "rate", "q", "dropped")}
     for i, guess in enumerate(guesses):
         roles[guess.role].append(i)
