@@ -33,6 +33,9 @@ READING = (
     flag("--degrees", "coordinates in degrees whose header does not say so, or none (default: with a warning, those "
          "without a unit whose name is that of an angle and whose motion cannot be one in rad)",
          type=names, metavar="NAMES"),
+    flag("--polar", "positions of a body on a circle that become one angle: x,y (centre and radius by least squares), "
+         "x,y,X,Y with the centre in numbers or columns, x,-y where y grows downwards; again for the next body of a "
+         "chain; none to leave positions as they are", action="append", metavar="X,Y"),
     flag("--sensor-zeros", f"what the sensors read where the coordinates are 0, {EACH}",
          type=finite, nargs="+", metavar="X"),
     flag("--sensor-scales", f"what one unit of each reading is worth, {EACH}", type=finite, nargs="+", metavar="X"),
@@ -55,8 +58,9 @@ RUN = (
 
 def columns_of(arguments: argparse.Namespace) -> dict[str, Any]:
     """Return what the flags say of the columns, for `load`."""
-    roles = ("angles", "degrees", "time", "coordinates", "inputs", "drop", "group", "sensor_zeros", "sensor_scales")
-    given = {name: getattr(arguments, name) for name in roles}
+    roles = ("time", "coordinates", "inputs", "drop", "group")
+    meant = ("angles", "degrees", "polar", "sensor_zeros", "sensor_scales")
+    given = {name: getattr(arguments, name) for name in (*meant, *roles)}
     return {name: value for name, value in given.items() if value is not None}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -55,8 +55,8 @@ def data_of(arguments: argparse.Namespace, columns: dict[str, Any]) -> tuple[Tra
             f"herglotz: note: read as {arguments.config} says: {told_before or 'nothing, flags stand over it'}",
             sys.stderr,
         )
-    data = load(arguments.data, **{name: x for name, x in told.items() if name not in ("hold", "every")})
-    return replace(data, hold=told.get("hold", data.hold)).thinned(told.get("every", 1)), told
+    data = load(arguments.data, **{name: x for name, x in told.items() if name != "every"})
+    return data.thinned(told.get("every", 1)), told
 
 
 def _in_words(value: Any) -> str:

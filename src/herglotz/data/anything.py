@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from numbers import Number
 from pathlib import Path
 from types import FunctionType
@@ -15,11 +14,10 @@ from torch import Tensor
 
 from herglotz.data.checks import MIN_SAMPLES
 from herglotz.data.csv_columns import Names, Wanted, as_names, name_and_unit
-from herglotz.data.degrees import in_told_degrees
 from herglotz.data.extra_formats import Table
 from herglotz.data.gaps import parted, without
-from herglotz.data.jumps import refuse_jumps
-from herglotz.data.readers import angles_like, load, with_angles
+from herglotz.data.polar import named_by
+from herglotz.data.readers import angles_like, as_told, load, with_angles
 from herglotz.data.sensors import measured
 from herglotz.data.simulate import OF_AN_L_D
 from herglotz.data.table import from_frame, plain, seconds
@@ -29,7 +27,9 @@ from herglotz.errors import InputError, refuse
 from herglotz.telling import tell
 
 TRANSPOSED = 4  # times as many coordinates as samples: chains that are recorded so shortly tell nothing
-OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "sensor_zeros", "sensor_scales")
+AS_THEY_ARE = Wanted(coordinates=())  # coordinates of arrays, which no header names
+OPTIONS = ("h", "time", "coordinates", "inputs", "drop", "group", "angles", "degrees", "polar",
+           "sensor_zeros", "sensor_scales")  # fmt: skip
 
 
 def as_trajectories(
@@ -43,6 +43,7 @@ def as_trajectories(
     group: str | None = None,
     angles: Names | bool | None = None,
     degrees: Names | None = None,
+    polar: Names | None = None,
     sensor_zeros: Sequence[float] | None = (),
     sensor_scales: Sequence[float] | None = (),
     like: Trajectories | None = None,
@@ -70,8 +71,9 @@ def as_trajectories(
         Columns of a table that are left aside; the column that numbers its trajectories.
     angles
         Coordinates that are angles in rad; True for all, () for none; left out: those in rad or deg.
-    degrees
-        Coordinates in degrees whose header does not say so, () for none; left out: as `load`.
+    degrees, polar
+        Coordinates in degrees whose header does not say so; pairs of positions that become one angle each: as in
+        `load`.
     sensor_zeros, sensor_scales
         q = scale · (reading − zero), zeros in the units of the readings: n numbers, or n for each recording; None or ()
         for none.
@@ -90,30 +92,32 @@ def as_trajectories(
     """
     names = _lists({"coordinates": coordinates, "inputs": inputs, "drop": drop, "group": group})
     coordinates, data = names["coordinates"], _by_field(data)
+    meant = {"angles": angles, "degrees": degrees, "polar": polar}
     refuse({f"a function is no recording; {OF_AN_L_D}": isinstance(data, FunctionType)})
     if isinstance(data, Trajectories):
-        wrong = "trajectories have their columns already; angles, sensor_zeros and sensor_scales alone change them"
+        wrong = "trajectories have their columns already; angles, degrees, polar and sensors alone change them"
         refuse({wrong: drop or any(x is not None for x in (h, time, coordinates, inputs, group))})
         found = data
     elif isinstance(data, (str, Path)):
         columns = {k: v for k, v in {"time": time, **names}.items() if v is not None}
-        read = {"angles": angles, "degrees": degrees, "sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
-        return _shown(load(data, like=like, show=False, **read, **columns))
+        sensors = {"sensor_zeros": sensor_zeros, "sensor_scales": sensor_scales}
+        return _shown(load(data, like=like, show=False, **meant, **sensors, **columns))
     elif hasattr(data, "columns") and h is not None:
         found = _array(np.asarray(data), h, time, {**names, "coordinates": coordinates or [*map(str, data.columns)]})
     elif hasattr(data, "columns") or isinstance(data, Mapping):
-        found = in_told_degrees(_table(data, Wanted(time, **names), like), degrees, angles, like)
+        wanted = Wanted(time, **names, known=() if like is None else like.columns, positions=named_by(polar))
+        found = as_told(_table(data, wanted), wanted, **meant, like=like)
         found = found if like is None else angles_like(found, like)
         return _shown(_marked(measured(found, sensor_zeros, sensor_scales), angles))
     elif _is_list_of_recordings(data):
         several = "sensor_scales of several recordings: read each with its own, as_trajectories(one, sensor_scales=...)"
         refuse({several: sensor_scales is not None and len(sensor_scales) > 0})  # its angles are unwrapped by now
-        options = {"h": h, "time": time, **names, "angles": angles, "degrees": degrees, "like": like}
+        options = {"h": h, "time": time, **names, **meant, "like": like}
         return measured(_of_each(data, options), sensor_zeros)
     else:
         found = _array(data, h, time, names)
-    if degrees is not None or not isinstance(data, Trajectories):
-        found = in_told_degrees(found, degrees, angles, like)
+    if not isinstance(data, Trajectories) or any(x is not None for x in (degrees, polar)):
+        found = as_told(found, AS_THEY_ARE, **meant, like=like)
     return _noted(_marked(measured(found, sensor_zeros, sensor_scales), angles), data)
 
 
@@ -155,15 +159,12 @@ def _of_each(data: Any, options: dict[str, Any]) -> Trajectories:
     return Trajectories.cat([as_trajectories(one, **options) for one in rows])
 
 
-def _table(data: Any, wanted: Wanted, like: Trajectories | None) -> Trajectories:
+def _table(data: Any, wanted: Wanted) -> Trajectories:
     """The recordings of a DataFrame or a dict of columns."""
-    wanted = replace(wanted, known=() if like is None else like.columns)
     is_frame = hasattr(data, "columns")
     where = Path("DataFrame" if is_frame else "dict")
     frame = data if is_frame else Table(where, {str(name): plain(x) for name, x in data.items()})
-    found = in_radians_and_seconds(from_frame(frame, wanted, where))
-    refuse_jumps(found, wanted)
-    return found
+    return in_radians_and_seconds(from_frame(frame, wanted, where))
 
 
 def _array(data: Any, h: float | None, time: Any, names: dict[str, Any]) -> Trajectories:

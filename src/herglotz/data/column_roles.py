@@ -11,7 +11,8 @@ ANGLES = re.compile(r"[mµμ]?rad|radians?|deg|°|degrees?|gon|rev|turns?")
 KINDS = {
     "position": re.compile(rf"{ANGLES.pattern}|[kcdmµμunp]?m|met(er|re)s?|in|inch|ft|px|pixels?"),
     "time": re.compile(r"s|ms|us|µs|μs|ns|min|h|secs?|seconds?|msec|usec"),
-    "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf|[kmµμ]?[AV]|Vdc|VDC|%|percent"),
+    "effort": re.compile(r"[kmMµμ]?N([ *·.⋅]?[cm]?m)?|lbf|kgf"),
+    "electric": re.compile(r"[kmµμ]?[AV]|Vdc|VDC|%|percent"),
     "acceleration": re.compile(r".+/ ?(s|ms|min)(\^2|²|2|\*\*2)|.+[ ·*]s(\^-2|⁻²)|g|g0"),
     "rate": re.compile(r".+/ ?(s|ms|min|h|sec)|.+[ ·*]s(\^-1|⁻¹)|rpm|RPM|dps|mps|kph|mph"),
     "pressure": re.compile(r"[kMh]?Pa|m?bar|psi"),
@@ -57,6 +58,7 @@ _WORDS = {
 WORDS = {kind: frozenset(words.split()) for kind, words in _WORDS.items()}
 GIVEN = frozenset(("input", "inputs", "control", "controls"))
 BY_NAME = "by its name alone"
+READING = "it may be the reading of a position"
 
 
 class Guess(NamedTuple):
@@ -82,7 +84,7 @@ def role_of(name: str, unit: str, others: Collection[str] = ()) -> Guess:
         return Guess(role, "it may be a desired value or a derivative")
     if not kind:
         return _by_words(key, words, others)
-    return _in_place(key, unit, words, others) if kind == "position" else _by_unit(kind, words)
+    return _in_place(key, unit, words, others) if kind == "position" else _by_unit(key, kind, words)
 
 
 def kind_of(unit: str) -> str:
@@ -93,6 +95,11 @@ def kind_of(unit: str) -> str:
 def is_angular(name: str) -> bool:
     """Whether a name is one that is given to angles."""
     return bool(words_of(name) & WORDS["angle"])
+
+
+def is_time(name: str, unit: str) -> bool:
+    """Whether a column is called as times are, or is in a unit of time."""
+    return kind_of(unit) == "time" or bool(ROLES["time"].fullmatch(name.casefold() if len(name) > 1 else name))
 
 
 def is_timed(words: frozenset[str]) -> bool:
@@ -118,7 +125,7 @@ def _whole(key: str, kind: str) -> str:
     role = next((role for role, pattern in ROLES.items() if pattern.fullmatch(key)), "")
     if role in ("action", "momentum"):
         return "" if kind in ("position", "pressure", "other") else role
-    meant = kind in ("", "effort") or (kind == "position" and key[0] == "u")
+    meant = kind in ("", "effort", "electric") or (kind == "position" and key[0] == "u")
     return "" if role == "input" and not meant else role
 
 
@@ -140,13 +147,14 @@ def _in_place(key: str, unit: str, words: frozenset[str], others: Collection[str
     return Guess("input", BY_NAME) if moved and alone else Guess("q", "it may be moved from outside" if moved else "")
 
 
-def _by_unit(kind: str, words: frozenset[str]) -> Guess:
+def _by_unit(key: str, kind: str, words: frozenset[str]) -> Guess:
     """The role of a column with a unit that no position has."""
     if kind == "acceleration" and words & (WORDS["excitation"] | WORDS["support"]):
         return Guess("input", BY_NAME)
-    if kind == "effort":
+    if kind in ("effort", "electric"):
         read = words & WORDS["reading"] and not words & (WORDS["effort"] | WORDS["attribute"])
-        return Guess("dropped", "it may be the reading of a position") if read else Guess("input")
+        read = read or re.fullmatch(SYMBOL + r"_?\d*", key)
+        return Guess("dropped", READING) if kind == "electric" and read else Guess("input")
     if kind == "pressure":
         return Guess("dropped", "it may be an input")
     return Guess("rate" if kind in ("rate", "acceleration") else "dropped")

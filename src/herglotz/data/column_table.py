@@ -45,6 +45,8 @@ def column_rows(data: Any) -> list[tuple[str, str, str]]:
             if role == "coordinate" and not unit and is_angular(name):
                 far = float(data.q[:, data.names.index(name)].abs().max()) > 2 * math.pi
                 unit = f"- (an angle in {'deg? --degrees' if far else 'rad? --angles'} {name})"
+        elif role == "polar":
+            role, unit = "angle", "rad"
         elif role == "time":
             unit = _converted(unit, data.time_unit) if unit else f"- (taken for {data.time_unit})"
         rows.append((name, role, unit or "-"))

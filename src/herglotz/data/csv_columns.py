@@ -8,7 +8,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from herglotz.data.column_roles import ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
+from herglotz.data.column_roles import READING, ROLES, Guess, is_timed, is_usual, kind_of, role_of, words_of
 from herglotz.data.rows import quote
 from herglotz.errors import InputError, refuse
 
@@ -32,6 +32,8 @@ class Wanted:
     drop: Names = ()  # left aside
     group: str | None = None  # numbers the trajectories
     known: tuple[tuple[str, str, str], ...] = ()  # name, role, unit in another table: names keep their roles
+    positions: tuple[str, ...] = ()  # coordinates as well, unless `coordinates` says exactly which
+    hold: str = ""  # what the inputs do between samples, whatever the file says of it; "": as the file says
     motion: bool = True  # False: times and inputs suffice; without coordinates the first input stands in for one
 
     def role(self, name: str) -> str | None:
@@ -40,7 +42,7 @@ class Wanted:
         for role, wanted in (*given, ("input", self.inputs)):
             if name in as_names(wanted or ()):
                 return role
-        return None
+        return "q" if name in self.positions and self.coordinates is None else None
 
     def __bool__(self) -> bool:
         return bool(self.names) or self.inputs is not None or self.coordinates is not None
@@ -48,7 +50,7 @@ class Wanted:
     @property
     def names(self) -> tuple[str, ...]:
         """All columns that the user names."""
-        every = (self.time, self.group, self.drop, self.coordinates, self.inputs)
+        every = (self.time, self.group, self.drop, self.coordinates, self.inputs, self.positions)
         return tuple(name for wanted in every if wanted for name in as_names(wanted))
 
     def by_name(self, cells: Sequence[str], names: Sequence[str]) -> Wanted:
@@ -60,7 +62,7 @@ class Wanted:
             of = [called.get(name, name) for name in as_names(wanted or ())]
             return wanted if not wanted else of[0] if isinstance(wanted, str) else tuple(of)
 
-        who = ("time", "group", "drop", "coordinates", "inputs")
+        who = ("time", "group", "drop", "coordinates", "inputs", "positions")
         return replace(self, **{field: named(getattr(self, field)) for field in who})
 
     def before(self, name: str) -> str | None:
@@ -88,6 +90,7 @@ class Columns:
     s: int | None = None
     p: tuple[int, ...] = ()
     u: tuple[int, ...] = ()
+    hold: str = ""  # what the user says of the inputs between samples
     notes: tuple[str, ...] = ()  # warnings of roles that are guesses
 
     @property
@@ -121,6 +124,9 @@ def assign(
     every = ", ".join(names)
     refuse({f"{where}: there is no column {quote(x)}; the columns are {every}": x not in place for x in wanted.names})
     guesses = [_guess(name, unit, wanted, place) for name, unit in zip(names, units, strict=True)]
+    if wanted.motion and wanted.coordinates is None and not any(guess.role == "q" for guess in guesses):
+        # Volts of a sensor are the motion where no other column is.
+        guesses = [Guess("q", "its unit is none of a position") if x.doubt == READING else x for x in guesses]
     roles: dict[str, list[int]] = {role: [] for role in (*ROLES, "rate", "q", "dropped")}
     for i, guess in enumerate(guesses):
         roles[guess.role].append(i)
@@ -136,7 +142,7 @@ def assign(
     })  # fmt: skip
     p = _momenta(where, [names[i] for i in q], {names[i]: i for i in roles["momentum"]})
     trajectory, action = (next(iter(roles[role]), None) for role in ("trajectory", "action"))
-    found = Columns(names, units, clock, q, trajectory, action, p, u)
+    found = Columns(names, units, clock, q, trajectory, action, p, u, wanted.hold)
     return replace(found, notes=_warnings(found, guesses, wanted))
 
 

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from herglotz.data.csv_columns import is_number
+from herglotz.data.column_roles import is_time, kind_of
+from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.rows import MISSING
 from herglotz.errors import InputError
 
 # Separators in the order in which they are tried; a comma last but one, as it may be the decimal sign of the others.
 SEPARATORS = {";": "';'", "\t": "tabs", ",": "commas", " ": "spaces"}
+TITLES = 50  # lines above a header at most
 EXCEL = "sep=(.|tab)?"  # a line above the header by which Excel is told the separator
 THOUSANDS = re.compile(r"[+-]?\d{1,3}(?:[., ']\d{3})+[.,]\d*")  # 1,234.5 and 1,234,567
 EITHER = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")  # 1,250 is 1250 or 1.25; 0,250 is 0.25
@@ -36,8 +40,8 @@ def header_cells(line: str, separator: str = ",") -> list[str]:
 def in_commas(
     path: Path,  # begins messages
     lines: Sequence[str],  # of the file
-) -> tuple[Rows, tuple[str, ...]]:
-    """Rows of a table, header first, with commas between columns and decimal points; and notes on what was changed.
+) -> tuple[Rows, tuple[str, ...], str]:
+    """Rows of a table, header first, with commas and decimal points; notes on what was changed, and the separator.
 
     Lines without a value and comments are left out, unless a comment is the header: the last one before rows of numbers
     alone, in as many columns. Raise InputError if numbers have decimal commas in some rows and decimal points in
@@ -45,11 +49,13 @@ def in_commas(
     """
     written = [(i, line) for i, line in enumerate(lines, 1) if line.strip(" \t;,")]
     rows, notes = _with_header(written[1:] if written and re.fullmatch(EXCEL, written[0][1].strip()) else written)
+    rows, above = _without_titles(rows)
+    notes += above
     separator = (_separator(rows[0][1], rows[1][1]) if len(rows) > 1 else None) or ","
     if separator != ",":
         notes.append(f"columns are separated by {SEPARATORS[separator]}")
     elif not any('"' in line for _, line in rows):
-        return _without_empty_ends(rows), tuple(notes)
+        return _without_empty_ends(rows), tuple(notes), separator
     table = [(i, cells_of(line, separator)) for i, line in rows[1:]]
     if separator == ",":
         _check_thousands(path, table)
@@ -57,7 +63,7 @@ def in_commas(
     if changed:
         notes = [f"{notes[-1]}, and decimals by commas"] if separator != "," else ["decimals are written with commas"]
     names = ",".join(header_cells(rows[0][1], separator))
-    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes)
+    return _without_empty_ends([(rows[0][0], names), *points]), tuple(notes), separator
 
 
 def is_row_of_numbers(line: str) -> bool:
@@ -90,6 +96,50 @@ def _with_header(written: Rows) -> tuple[Rows, list[str]]:
     if before and (found := _separator(before[-1][1], rows[0][1])) and _all_numbers(rows[0][1], found):
         return [before[-1], *rows], [f"the header is row {before[-1][0]}, behind #"]
     return rows, []
+
+
+def _without_titles(rows: Rows) -> tuple[Rows, list[str]]:
+    """The rows from the header on, where lines above the table say what was recorded; and the note that says so."""
+    at = next((k for k, (_, line) in enumerate(rows[:TITLES]) if any(_has_time(line, mark) for mark in SEPARATORS)), 0)
+    if at == 0 or not _is_header(rows[at : at + 3]):
+        return rows, []
+    number, header = rows[at]
+    separator = _separator(header, rows[at + 1][1]) or ","
+    titles, cells = (cells_of(line, separator) for line in (rows[at - 1][1].rstrip("\r"), header))
+    if len(set(cells)) < len(cells) == len(titles):
+        header = separator.join(_told_apart(cells, titles))
+    plural = "s" if at > 1 else ""
+    return [(number, header), *rows[at + 1 :]], [f"{at} line{plural} above the header, which is row {number}, left out"]
+
+
+def _has_time(line: str, separator: str) -> bool:
+    """Whether a line names a time beside another column."""
+    heads = [name_and_unit(cell) for cell in cells_of(line, separator)]
+    return len(heads) > 1 and any(head is not None and is_time(*head) for head in heads)
+
+
+def _is_header(rows: Rows) -> bool:
+    """Whether the first of these rows is followed by numbers in as many columns, or by units and then numbers."""
+    if len(rows) < 2 or (separator := _separator(rows[0][1], rows[1][1])) is None:
+        return False
+    below = [cells_of(line, separator) for _, line in rows[1:]]
+    units = any(kind_of(cell.strip("[]()<> ")) == "time" for cell in below[0])
+    numbers = [cell.replace(",", ".") for cell in below[-1 if units else 0] if cell.casefold() not in MISSING]
+    return bool(numbers) and all(map(is_number, numbers))
+
+
+def _told_apart(cells: Sequence[str], titles: Sequence[str]) -> list[str]:
+    """Names that come twice, as of several bodies, with the title above them; the first time is that of all."""
+    found: list[str] = []
+    title, often = "", Counter(cells)
+    for cell, above in zip(cells, titles, strict=True):
+        title, (name, unit) = above or title, name_and_unit(cell) or (cell, "")
+        clock = is_time(name, unit)
+        if often[cell] == 1 or not title or (clock and cell not in found):
+            found.append(cell)
+        else:
+            found.append("_".join(["time" if clock else name, *title.split()]) + (f"[{unit}]" if unit else ""))
+    return found
 
 
 def _separator(header: str, row: str) -> str | None:

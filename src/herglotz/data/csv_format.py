@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from datetime import datetime
+from itertools import chain, islice
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
-from herglotz.data.checks import EXACT, MIN_SAMPLES
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
-from herglotz.data.csv_dialect import cells_of, header_cells, in_commas
+from herglotz.data.csv_dialect import Rows, cells_of, in_commas
+from herglotz.data.csv_numbers import NumberLines
 from herglotz.data.files import PathLike, read_lines, write_atomically
-from herglotz.data.rows import MISSING, SHOWN, number, number_or_none, quote
+from herglotz.data.rows import MISSING, number, number_or_none, quote
 from herglotz.data.sensors import measured
-from herglotz.data.table import from_numbers, from_table, in_dates, moment
+from herglotz.data.table import from_table, in_dates, moment
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.errors import InputError, refuse
 
-LONG = 100_000  # characters of a row of plain numbers
+HEAD = 64  # lines that say how a table is written
 SAID = r"#\s*(hold|delay|lag|zero|scale):\s*(.+)"  # what happens to inputs before they act, and what sensors read
 
 
@@ -34,7 +34,9 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
     `herglotz.data.csv_columns.Wanted`.
 
     Commas, semicolons, tabs or spaces stand between columns; where no commas do, decimals may have one. A row in
-    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs.
+    which a coordinate, s or a momentum is empty or NaN is left out; the step over it has the mean of its inputs. An
+    input that is empty is held from the row before, or goes in a straight line where its hold is "first" or "smooth".
+    Rows of stacked tables are sorted by time, and those of one time joined.
 
     The header's cells are `name`, `name[unit]`, `name (unit)`, or of angles and times `name_deg`, `t_ms`; it may stand
     behind #, as `numpy.savetxt` writes it, and the units in a row of their own below it. `t`, `time`, `timestamp`,
@@ -69,7 +71,17 @@ def read_csv(path: PathLike, wanted: Wanted = HEADER_DECIDES) -> Trajectories:
 def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
     """Row by row: dates, names of trajectories, and the place of every mistake."""
     lines = read_lines(path)
-    rows, notes = in_commas(path, lines)
+    columns, rows, notes, _ = _header(path, lines, wanted)
+    _check_kinds(path, columns, rows)
+    found = from_table(path, columns, *_parse_rows(path, columns, rows), lambda found: _held(found, lines))
+    if not is_number(cells_of(rows[0][1])[columns.time]):
+        found = in_dates(found)
+    return replace(found, notes=(*notes, *found.notes))
+
+
+def _header(path: Path, lines: Sequence[str], wanted: Wanted) -> tuple[Columns, Rows, tuple[str, ...], str]:
+    """The columns of a table, its rows below the header and a row of units, notes on its text, and its separator."""
+    rows, notes, separator = in_commas(path, lines)
     if not rows:
         raise InputError(f"{Path(path)}: there is no header; add a first line such as t[s],q[rad]")
     at, header = rows[0]
@@ -78,43 +90,34 @@ def _read_rows(path: Path, wanted: Wanted) -> Trajectories:
     refuse({f"{where}: {quote(header)} is no header; delete the lines above the table, or begin them with #": text})
     if len(rows) > 1 and (named := with_units(cells, cells_of(rows[1][1]), where, wanted)):
         cells, notes = named, (*notes, f"units stand in row {rows.pop(1)[0]}")
-    columns = assign(cells, where, wanted)
-    _check_kinds(path, columns, rows[1:])
-    found = from_table(path, columns, *_parse_rows(path, columns, rows[1:]), lambda found: _held(found, lines))
-    if not is_number(cells_of(rows[1][1])[columns.time]):
-        found = in_dates(found)
-    return replace(found, notes=(*notes, *found.notes))
+    return assign(cells, where, wanted), rows[1:], notes, separator
 
 
 def _read_numbers(path: Path, wanted: Wanted) -> Trajectories | None:
-    """A table of plain numbers by numpy's parser, a fifth of the time and of the memory; None for any other file."""
-    comments: list[str] = []
+    """A table whose columns of time, trajectories and motion are plain numbers; None for any other file.
 
-    def rows(file: TextIO) -> Iterator[str]:
-        for line in file:
-            if line.startswith("#"):
-                comments.append(line)
-            elif not line.isspace():
-                if len(line) > LONG:
-                    raise ValueError(line[:SHOWN])
-                yield line
-
+    Its first lines say how it is written. Read row by row, a mistake has a place.
+    """
     if not path.is_file():
         return None
     try:
         with open(path, encoding="utf-8-sig") as file, warnings.catch_warnings(action="ignore"):
-            lines = rows(file)
-            columns = assign(header_cells(next(lines)), str(path), wanted)
-            table = np.loadtxt(lines, delimiter=",", comments=None, ndmin=2)
-    except (OSError, ValueError, StopIteration, InputError):
-        return None  # read row by row, the mistake has a place
-    if table.shape[1] != len(columns.names) or len(table) < MIN_SAMPLES or not np.abs(table).max() < EXACT:
-        return None  # NaN is not below EXACT either
-    labels = None if columns.trajectory is None else table[:, columns.trajectory]
-    if labels is not None and np.any(labels != np.round(labels)):
+            head = list(islice(file, HEAD))
+            columns, rows, notes, separator = _header(path, [line.rstrip("\n") for line in head], wanted)
+            first = rows[0][0]
+            body = NumberLines(separator, len(columns.names), first)
+            labelled = columns.trajectory is not None
+            chosen = (*columns.numeric, *((columns.trajectory,) if columns.trajectory is not None else ()))
+            table = body.parsed(chain(head[first - 1 :], file), chosen)
+        labels = table[:, -1] if labelled else None
+        if np.isnan(table[:, 0]).any() or (labels is not None and np.any(labels != np.round(labels))):
+            return None
+        said = [*(line for line in head[: first - 1] if line.startswith("#")), *body.comments]
+        values = table[:, : len(columns.numeric)]
+        found = from_table(path, columns, body.at, labels, values, lambda found: _held(found, said))
+    except (OSError, ValueError, IndexError):
         return None
-    found = from_numbers(path, columns, labels, table[:, columns.numeric])
-    return None if found is None else _held(found, comments)
+    return replace(found, notes=(*notes, *found.notes))
 
 
 def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
@@ -128,6 +131,8 @@ def _held(found: Trajectories, lines: Iterable[str]) -> Trajectories:
             sensors.setdefault(name, [number(x, where) for x in text.replace(",", " ").split()])
         else:
             said.setdefault(name, text if name == "hold" else number(text, where))
+    if found.hold:  # the user has said it
+        said.pop("hold", None)
     return replace(measured(found, sensors.get("zero", ()), sensors.get("scale", ())), **said)  # type: ignore[arg-type]
 
 
@@ -160,11 +165,11 @@ def write_csv(path: PathLike, trajectories: Trajectories, *, comments: Sequence[
 
 def _parse_rows(
     path: Path, columns: Columns, rows: Sequence[tuple[int, str]]
-) -> tuple[list[int], list[str], list[list[float]]]:
-    """Return line number, trajectory label and numbers of every row."""
+) -> tuple[list[int], list[str] | None, list[list[float]]]:
+    """Return line number, trajectory label and numbers of every row; None for the labels where all are of one."""
     width, labels, values = len(columns.names), [], []
     first = None  # date of the first row, where times are dates
-    parse = {i: number if i in (columns.time, *columns.u) else number_or_none for i in columns.numeric}
+    parse = {i: number if i == columns.time else number_or_none for i in columns.numeric}
     for at, line in rows:
         cells = cells_of(line)
         if len(cells) != width:
@@ -180,7 +185,7 @@ def _parse_rows(
     if any(labels) and not all(labels):
         at = rows[labels.index("")][0]
         raise InputError(f"{path}, row {at}, column 'trajectory': blank, but other rows name a trajectory; fill it in")
-    return [at for at, _ in rows], labels, values
+    return [at for at, _ in rows], labels if any(labels) else None, values
 
 
 def _check_kinds(path: Path, columns: Columns, rows: Sequence[tuple[int, str]]) -> None:

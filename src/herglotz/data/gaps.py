@@ -17,11 +17,13 @@ CROSSED = 1000  # typical steps: a gap of so many is crossed in any recording, a
 def without(data: Trajectories, missing: Tensor, first: str) -> Trajectories:
     """Return the set without the samples that are `missing`, (N,) bool; a note counts them and names the `first`.
 
-    A step over them is longer, and has the mean of their inputs. Each trajectory starts at its first known sample.
+    A step over them is longer, and has the mean of their inputs. Each trajectory goes from its first known sample to
+    its last one.
     """
-    begun = torch.cat([(~own).cumsum(0) > 0 for own in missing.split(list(data.lengths))])
-    lengths = tuple(int(own.sum()) for own in begun.split(list(data.lengths)))
-    found = data.rows(begun.nonzero()[:, 0], lengths).keep(~missing[begun])
+    known = (~missing).split(list(data.lengths))
+    inside = torch.cat([(own.cumsum(0) > 0) & (own.flip(0).cumsum(0).flip(0) > 0) for own in known])
+    lengths = tuple(int(own.sum()) for own in inside.split(list(data.lengths)))
+    found = data.rows(inside.nonzero()[:, 0], lengths).keep(~missing[inside])
     count = "a row is" if int(missing.sum()) == 1 else f"{int(missing.sum())} rows are"
     return replace(found, notes=(*data.notes, f"{count} left out, without a value: the first is {first}"))
 

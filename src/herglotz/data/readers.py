@@ -20,8 +20,11 @@ from herglotz.data.gaps import parted
 from herglotz.data.ibm_double_pendulum import looks_like_markers, read_ibm_double_pendulum
 from herglotz.data.jumps import refuse_jumps
 from herglotz.data.npz_format import read_npz, write_npz
+from herglotz.data.polar import in_polar, named_by, pairs_of, with_hints
+from herglotz.data.rows import Unusable
 from herglotz.data.schmidt_lipson import read_schmidt_lipson
 from herglotz.data.sensors import measured
+from herglotz.data.table import left_out
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.units import in_radians_and_seconds
 from herglotz.errors import InputError
@@ -65,6 +68,7 @@ def load(
     *,
     angles: Names | bool | None = None,  # coordinates that are angles; left out: those in rad or deg; () for none
     degrees: Names | None = None,  # coordinates in degrees whose header does not say so; () for none
+    polar: Names | None = None,  # pairs of positions, "x,y", that become one angle each; () for none
     unwrap: bool = True,  # make angles continuous
     show: bool = True,  # print the table of columns on stderr, where a table was read
     sensor_zeros: Sequence[float] | None = (),  # what the sensors read at 0; see `herglotz.data.sensors`
@@ -84,6 +88,10 @@ def load(
     degrees
         Coordinates in degrees whose header does not say so; left out: those without a unit whose name is that of an
         angle and whose motion cannot be one in rad, with a warning; () for none.
+    polar
+        Pairs of positions that become one angle each (`herglotz.data.polar`): "x,y" of a body on a circle, or
+        ["x1,y1", "x2,y2"] of a chain, the second body on the first; "x,y,X,Y" with the centre in numbers or columns;
+        "x,-y" where y grows downwards. Left out: as in `like`; () for none.
     unwrap
         Make angles continuous.
     show
@@ -96,7 +104,8 @@ def load(
         same, in the same order, and its angles are angles, where nothing else is said.
     **columns
         Of a table: time, coordinates, inputs, drop and group, each by column names; left out, the header decides.
-        motion=False where inputs alone are needed.
+        hold="zero", "first" or "smooth": what inputs do between samples, whatever the file says. motion=False where
+        inputs alone are needed.
 
     Returns
     -------
@@ -110,14 +119,15 @@ def load(
         in jumps alone, or from the reader of that format.
     """
     columns.setdefault("known", () if like is None else like.columns)
-    wanted = Wanted(**columns)
+    wanted = Wanted(**columns, positions=named_by(polar))
     files = _files(path := Path(path))
-    found = _joined(files, [in_radians_and_seconds(_read(file, wanted)) for file in files])
+    files, sets, left = _usable(path, files, wanted)
+    found = _joined(files, sets)
+    found = replace(found, notes=(*found.notes, *left))
     if path.is_dir():
         which = f"{len(files)} recordings: {', '.join(file.name for file in files)}"
         found = replace(found, source=path.resolve().name, notes=(textwrap.shorten(which, SHOWN), *found.notes))
-    refuse_jumps(found, wanted)
-    found = in_told_degrees(found, degrees, angles, like)
+    found = as_told(found, wanted, polar, degrees, angles, like)
     found = parted(measured(found, sensor_zeros, sensor_scales))
     if angles is not None:
         found = with_angles(found, angles)
@@ -126,6 +136,22 @@ def load(
     if show and found.columns:
         tell(found.table())
     return found.unwrapped() if unwrap else found
+
+
+def as_told(
+    found: Trajectories,  # as recorded, in rad and s where the header says so
+    wanted: Wanted,
+    polar: Names | None,
+    degrees: Names | None,
+    angles: Names | bool | None,
+    like: Trajectories | None,
+) -> Trajectories:
+    """The coordinates that the columns are meant for: angles of bodies, and of degrees; refused where one jumps."""
+    pairs = pairs_of(polar, like)
+    chosen = polar is not None or wanted.coordinates is not None or wanted.known
+    found = in_polar(found, pairs) if pairs or chosen else with_hints(found)
+    refuse_jumps(found, wanted)
+    return in_told_degrees(found, degrees, angles, like)
 
 
 def with_angles(found: Trajectories, angles: Names | bool) -> Trajectories:
@@ -180,6 +206,22 @@ def _files(path: Path) -> list[Path]:
     return found
 
 
+def _usable(
+    path: Path, files: Sequence[Path], wanted: Wanted
+) -> tuple[list[Path], list[Trajectories], tuple[str, ...]]:
+    """The files that hold a recording, what they hold, and a warning of those whose recording is too short."""
+    kept: list[Path] = []
+    sets: list[Trajectories] = []
+    wrong: list[Unusable] = []
+    for file in files:
+        try:
+            sets.append(in_radians_and_seconds(_read(file, wanted)))
+            kept.append(file)
+        except Unusable as error:
+            wrong.append(error)
+    return kept, sets, left_out(path, wrong, len(files))
+
+
 def _is_prose(file: Path) -> bool:
     """Whether a text file beside recordings is none itself: a README, or a text without a row of numbers."""
     if file.suffix.lower() != ".txt" or not file.is_file():
@@ -211,7 +253,10 @@ def _read(path: Path, wanted: Wanted) -> Trajectories:
         if one.first_line(line):
             if wanted and not one.is_table:
                 raise InputError(f"{path}: columns are chosen in a table, such as a csv file; this is {one.name}")
-            return one.read(path, wanted) if one.is_table else one.read(path)
+            if one.is_table:
+                return one.read(path, wanted)
+            found = one.read(path)
+            return replace(found, hold=wanted.hold) if wanted.hold else found
     what = f"a {suffix} file that begins like this" if candidates else suffix or "a file without extension"
     known = "; ".join(dict.fromkeys(one.name for one in FORMATS))
     raise InputError(f"{path}: cannot read {what}; known formats: {known}")

@@ -14,6 +14,10 @@ SHOWN = 40  # characters of a bad cell that a message quotes
 MISSING = ("", "nan", "na", "n/a", "#n/a", "null", "none")  # what programs write where a value is missing
 
 
+class Unusable(InputError):
+    """A recording that is too short or out of order: others of the same set can be used without it."""
+
+
 def quote(text: str) -> str:
     """Quote a cell for a one-line message: control characters escaped, long text cut."""
     return repr(text if len(text) <= SHOWN else text[:SHOWN] + "…")
@@ -52,10 +56,11 @@ def group_rows(
 ) -> list[list[int]]:
     """Return the sample numbers of each trajectory, in order of first appearance.
 
-    Raise InputError if there is no sample, a trajectory has fewer than three, or its time does not increase.
+    Raise Unusable, an InputError, if there is no sample, a trajectory has fewer than three, or its time does not
+    increase.
     """
     if not rows:
-        raise InputError(f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows")
+        raise Unusable(f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows")
     groups: dict[str, list[int]] = {}
     for i, label in enumerate(labels):
         groups.setdefault(label, []).append(i)
@@ -64,11 +69,11 @@ def group_rows(
             has = f"has {len(group)} sample{'s' if len(group) > 1 else ''}, at least {MIN_SAMPLES} are needed"
             where = f"{path}, row {rows[group[0]]}"
             if label:
-                raise InputError(f"{where}, column '{columns[0]}': {quote(label)} {has}; delete it or add rows")
-            raise InputError(f"{where}: the file {has}; add rows")
+                raise Unusable(f"{where}, column '{columns[0]}': {quote(label)} {has}; delete it or add rows")
+            raise Unusable(f"{where}: the file {has}; add rows")
         for one, two in pairwise(group):
             if not t[two] > t[one]:
-                raise InputError(
+                raise Unusable(
                     f"{path}, row {rows[two]}, column '{columns[1]}': {t[two]!r} does not increase on {t[one]!r} in "
                     f"row {rows[one]}; sort the rows, delete one, or number the trajectories in a column 'trajectory' "
                     "(another name: --group NAME, group= in Python)"

@@ -13,9 +13,11 @@ import numpy as np
 import torch
 
 from herglotz.data.checks import EXACT, MIN_SAMPLES
+from herglotz.data.clock import without_repeats
 from herglotz.data.csv_columns import HEADER_DECIDES, Columns, Wanted, assign, is_number
 from herglotz.data.gaps import without
-from herglotz.data.rows import group_rows, quote
+from herglotz.data.rates import Recording, completed, in_order
+from herglotz.data.rows import Unusable, group_rows, quote
 from herglotz.data.trajectories import Trajectories
 from herglotz.data.unit_row import refuse_unknown, with_units
 from herglotz.data.units import in_seconds
@@ -28,43 +30,110 @@ def from_table(
     path: Path,  # begins messages
     columns: Columns,
     at: Sequence[int],  # (N,) row number of each sample in the file, for messages
-    labels: Sequence[str],  # (N,) trajectory of each sample; "" where there is one; whole numbers, or else names
+    labels: Sequence[str] | np.ndarray | None,  # (N,) trajectory of each sample, names or whole numbers; None: of one
     values: Any,  # (N, columns.numeric) numbers; NaN where a coordinate, s or a momentum is missing
     said: Callable[[Trajectories], Trajectories] = lambda found: found,  # adds what the file says beside the table
 ) -> Trajectories:
     """Group the rows into trajectories; a coordinate in rad is taken for an angle.
 
-    Rows in which a value is missing are left out, and a note says how many: the step over them is longer, with the mean
-    of their inputs. Raise InputError if the time of a trajectory does not increase, or a trajectory is too short.
+    Rows in which a coordinate is missing are left out, and a note says how many: the step over them is longer, with the
+    mean of its inputs, which go on between the rows that have them (`herglotz.data.rates`). A trajectory that is too
+    short or whose time does not increase is left out with a warning, as long as most can be used. Raise InputError if
+    they cannot.
     """
     values = np.asarray(values, dtype=np.float64).reshape(len(at), len(columns.numeric))
-    groups = group_rows(path, at, _one_spelling(labels), values[:, 0].tolist(), _called(columns))
-    order, lengths = [i for group in groups for i in group], tuple(map(len, groups))
-    missing = np.isnan(values).any(1)
+    recordings = _recordings(path, labels, np.asarray(at), values)
+    blank = bool(np.isnan(values).any())
+    recordings, notes = _with_clocks(recordings, blank, columns.units[columns.time] or "s")
+    recordings, left = _usable(path, recordings, lambda one: _check_times(path, columns, one))
+    if not blank:
+        found = said(_trajectories(path, columns, recordings))
+        return replace(found, notes=(*found.notes, *notes, *left))
+    hold = said(_trajectories(path, columns, recordings)).hold
+    whole, made, hold = completed(recordings, columns, hold)
+    whole, gone = _usable(path, whole, lambda one: _check_enough(path, columns, one))
+    found = said(_trajectories(path, columns, whole))
+    found = replace(found, hold=hold, notes=(*found.notes, *notes, *left, *made, *gone))
+    missing = np.concatenate([np.isnan(one.values).any(1) for one in whole])
     if not missing.any():
-        return said(_trajectories(path, columns, values[order], lengths))
-    for group in groups:
-        _check_enough(path, columns, at, values, group)
-    first = int(missing.argmax())
-    name = columns.names[columns.numeric[int(np.isnan(values[first]).argmax())]]
-    found = said(_trajectories(path, columns, np.nan_to_num(values[order]), lengths))
-    return without(found, torch.from_numpy(missing[order]), f"row {at[first]}, column '{name}'")
+        return found
+    one = next(one for one in whole if np.isnan(one.values).any())
+    row, column = np.argwhere(np.isnan(one.values))[0]
+    first = f"row {one.at[row]}, column '{columns.names[columns.numeric[column]]}'"
+    return without(found, torch.from_numpy(missing), first)
 
 
-def _check_enough(path: Path, columns: Columns, at: Sequence[int], values: np.ndarray, group: list[int]) -> None:
+def _with_clocks(recordings: list[Recording], blank: bool, unit: str) -> tuple[list[Recording], list[str]]:
+    """The recordings by time, without stamps that repeat; and what was made of those, once for several recordings."""
+    made = [without_repeats(in_order(one) if blank else one, unit) for one in recordings]
+    notes = [note for _, note in made if note]
+    more = f", and so of {len(notes) - 1} more recordings" if len(notes) > 1 else ""
+    return [one for one, _ in made], [f"{note}{more}" for note in notes[:1]]
+
+
+def _usable(
+    path: Path, recordings: list[Recording], check: Callable[[Recording], None]
+) -> tuple[list[Recording], tuple[str, ...]]:
+    """The recordings that pass a check, and a warning of the others; raise what it says where most do not pass."""
+    kept: list[Recording] = []
+    wrong: list[Unusable] = []
+    for one in recordings:
+        try:
+            check(one)
+            kept.append(one)
+        except Unusable as error:
+            wrong.append(error)
+    return kept, left_out(path, wrong, len(recordings))
+
+
+def left_out(path: Path, wrong: Sequence[Unusable], count: int) -> tuple[str, ...]:
+    """A warning of the recordings, of so many, that are wrong; raise the first error where most are."""
+    if not wrong:
+        return ()
+    if 2 * len(wrong) > count:
+        raise wrong[0]
+    why = str(wrong[0]).removeprefix(f"{path}, ").removeprefix(f"{path}: ").partition(";")[0]
+    plural = ("is", "") if len(wrong) == 1 else ("are", "the first: ")
+    return (f"warning: {len(wrong)} of {count} recordings {plural[0]} left out: {plural[1]}{why}",)
+
+
+def _recordings(
+    path: Path, labels: Sequence[str] | np.ndarray | None, at: np.ndarray, values: np.ndarray
+) -> list[Recording]:
+    """The rows of each trajectory, in order of first appearance; raise InputError where there is none."""
+    refuse({f"{path}: there is a header but no samples; add at least {MIN_SAMPLES} rows": not len(at)})
+    if labels is None:
+        return [Recording("", at, values)]
+    named = labels if isinstance(labels, np.ndarray) else _one_spelling(labels)
+    _, first, place = np.unique(np.asarray(named), return_index=True, return_inverse=True)
+    rank = np.argsort(np.argsort(first))[place.reshape(-1)]
+    order = np.argsort(rank, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(rank[order])) + 1)
+    words = [f"{x:.0f}" if isinstance(x, float) else x for x in (named[int(rows[0])] for rows in groups)]
+    return [Recording(word, at[rows], values[rows]) for word, rows in zip(words, groups, strict=True)]
+
+
+def _check_times(path: Path, columns: Columns, one: Recording) -> None:
+    """Raise unless this trajectory has three rows, in order of time."""
+    t = one.values[:, 0]
+    if len(t) < MIN_SAMPLES or not (np.diff(t) > 0).all():
+        group_rows(path, one.at.tolist(), [one.label] * len(t), t.tolist(), _called(columns))
+
+
+def _check_enough(path: Path, columns: Columns, one: Recording) -> None:
     """Raise unless three rows of this trajectory have all their values."""
-    gone = np.isnan(values[group])
+    gone = np.isnan(one.values)
     if (known := int((~gone.any(1)).sum())) < MIN_SAMPLES:
         name = columns.names[columns.numeric[int(gone.sum(0).argmax())]]
-        raise InputError(
-            f"{path}, row {at[group[0]]}: of the {len(group)} rows from here, {known} have a value in every column, at "
+        raise Unusable(
+            f"{path}, row {one.at[0]}: of the {len(gone)} rows from here, {known} have a value in every column, at "
             f"least {MIN_SAMPLES} are needed; column '{name}' has the most gaps: leave it out with --drop {name} "
             "(drop= in Python), or fill it in"
         )
 
 
 def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
-    """Where all labels are whole numbers, those of equal value are one trajectory, as in `from_numbers`: 1, 01, 1.0."""
+    """Where all labels are whole numbers, those of equal value are one trajectory, as in a table of numbers: 1, 01."""
     if any("_" in label for label in set(labels)):  # Python reads 1_000 as a number, and numpy does not
         return labels
     try:
@@ -77,25 +146,10 @@ def _one_spelling(labels: Sequence[str]) -> Sequence[str]:
     return [first.setdefault(value[label], label) for label in labels]
 
 
-def from_numbers(path: Path, columns: Columns, labels: np.ndarray | None, values: np.ndarray) -> Trajectories | None:
-    """As `from_table` of a large table, whose labels are numbers, (N,); None where `from_table` would raise."""
-    lengths = (len(values),)
-    if labels is not None:
-        _, first, place, counts = np.unique(labels, return_index=True, return_inverse=True, return_counts=True)
-        order = np.argsort(first)  # of first appearance
-        rank = np.argsort(order)[place]
-        if np.any(np.diff(rank) < 0):
-            values = values[np.argsort(rank, kind="stable")]
-        lengths = tuple(counts[order].tolist())
-    same = np.ones(max(len(values) - 1, 0), dtype=bool)
-    same[np.cumsum(lengths)[:-1] - 1] = False
-    if min(lengths) < MIN_SAMPLES or not np.all(np.diff(values[:, 0])[same] > 0):
-        return None
-    return _trajectories(path, columns, values, lengths)
-
-
-def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tuple[int, ...]) -> Trajectories:
-    """The set whose samples are the rows of the table, (N, columns.numeric), trajectory after trajectory."""
+def _trajectories(path: Path, columns: Columns, recordings: Sequence[Recording]) -> Trajectories:
+    """The set whose samples are the rows of these recordings; 0 where a value is missing."""
+    table = np.nan_to_num(np.concatenate([one.values for one in recordings]))
+    lengths = tuple(len(one.values) for one in recordings)
     widths = [1, len(columns.q), 0 if columns.s is None else 1, len(columns.p), len(columns.u)]
     t, q, s, p, u = np.split(table, np.cumsum(widths)[:-1], axis=1)
     name, last = columns.names[columns.time], float(t[-1, 0])
@@ -115,6 +169,7 @@ def _trajectories(path: Path, columns: Columns, table: np.ndarray, lengths: tupl
         p=p if p.size else None,
         u=u if u.size else None,
         time_unit=columns.units[columns.time] or "s",
+        hold=columns.hold if columns.u else "",
         source=path.name,
         columns=columns.roles(),
     )
@@ -133,11 +188,11 @@ def from_frame(frame: Any, wanted: Wanted = HEADER_DECIDES, where: Path = Path("
     columns, raw = assign(heads, str(where), wanted), [column[first:] for column in raw]
     if all(column.ndim == 1 and len(column) for column in raw):
         refuse_unknown(columns, [_text(column[0]) for column in raw], f"{where}, row {first}")
-    clock, known = seconds(raw[columns.time]), (columns.time, *columns.u)  # those that every row needs
+    clock = seconds(raw[columns.time])
     told = None if clock is raw[columns.time] else "" if raw[columns.time].dtype.kind == "m" else "date"
     raw[columns.time] = clock
-    every = [_numbers(where, columns.names[i], raw[i], i in known, first) for i in columns.numeric]
-    labels = [""] * len(clock) if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
+    every = [_numbers(where, columns.names[i], raw[i], i == columns.time, first) for i in columns.numeric]
+    labels = None if columns.trajectory is None else list(map(str, raw[columns.trajectory]))
     found = from_table(where, columns, range(first, first + len(clock)), labels, np.stack(every, 1))
     return found if told is None else in_dates(found, told)
 

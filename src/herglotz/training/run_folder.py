@@ -256,6 +256,7 @@ class Reading(TypedDict, total=False):
     drop: str | list[str]
     angles: str | list[str]
     degrees: str | list[str]
+    polar: str | list[str]
     sensor_zeros: list[float]
     sensor_scales: list[float]
     hold: Literal["zero", "first", "smooth"]

@@ -120,10 +120,22 @@ def test_two_times_are_asked_for(tmp_path):  # fails if one of two is chosen uns
 
 
 def test_no_coordinate_says_what_the_columns_look_like():
-    # fails if a table of voltages alone is refused without the way to take one of them
-    with pytest.raises(InputError, match=r"pot look like no positions: choose with --coordinates NAMES"):
-        assign(["t", "pot[V]"], "header")
-    assert assign(["t", "pot[V]"], "header", Wanted(coordinates="pot")).q == (1,)
+    # fails if a table without a position is refused without the way to take one of its columns
+    with pytest.raises(InputError, match=r"valve look like no positions: choose with --coordinates NAMES"):
+        assign(["t", "valve[bar]"], "header")
+    assert assign(["t", "valve[bar]"], "header", Wanted(coordinates="valve")).q == (1,)
+
+
+@pytest.mark.parametrize("head", ["y[V]", "pot[mV]", "x1[%]", "theta[V]"])
+def test_volts_of_a_sensor_are_a_coordinate_where_nothing_else_is(head):
+    # fails if a circuit that is a mechanism's analogue is refused, or volts are a second coordinate beside metres
+    alone = assign(["t[s]", head, "u[V]"], "header")
+    assert (alone.q, alone.u) == ((1,), (2,))
+    assert "taken for a coordinate, but its unit is none of a position" in alone.notes[0]
+    beside = assign(["t[s]", head, "z[m]", "u[V]"], "header")
+    assert (beside.q, beside.u) == ((2,), (3,))
+    assert "left aside, but it may be the reading of a position" in beside.notes[0]
+    assert assign(["t[s]", "x[N]", "z[m]"], "header").u == (1,)
 
 
 def test_names_of_inputs_survive_writing(tmp_path):  # fails if a coordinate that is written comes back as an input

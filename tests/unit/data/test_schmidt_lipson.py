@@ -47,8 +47,11 @@ def test_two_coordinates(tmp_path):  # fails if the first velocity is read as th
         ("% o v\n" + ROWS + "0 7 abc 1\n", r"real.txt, row 5, column 'o': 'abc' is not a number; correct or delete"),
         ("% o v\n" + ROWS + "0 inf 1 1\n", r"real.txt, row 5, column 't': 'inf' is not finite"),
         ("% o v\n" + ROWS + "x 7 1 1\n", r"real.txt, row 5, column 'trial': 'x' is not a number"),
-        ("% o v\n" + ROWS + "0 6.5 1 1\n", r"real.txt, row 5, column 't': 6.5 does not increase on 6.5 in row 4"),
-        ("% o v\n" + ROWS + "3 6.5 1 1\n", r"row 5, column 'trial': '3' has 1 sample, at least 3 are needed; delete"),
+        ("% o v\n" + ROWS + "0 6.25 1 1\n", r"real.txt, row 5, column 't': 6.25 does not increase on 6.5 in row 4"),
+        (
+            "% o v\n" + ROWS + "3 6.5 1 1\n4 6.5 1 1\n",
+            r"row 5, column 'trial': '3' has 1 sample, at least 3 are needed; delete",
+        ),
     ],
 )
 def test_every_mistake_has_its_message(tmp_path, text, message):

@@ -124,7 +124,7 @@ def test_unicode_text(tmp_path):  # fails if what spreadsheets call so, UTF-16 w
         ('t,x\n0,"5,000.5"\n1,"6,000.5"\n2,"7,0.5"\n', r"row 2: '5,000.5' has a separator of thousands"),
         ("t;x\n0;1.250,5\n1;2,5\n2;3\n", r"row 2: '1.250,5' has a separator of thousands; write numbers without it"),
         ("t;x\n0;1,234,567\n1;2,5\n2;3\n", "row 2: '1,234,567' has a separator of thousands"),
-        ("Device 7\n2026\nt,x\n0,1\n1,2\n2,3\n", "'Device 7' is no header; delete the lines above the table"),
+        ("Device 7\n2026\nclock,x\n0,1\n1,2\n2,3\n", "'Device 7' is no header; delete the lines above the table"),
         ("timestamp,x\n1700000000000,1\n1700000000050,2\n1700000000100,3\n", r"write its unit, timestamp\[ms\]"),
         ("date,time,x\n2026-03-01,12:00:00,1\n2026-03-01,12:00:01,2\n", "leave the column out with --drop date"),
     ],

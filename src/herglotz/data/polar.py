@@ -1,0 +1,278 @@
+"""Positions x, y of bodies on circles, as cameras see them: one angle of each body, and chains of them.
+
+The angle is θ = atan2(x − x_c, −(y − y_c)): 0 towards −y, growing towards +x, so that a body that hangs from the centre
+is at 0 where y grows upwards.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from herglotz.data.column_roles import kind_of
+from herglotz.data.csv_columns import is_number, name_and_unit
+from herglotz.data.trajectories import Trajectories
+from herglotz.errors import refuse
+from herglotz.least_squares import least_squares
+
+POLAR = "polar"  # role of an angle that was made, in the table of columns
+MOST = 4000  # samples at most in which circles are looked for
+ON_A_CIRCLE = (
+    0.1  # a circle misses a tenth of what a straight line misses: bodies on arms are far below, ellipses above
+)
+ROUNDS, SMALLER = 50, 1 - 1e-12  # of Gauss and Newton, and by what the error has to fall in one
+EXACT = 1e-12  # of the radius: what rounding leaves of a circle
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two columns that hold the position of a body, and where the centre of its circle is."""
+
+    x: str
+    y: str
+    signs: tuple[float, float] = (1.0, 1.0)  # −1 where an axis grows the other way
+    centre: tuple[str, str] | tuple[float, float] | None = None  # columns, numbers in their unit, or to be found
+    again: bool = False  # whether the numbers are those of another recording
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """All columns that it names."""
+        return (self.x, self.y, *(c for c in self.centre or () if isinstance(c, str)))
+
+    def spec(self, centre: Sequence[str | float]) -> str:
+        """The pair as a user says it, with this centre."""
+        (x, y), ends = self.axes(), map(str, centre)
+        return ",".join([x.removeprefix("+"), y.removeprefix("+"), *ends])
+
+    def axes(self) -> tuple[str, str]:
+        """Both columns with their signs."""
+        return ("-+"[self.signs[0] > 0] + self.x, "-+"[self.signs[1] > 0] + self.y)
+
+
+def pairs_of(polar: str | Sequence[str] | None, like: Trajectories | None = None) -> list[Pair]:
+    """What the user says, `x,y` or `x,y,CENTRE_X,CENTRE_Y` each, or what another recording was made with.
+
+    Raise InputError if a text names no two columns.
+    """
+    if polar is None:
+        told = [] if like is None else [unit for _, role, unit in like.columns if role == POLAR]
+        return [replace(_pair(text), again=True) for text in told]
+    every = [polar] if isinstance(polar, str) else list(polar)
+    return [_pair(text) for text in every if text.strip().lower() != "none"]
+
+
+def named_by(polar: str | Sequence[str] | None) -> tuple[str, ...]:
+    """All columns that the user names in pairs of positions: they are coordinates."""
+    return tuple(name for pair in pairs_of(polar) for name in pair.columns)
+
+
+def _pair(text: str) -> Pair:
+    parts = [part.strip() for part in text.split(",")]
+    signs = tuple(-1.0 if part.startswith("-") else 1.0 for part in parts[:2])
+    axes = [name_and_unit(part.removeprefix("-")) for part in parts[:2]]
+    how = "write x,y or, with the centre of the circle in numbers or columns, x,y,X,Y"
+    refuse({f"polar: {text!r} is no pair of columns; {how}": len(parts) not in (2, 4) or None in axes
+            or axes[0] == axes[-1]})  # fmt: skip
+    x, y = (name for name, _ in filter(None, axes))
+    numbers = [is_number(part) and math.isfinite(float(part)) for part in parts[2:]]
+    refuse({f"polar: {text!r}: give both numbers of the centre, or both columns": len(set(numbers)) > 1})
+    if not numbers:
+        return Pair(x, y, signs)  # type: ignore[arg-type]
+    heads = [(name_and_unit(part) or (part, ""))[0] for part in parts[2:]]
+    centre = tuple(map(float, parts[2:])) if numbers[0] else tuple(heads)
+    return Pair(x, y, signs, centre)  # type: ignore[arg-type]
+
+
+def in_polar(data: Trajectories, pairs: Sequence[Pair]) -> Trajectories:
+    """The set with an angle in the place of each pair of positions; notes say about which centre, and at what distance.
+
+    A centre that is not given is fixed, and found by least squares, or it is the body of an earlier pair: whichever
+    leaves the distance more constant. The centre of another recording is kept unless a new one is better by the
+    Bayesian information criterion. Raise InputError if a pair is none of coordinates, or momenta are recorded.
+    """
+    pairs = [pair for pair in pairs if not pair.again or set(pair.columns) <= set(data.names)]
+    if not pairs:
+        return data
+    _check(data, pairs)
+    bodies: list[tuple[Pair, Tensor]] = []
+    angles, rows, notes = [], [], []
+    for pair, name in zip(pairs, _names(data, pairs), strict=True):
+        body = _positions(data, pair, (pair.x, pair.y))
+        centre, spec, where = _centre(data, pair, body, bodies)
+        arm = body - centre
+        r = _radii(arm)
+        at = f"{pair.x}, {pair.y} is at its centre at t = {float(data.t[int(r.argmin())]):g}, and has no angle there"
+        refuse({f"{data.source or 'data'}: {at}; give another centre": bool((r == 0).any())})
+        angles.append(torch.atan2(arm[:, 0], -arm[:, 1]))
+        rows.append((name, POLAR, spec))
+        notes.append(_note(data, pair, name, where, r, angles[-1]))
+        bodies.append((pair, body))
+    return _with_angles(data, pairs, angles, rows, notes)
+
+
+def _check(data: Trajectories, pairs: Sequence[Pair]) -> None:
+    where = data.source or "data"
+    named = [name for pair in pairs for name in (pair.x, pair.y)]
+    for pair in pairs:
+        for name in pair.columns:
+            known = ", ".join(data.names)
+            refuse({f"{where}: polar names {name!r}, but the coordinates are {known}": name not in data.names})
+        units = {data.units[data.names.index(name)] for name in pair.columns}
+        refuse({f"{where}: polar: {', '.join(pair.columns)} are not in one unit, but in {', '.join(units)}":
+                len(units) > 1})  # fmt: skip
+    twice = f"{where}: polar has a column twice, {', '.join(named)}; a position makes one angle"
+    momenta = f"{where}: momenta of positions are no momenta of angles; leave them out with --drop"
+    refuse({twice: len(set(named)) < len(named), momenta: data.p is not None})
+
+
+def _positions(data: Trajectories, pair: Pair, names: Iterable[str]) -> Tensor:
+    """(N, 2) of two columns, each axis with its sign."""
+    columns = [data.q[:, data.names.index(name)] for name in names]
+    return torch.stack(columns, 1) * data.q.new_tensor(pair.signs)
+
+
+def _centre(
+    data: Trajectories, pair: Pair, body: Tensor, earlier: Sequence[tuple[Pair, Tensor]]
+) -> tuple[Tensor, str, str]:
+    """The centre of a body's circle, (2,) or (N, 2), as the user would say it, and in words."""
+    if pair.centre is not None and isinstance(pair.centre[0], str):
+        names = [str(name) for name in pair.centre]
+        return _positions(data, pair, names), pair.spec(names), ", ".join(names)
+    found: list[tuple[float, Tensor, str, str]] = []
+    if pair.centre is None or pair.again:
+        fixed = circle(body)
+        found.append((_criterion(body - fixed, 2), fixed, *_words(data, pair, fixed)))
+    if pair.centre is not None:
+        given = body.new_tensor(pair.centre) * body.new_tensor(pair.signs)
+        found.append((_criterion(body - given, 0), given, *_words(data, pair, given)))
+    else:
+        found += [(_criterion(body - other, 0), other, pair.spec((one.x, one.y)), f"{one.x}, {one.y}")
+                  for one, other in earlier]  # fmt: skip
+    return min(found, key=lambda candidate: candidate[0])[1:]
+
+
+def _criterion(arm: Tensor, numbers: int) -> float:
+    """The Bayesian information criterion of a circle, by its radial errors, whose centre has so many fitted numbers."""
+    r = _radii(arm)
+    error = float(r.var(correction=0)) + (EXACT * float(r.mean())) ** 2
+    return len(r) * math.log(max(error, 1e-300)) + numbers * math.log(len(r))
+
+
+def _words(data: Trajectories, pair: Pair, centre: Tensor) -> tuple[str, str]:
+    """A fixed centre as the user would say it, in the signs of the columns, and in words."""
+    own = (centre * centre.new_tensor(pair.signs)).tolist()
+    return pair.spec([repr(x) for x in own]), f"({own[0]:.4g}, {own[1]:.4g}){_unit(data, pair)}"
+
+
+def _unit(data: Trajectories, pair: Pair) -> str:
+    return f" {data.units[data.names.index(pair.x)]}".removesuffix(" 1")
+
+
+def _note(data: Trajectories, pair: Pair, name: str, where: str, r: Tensor, angle: Tensor) -> str:
+    unit, x = _unit(data, pair), pair.axes()[0]
+    size = f"{float(r.mean()):.4g}{unit} to within {float(r.std(correction=0)):.2g}{unit}"
+    other = replace(pair, signs=(pair.signs[0], -pair.signs[1]))
+    over = f"; if {pair.y} grows the other way: --polar {other.spec(())}" if float(angle.cos().mean()) < 0 else ""
+    zero = f"0 towards {other.axes()[1]}, growing towards {x}{over}"
+    return f"{name} is the angle of {pair.x}, {pair.y} about {where}, at {size}; {zero}"
+
+
+def _names(data: Trajectories, pairs: Sequence[Pair]) -> list[str]:
+    """`theta`, or `theta1`, `theta2`, … of several; with the name of x where a coordinate has that name already."""
+    others = set(data.names) - {name for pair in pairs for name in pair.columns}
+    plain = ["theta"] if len(pairs) == 1 else [f"theta{k + 1}" for k in range(len(pairs))]
+    return [name if name not in others else f"{name}_{pair.x}" for name, pair in zip(plain, pairs, strict=True)]
+
+
+def _with_angles(
+    data: Trajectories,
+    pairs: Sequence[Pair],
+    angles: Sequence[Tensor],
+    rows: Sequence[tuple[str, str, str]],
+    notes: Sequence[str],
+) -> Trajectories:
+    """The set with these angles in the place of the first column of each pair, without its other columns."""
+    made = {pair.x: (name, angle) for pair, (name, *_), angle in zip(pairs, rows, angles, strict=True)}
+    every = [(pair, name) for pair, (name, *_) in zip(pairs, rows, strict=True)]
+    of = {column: name for pair, name in every for column in pair.columns}
+    of |= {column: name for pair, name in every for column in (pair.x, pair.y)}
+    kept = [k for k, name in enumerate(data.names) if name in made or name not in of]
+    labels = [(made[data.names[k]][0], "rad", True) if data.names[k] in made
+              else (data.names[k], data.units[k], data.angles[k]) for k in kept]  # fmt: skip
+    q = torch.stack([made[data.names[k]][1] if data.names[k] in made else data.q[:, k] for k in kept], 1)
+    columns = tuple((name, f"of {of[name]}" if name in of else role, unit) for name, role, unit in data.columns)
+    names, units, turning = zip(*labels, strict=True)
+    return replace(
+        data, q=q, names=names, units=units, angles=turning, columns=(*columns, *rows), notes=(*data.notes, *notes)
+    )
+
+
+def circle(x: Tensor) -> Tensor:
+    """The centre (2,) of the circle of least squares through points (N, 2).
+
+    It starts from Taubin's algebraic fit (IEEE PAMI 13:1115, 1991) and goes on by Gauss and Newton on the distances.
+    """
+    middle = x.mean(0)
+    x = x - middle
+    size = x.square().sum(1).mean().clamp_min(torch.finfo(x.dtype).tiny)
+    z = (x.square().sum(1) - size) / (2 * size.sqrt())
+    a, b, c = torch.linalg.svd(torch.column_stack([z, x]), full_matrices=False).Vh[-1].tolist()
+    scale = a / (2 * float(size.sqrt())) or torch.finfo(x.dtype).tiny  # 0: a straight line
+    centre = -x.new_tensor([b, c]) / (2 * scale)
+    for _ in range(ROUNDS):
+        moved = centre + _gauss_newton(x - centre)
+        if not _variance(x - moved) < SMALLER * _variance(x - centre):
+            break
+        centre = moved
+    return centre + middle
+
+
+def _gauss_newton(arm: Tensor) -> Tensor:
+    """The step of a centre that makes distances most alike, to first order."""
+    r = _radii(arm)[:, None]
+    along = arm / r.clamp_min(torch.finfo(arm.dtype).tiny)
+    along = along - along.mean(0)
+    return least_squares(along.T @ along, along.T @ (r - r.mean()))[:, 0]
+
+
+def _radii(arm: Tensor) -> Tensor:
+    return arm.square().sum(1).sqrt()
+
+
+def _variance(arm: Tensor) -> float:
+    """That of the distances from a centre."""
+    return float(_radii(arm).var(correction=0))
+
+
+def with_hints(data: Trajectories) -> Trajectories:
+    """The set with a warning of each pair of positions x, y that stays on a circle: it may be one body on an arm."""
+    notes, earlier = [], []
+    for x, y in _pairs_by_name(data):
+        pair = Pair(x, y)
+        body = _positions(data, pair, (x, y))[:: -(-data.samples // MOST)]
+        fixed = circle(body)
+        centres = [(fixed, _words(data, pair, fixed)[1]), *((other, f"{one.x}, {one.y}") for one, other in earlier)]
+        earlier.append((pair, body))
+        centre, where = min(centres, key=lambda one: _variance(body - one[0]))
+        line = float(torch.linalg.svdvals(body - body.mean(0))[-1]) / math.sqrt(len(body))
+        if _variance(body - centre) ** 0.5 < ON_A_CIRCLE * line:
+            r = f"{float(_radii(body - centre).mean()):.4g}{_unit(data, pair)}"
+            remedy = f"--polar {x},{y} (polar= in Python) makes one angle of it"
+            notes.append(f"warning: {x}, {y} stay on a circle about {where}, at {r}; one body on an arm? {remedy}")
+    return replace(data, notes=(*data.notes, *notes)) if notes else data
+
+
+def _pairs_by_name(data: Trajectories) -> list[tuple[str, str]]:
+    """Coordinates of one unit whose names differ by x and y alone: x1 and y1, mass_x and mass_y."""
+    units = dict(zip(data.names, data.units, strict=True))
+    found = []
+    for x in data.names:
+        if kind_of(units[x]) == "position" or units[x] == "1":
+            at = [i for i, letter in enumerate(x) if letter in "xX"]
+            swaps = (f"{x[:i]}{'y' if x[i] == 'x' else 'Y'}{x[i + 1 :]}" for i in at)
+            found += [(x, y) for y in swaps if units.get(y) == units[x]]
+    return found

@@ -1,0 +1,127 @@
+"""Columns of one table that were sampled at different times: rows joined, inputs between their samples.
+
+A sample of the motion is a row in which every coordinate is known. An input is needed between samples, too: it is held
+from its sample to its next one, or goes there in a straight line, and a step of the motion has its mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from herglotz.data.csv_columns import Columns
+from herglotz.data.holds import lagrange
+
+NEAR = 4  # samples of a column that a value between them is made of: a cubic
+
+
+class Recording(NamedTuple):
+    """The rows of one trajectory."""
+
+    label: str  # "" where the table has one trajectory
+    at: np.ndarray  # (n,) number of each row in the file
+    values: np.ndarray  # (n, k) time, coordinates, s, momenta, inputs; NaN where there is none
+
+
+def in_order(one: Recording) -> Recording:
+    """The rows by time where each column is in order by itself, as in stacked tables; those of one time joined.
+
+    Rows of one time are one row where they hold different columns. Other rows stay as they are.
+    """
+    t, known = one.values[:, 0], ~np.isnan(one.values)
+    if (np.diff(t) < 0).any() and all((np.diff(t[known[:, k]]) > 0).all() for k in range(1, known.shape[1])):
+        order = np.argsort(t, kind="stable")
+        one = Recording(one.label, one.at[order], one.values[order])
+    t, values = one.values[:, 0], one.values.copy()
+    kept, first = np.ones(len(t), dtype=bool), 0
+    for k in (np.flatnonzero(np.diff(t) == 0) + 1).tolist():
+        first = k - 1 if kept[k - 1] else first
+        more, has = ~np.isnan(values[k]), ~np.isnan(values[first])
+        if not (more & has)[1:].any():
+            values[first] = np.where(more, values[k], values[first])
+            kept[k] = False
+    return Recording(one.label, one.at[kept], values[kept])
+
+
+def completed(
+    recordings: Sequence[Recording], columns: Columns, hold: str
+) -> tuple[list[Recording], tuple[str, ...], str]:
+    """The recordings with all that can be known of their rows, notes on what was made, and the hold of the inputs.
+
+    A hold that nobody has said is "zero" where most samples of the motion have no input of their own.
+    """
+    q, u = slice(1, 1 + len(columns.q)), slice(len(columns.numeric) - len(columns.u), len(columns.numeric))
+    straight, unit, notes = hold in ("first", "smooth"), columns.units[columns.time] or "s", []
+    aligned = [_together(one, q) for one in recordings]
+    if any(one is not before for one, before in zip(aligned, recordings, strict=True)):
+        names = " and ".join(columns.names[i] for i in columns.q)
+        notes.append(f"warning: {names} are seldom in one row, and are interpolated at the times of the rarest")
+    blank = np.isnan(np.concatenate([one.values for one in aligned]))
+    if not blank[:, u].any():
+        return aligned, tuple(notes), hold
+    filled = [_filled(one, u, straight) for one in aligned]
+    names = [columns.names[i] for k, i in enumerate(columns.u) if blank[:, u.start + k].any()]
+    notes.append(_where_blank(names, straight, max(longest for _, longest in filled), unit))
+    sample = ~blank[:, q].any(1)
+    own_rate = 2 * int(blank[sample][:, u].any(1).sum()) > int(sample.sum())
+    return [one for one, _ in filled], tuple(notes), hold or ("zero" if own_rate else "")
+
+
+def _together(one: Recording, q: slice) -> Recording:
+    """The recording with the values of all coordinates in one row.
+
+    Where most samples of the coordinate with the fewest stand in rows without another one, the others are interpolated
+    at its times, by cubics through their samples beside.
+    """
+    known = ~np.isnan(one.values[:, q])
+    counts = known.sum(0)
+    base = int(counts.argmin())
+    if counts[base] < NEAR or 2 * int(known.all(1).sum()) >= counts[base]:
+        return one
+    values = one.values.copy()
+    rows = np.flatnonzero(known[:, base])
+    for k in range(known.shape[1]):
+        if k != base:
+            own = known[:, k]
+            values[rows, q.start + k] = _between(values[own, 0], values[own, q.start + k], values[rows, 0])
+    return Recording(one.label, one.at, values)
+
+
+def _between(t: np.ndarray, x: np.ndarray, at: np.ndarray) -> np.ndarray:
+    """Values of cubics through the nearest four samples (t, x) at other times; NaN outside of the samples."""
+    first = np.clip(np.searchsorted(t, at) - NEAR // 2, 0, len(t) - NEAR)[:, None] + np.arange(NEAR)
+    weights = lagrange(torch.from_numpy(t[first] - at[:, None])).numpy()
+    return np.where((at >= t[0]) & (at <= t[-1]), (weights * x[first]).sum(1), np.nan)
+
+
+def _filled(one: Recording, u: slice, straight: bool) -> tuple[Recording, float]:
+    """The recording with its inputs in every row where they can be known, and the longest time that one was held.
+
+    Rows before the first sample of an input stay without it, and so do those farther behind its last one than its
+    samples are apart, or behind it at all where it goes in `straight` lines.
+    """
+    t, values, longest = one.values[:, 0], one.values.copy(), 0.0
+    for x in values[:, u].T:
+        known = np.flatnonzero(~np.isnan(x))
+        if len(known) in (0, len(x)):
+            continue
+        last = known[np.maximum(np.searchsorted(known, np.arange(len(x)), side="right") - 1, 0)]
+        apart = float(np.median(np.diff(t[known]))) if len(known) > 1 else np.inf
+        inside = (t >= t[known[0]]) & (t <= t[known[-1]] + (0.0 if straight else apart))
+        longest = max(longest, float((t - t[last])[inside].max()))
+        x[:] = np.where(inside, np.interp(t, t[known], x[known]) if straight else x[last], np.nan)
+    return Recording(one.label, one.at, values), longest
+
+
+def _where_blank(names: Sequence[str], straight: bool, longest: float, unit: str) -> str:
+    """What was made of inputs that have no value in some rows."""
+    some = f"{', '.join(names)} {'has' if len(names) == 1 else 'have'} no value in some rows"
+    if straight:
+        return f"{some}; straight lines go there from the row before to the row behind"
+    size = f"{longest:.3g}" if unit == "1" else f"{longest:.3g} {unit}"
+    return (
+        f"warning: {some}: the last one is held, for up to {size}; --hold first (hold= in Python) draws straight lines"
+    )

@@ -1,0 +1,134 @@
+"""One bad recording among good ones is left out and said; stamps that repeat are times again, or left out."""
+
+import numpy as np
+import pytest
+
+from herglotz.data import as_trajectories, load
+from herglotz.errors import InputError
+
+
+def written(folder, header, rows, name="a.csv"):
+    text = "\n".join(",".join("" if x != x else repr(x) for x in row) for row in rows)
+    (folder / name).write_text(f"{header}\n{text}\n")
+    return folder / name
+
+
+def recordings(lengths, start=0):
+    """Rows run, t, x of recordings of these lengths, their labels from `start`."""
+    return [[b, 0.1 * k, float(np.sin(b + k))] for b, n in enumerate(lengths, start) for k in range(n)]
+
+
+BAD = {
+    "too few rows": ([[5, 0.0, 1.0], [5, 0.1, 2.0]], "row 14, column 'run': '5' has 2 samples, at least 3 are needed"),
+    "out of order": (
+        [[5, 0.0, 1.0], [5, 0.2, 2.0], [5, 0.1, 3.0]],
+        "row 16, column 't': 0.1 does not increase on 0.2 in row 15",
+    ),
+    "too few values": (
+        [[5, 0.0, 1.0], [5, 0.1, np.nan], [5, 0.2, np.nan], [5, 0.3, 1.0]],
+        "row 14: of the 4 rows from here, 2 have a value in every column, at least 3 are needed",
+    ),
+}
+
+
+@pytest.mark.parametrize("kind", BAD)
+def test_one_bad_recording_is_left_out(tmp_path, capsys, kind):
+    # fails if one recording refuses the file, or goes without a word of its place and its fault
+    rows, why = BAD[kind]
+    good = recordings([4, 4, 4])
+    data = load(written(tmp_path, "run,t,x", good + rows))
+    assert data.lengths == (4, 4, 4)
+    assert data.q[:, 0].tolist() == [x for _, _, x in good]
+    assert f"warning: a.csv: 1 of 4 recordings is left out: {why}\n" in capsys.readouterr().err
+    table = dict(zip(("run", "t", "x"), np.array(good + rows).T, strict=True))
+    assert as_trajectories(table).lengths == (4, 4, 4)
+
+
+def test_most_recordings_have_to_be_good(tmp_path, capsys):
+    # fails if a column that numbers no recordings leaves a remnant, or all that is said is of the first
+    several = recordings([4, 2, 2, 4])
+    data = load(written(tmp_path, "run,t,x", several))
+    assert data.lengths == (4, 4)
+    said = "warning: a.csv: 2 of 4 recordings are left out: the first: row 6, column 'run': '1' has 2 samples"
+    assert said in capsys.readouterr().err
+    with pytest.raises(InputError, match="row 6, column 'run': '1' has 2 samples, at least 3 are needed; delete it or"):
+        load(written(tmp_path, "run,t,x", recordings([4, 2, 2])))
+    with pytest.raises(InputError, match="the file has 2 samples"):
+        load(written(tmp_path, "t,x", [[0.0, 1.0], [1.0, 2.0]]))
+
+
+def test_a_file_that_is_too_short_among_others(tmp_path, capsys):
+    # fails if one short file refuses its folder, or a file with a mistake goes with a warning
+    for name, n in (("a.csv", 5), ("b.csv", 2), ("c.csv", 4)):
+        written(tmp_path, "t,x", [[0.1 * k, float(k * k)] for k in range(n)], name)
+    assert load(tmp_path).lengths == (5, 4)
+    err = capsys.readouterr().err
+    assert "1 of 3 recordings is left out" in err
+    assert "b.csv, row 2: the file has 2 samples, at least 3 are needed" in err
+    assert "2 recordings: a.csv, c.csv" in err
+    (tmp_path / "b.csv").write_text("t,x\n0,1\n1,wrong\n2,3\n")
+    with pytest.raises(InputError, match="'wrong' is not a number"):
+        load(tmp_path)
+
+
+def stamped(rate, n=300, count=1e-3, jitter=0.0, way=np.floor):
+    """True times, and stamps in whole counts."""
+    t = np.arange(n) / rate + jitter * np.random.default_rng(0).standard_normal(n)
+    return t, way(t / count + 1e-6) * count
+
+
+@pytest.mark.parametrize("way", [np.floor, np.round])
+@pytest.mark.parametrize("rate", [1010, 1500, 2000, 4100])
+def test_stamps_that_count_too_slowly_are_a_clock(tmp_path, capsys, rate, way):
+    # fails if whole milliseconds are refused where samples come faster, or a step is a whole count or nothing
+    t, stamps = stamped(rate, way=way)
+    data = load(written(tmp_path, "t,x", np.column_stack([stamps, np.sin(50 * t)]).tolist()))
+    assert data.samples == 300
+    found = data.t.numpy()
+    assert np.diff(found) == pytest.approx(np.full(299, 1 / rate), rel=2e-3)
+    assert np.abs(found - t).max() < 1.1e-3
+    said = (
+        f"warning: a.csv: stamps repeat in counts of 0.001 s; rows are taken to be {np.diff(found).mean():.4g} s apart"
+    )
+    assert said in capsys.readouterr().err
+
+
+def test_stamps_in_milliseconds(tmp_path):  # fails if counts are looked for in seconds alone
+    t, stamps = stamped(1500, jitter=2e-5)
+    data = load(written(tmp_path, "t[ms],x", np.column_stack([1e3 * stamps, np.sin(50 * t)]).tolist()))
+    assert data.typical_step == pytest.approx(1 / 1500, rel=2e-3)
+
+
+UNEVEN = np.arange(60) + 0.15 * np.sin(np.arange(60))
+REPEATS = {
+    "a row twice": (np.r_[0:50, 49:100], np.r_[0:50, 49:100], 1),
+    "another row with its stamp": (np.r_[0:50, 49:100], np.arange(101), 1),
+    "three rows twice": (np.repeat(np.arange(100), 1 + (np.arange(100) % 33 == 20)), None, 3),
+    "a clock that stood": (np.r_[0:50, [49] * 9, 50:100], np.arange(109), 9),
+    "no counts, in equal parts": (np.repeat(UNEVEN, 1 + (np.arange(60) % 20 == 10)), np.arange(63), 3),
+    "no counts": (np.r_[0:50, 49:100] + 0.3 * np.sin(np.r_[0:50, 49:100]), np.arange(101), 1),
+}
+
+
+@pytest.mark.parametrize("kind", REPEATS)
+def test_other_rows_with_the_stamp_before_are_left_out(tmp_path, capsys, kind):
+    # fails if rows that were written twice, or a clock that stood, change all times; or the file is refused
+    stamps, x, count = REPEATS[kind]
+    x = stamps if x is None else x
+    rows = np.column_stack([0.01 * stamps, np.sin(0.1 * x)]).tolist()
+    data = load(written(tmp_path, "t,x", rows))
+    assert data.t.tolist() == (0.01 * np.unique(stamps)).tolist()
+    some = "a row is" if count == 1 else f"{count} rows are"
+    at = int(np.flatnonzero(np.diff(stamps) == 0)[0]) + 3
+    said = f"warning: a.csv: {some} left out, with the stamp of the row before: the first is row {at}\n"
+    assert said in capsys.readouterr().err
+
+
+def test_several_recordings_are_said_once(tmp_path, capsys):  # fails if every recording has a line of its own
+    clocks = [np.column_stack(stamped(1500 + 100 * b)).tolist() for b in range(4)]
+    rows = [[b, stamp, float(np.sin(50 * t))] for b, clock in enumerate(clocks) for t, stamp in clock]
+    data = load(written(tmp_path, "run,t,x", rows))
+    assert data.lengths == (300,) * 4
+    err = capsys.readouterr().err
+    assert err.count("warning") == 1
+    assert "as their number says, and so of 3 more recordings" in err
