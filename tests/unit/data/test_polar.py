@@ -52,6 +52,7 @@ def test_one_body(tmp_path, capsys):
     # fails if x, y stay two freedoms, the angle has another zero or sense, or nothing is said of centre and radius
     path = written(tmp_path, "x[m],F[N],y[m]", ONE[:, 0] + NOISE[0, :, 0], A, ONE[:, 1] + NOISE[0, :, 1])
     data = load(path, polar="x,y")
+    assert data.u is not None
     assert (data.names, data.units, data.angles, data.u.shape) == (("theta",), ("rad",), (True,), (200, 1))
     close(data.q[:, 0], A, 0.006)
     assert float((data.q[:, 0] - torch.from_numpy(A)).std()) < 0.0016  # 0.001 m at 0.8 m, and the centre's own error

@@ -111,6 +111,8 @@ def test_stacked_tables_and_rows_of_one_time(tmp_path):
         stacked[::-1][np.argsort(stacked[::-1, 0])],
     ):
         data = load(written(tmp_path, rows), show=False)
+        assert data.u is not None
+        assert expected.u is not None
         assert (data.q.tolist(), data.u.tolist(), data.hold) == (expected.q.tolist(), expected.u.tolist(), "zero")
     back = np.r_[union((T, X, None)), union((T[5:6], X[5:6], U[:1]))]  # x itself is not in order
     with pytest.raises(InputError, match=r"row 42, column 't': 0\.5 does not increase on 3\.9"):
