@@ -28,7 +28,7 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
         return None
     if any(c.angles) and n > 1 and c.diagonal and not c.coupled:
         c = replace(c, diagonal=False)  # joints that are apart have no mass between them
-    features, drag = _features(c.angles), _drag(c.angles)
+    features, drag = features_of(c.angles), _drag(c.angles)
     distances = tuple(text for text in expand(c.features, c.angles) if text.startswith("r^"))
     whole = replace(
         c, level="forced", features=(*features, *distances), drag=drag, coulomb=True, coupled=n > 1 and any(c.angles),
@@ -39,7 +39,8 @@ def dictionary(config: ModelConfig) -> ModelConfig | None:
     return whole if held else None
 
 
-def _features(angles: tuple[bool, ...]) -> tuple[str, ...]:
+def features_of(angles: tuple[bool, ...]) -> tuple[str, ...]:
+    """The terms of L, but those of the distance, which are singular where it is 0."""
     if len(angles) == 1:
         if angles[0]:
             return tuple(f"{f}({'' if k == 1 else k}q1)" for k in range(1, WAVES + 1) for f in ("cos", "sin"))

@@ -40,7 +40,9 @@ from herglotz.training.parameter_vector import ParameterVector
 RUNTIME = Path(herglotz.__file__).parent / "codegen" / "runtime"
 MAX_PARAMETERS = 300  # of a kernel: three joints with all their terms have 206, and gcc takes 5 s for them
 LEVEL = "-O1"  # long straight lines of sums and products gain nothing from -O3, which takes 13 times as long
-MADE_OF = ("models", "mechanics", "stepping", "codegen")  # rooms whose sources decide what a kernel computes
+# Rooms, and files beside this one, whose sources decide what a kernel computes.
+MADE_OF = ("models", "mechanics", "stepping", "codegen")
+OWN = ("kernel.py", "parameter_vector.py")
 BATCHES = (101, 211, 431, 1021)  # primes: the example batch of a trace is larger than any axis
 
 
@@ -61,8 +63,6 @@ def kernel_of(model: ContactLagrangian) -> Placed | None:
     if not plain or like.device.type != "cpu" or like.dtype != torch.float64:
         return None
     whole = dictionary(config) or structure(config)
-    if len(numbers_of(ContactLagrangian(whole))) > MAX_PARAMETERS:
-        return None
     try:
         compiler()
     except InputError:
@@ -70,8 +70,8 @@ def kernel_of(model: ContactLagrangian) -> Placed | None:
     kernel = _kernel(json.dumps(whole.to_dict(), sort_keys=True))
     if kernel is None:
         return None
-    at = {key: i for i, key in enumerate(keys_of(kernel.numbers, whole))}
-    chosen = torch.tensor([at[key] for key in keys_of(parameters.numbers, config)], dtype=torch.long)
+    keys = keys_of(parameters.numbers, config)
+    chosen = torch.tensor([kernel.place[key] for key in keys], dtype=torch.long)
     return Placed(kernel, chosen, torch.zeros(len(kernel.numbers), dtype=torch.float64))
 
 
@@ -87,16 +87,21 @@ def structure(config: ModelConfig) -> ModelConfig:
 
 @cache
 def _kernel(config: str) -> Kernel | None:
-    """The kernel of this structure; None where it has an operation without a form in C."""
+    """The kernel of this structure; None where it is too large, or has an operation without a form in C."""
+    model = ContactLagrangian(ModelConfig.from_dict(json.loads(config)))
+    if len(numbers_of(model)) > MAX_PARAMETERS:
+        return None
     with suppress(InputError):
-        return Kernel(ContactLagrangian(ModelConfig.from_dict(json.loads(config))))
+        return Kernel(model)
     return None
 
 
 @cache
 def _sources() -> str:
     """The hash of the package's sources that decide what a kernel computes."""
-    root, digest = Path(herglotz.__file__).parent, hashlib.sha256(Path(__file__).read_bytes())
+    root, digest = Path(herglotz.__file__).parent, hashlib.sha256()
+    for name in OWN:
+        digest.update((root / "training" / name).read_bytes())
     for room in MADE_OF:
         for path in sorted((root / room).rglob("*")):
             if path.suffix in (".py", ".c", ".h"):
@@ -110,6 +115,7 @@ class Kernel:
     def __init__(self, model: ContactLagrangian):
         self.n, self.m, self.sticks = model.dof, model.inputs, model.capabilities.sticking
         self.numbers = ParameterVector(model).numbers  # of θ, in order
+        self.place = {key: i for i, key in enumerate(keys_of(self.numbers, model.config))}
         key = _sources() + json.dumps(model.config.to_dict(), sort_keys=True)
         self.library = built(key, lambda: {SOURCE: source_of(model)}, LEVEL)
         self.library.hz_sweep.restype = ctypes.c_long

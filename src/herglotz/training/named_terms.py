@@ -16,12 +16,11 @@ from herglotz.models.features import Product, lengths, parse, revolute
 from herglotz.models.translations import differences, directions, unchanged
 from herglotz.training.baseline import JITTER, Baseline
 from herglotz.training.config import FitConfig
+from herglotz.training.dictionary import HIGHEST, WAVES, features_of
 from herglotz.training.parameter_vector import ParameterVector
 
 SERIES = 3  # powers of a length beside its spring: more than the potential of an oscillator that is named has
 SIDE = 0.1  # of the way to the farther side of 0: motion that goes less far on the other tells nothing of a bend there
-HIGHEST = 6  # power of a length in the potential of one coordinate: forces up to x⁵
-WAVES = 3  # highest harmonic of one angle
 BACK = 50  # a turn back that is shorter than this part of a recording says next to nothing of dry friction
 NEAR = 0.02  # of the RMS distance: powers of r are candidates where the data stay farther from 0
 STILL, MOVING, DRAG = "potential.features.sum.coefficient", "kinetic.sum.coefficient", "drag.coefficient"
@@ -62,14 +61,8 @@ def candidates(data: Trajectories, translations: Sequence[str] = ()) -> NamedTer
     if translations:
         return _unmoved(data, directions(translations, data.angles))
     angles = data.angles
-    if len(angles) == 1:
-        features = _of_one(data)
-    elif any(angles):
-        still = [f"q{i}^{k}" for k in (3, 4) for i, angle in enumerate(angles, 1) if not angle]
-        features = [*revolute(angles), *still]
-    else:
-        features = [x for x in lengths(angles) if not x.startswith("r^")]
-    return NamedTerms(tuple(features), tuple(_frictions(data)), True)
+    features = tuple(_of_one(data)) if len(angles) == 1 else features_of(angles)
+    return NamedTerms(features, tuple(_frictions(data)), True)
 
 
 def _of_one(data: Trajectories) -> list[str]:

@@ -164,20 +164,18 @@ class ShootingProblem(StatesProblem):
     def normal_equations(self, x: Tensor, *, held: bool = False) -> tuple[Tensor, Arrowhead, Tensor]:
         """(cost, JᵀJ, Jᵀr); remembers the path for the next solve. `held`: of the states alone, θ as it is."""
         theta, _ = self.unpack(x)
-        path = self.solve(x)
+        path, sums = self.solve(x), Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
+        if path is not None and self.compiled is not None:
+            path = path if self.compiled.run(theta, path.x[:, 0], self._observed(), sums) is not None else None
         if not everywhere(path is not None) or path is None:
-            none = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
-            matrix = Arrowhead(none.corner, none.border, none.blocks, none.blocks, self._eliminate)
+            matrix = Arrowhead(sums.corner, sums.border, sums.blocks, torch.zeros_like(sums.blocks), self._eliminate)
             return x.new_full((), torch.inf), matrix, x.new_zeros(len(x) - self.P * held)
         self.path, self._at = path, x.clone()
         fit, joints = self._residuals(path.x)
-        sums = Sums.zeros(0 if held else self.P, self.grid.segments, self.d, x)
         if self.compiled is None:
             root = self.root_weights(fit)
             by = root * self.weight / self.deviations
             sums.add_samples(self.grid, self._slopes_of(theta, path, held=held), by, root * fit)
-        elif self.compiled.run(theta, path.x[:, 0], self._observed(), sums) is None:
-            raise AssertionError("a motion that was run has no steps")
         to = self.grid.joined.nonzero()[:, 0]
         root = self.root_weights(joints[to])
         upper = sums.add_joints(to, root / self.joint_weight, root * joints[to])
@@ -273,7 +271,7 @@ class ShootingProblem(StatesProblem):
         rows = self.slopes_at_samples(self._at[: self.P], self.path) * by.square()[..., None]  # (N, n, P + d)
         segment = self.grid.node // (self.grid.h.shape[1] + 1)
         # Of every segment, whose samples have one zero: (S, P + d, n).
-        S, of = self.grid.segments, torch.full((self.grid.segments,), -1)
+        S, of = self.grid.segments, torch.full((self.grid.segments,), -1, device=which.device)
         of[segment] = which
         own = rows.new_zeros(S, *rows.shape[:0:-1]).index_add(0, segment, rows.mT)
         columns = rows.new_zeros(self.P + S * self.d, count, self.n)
