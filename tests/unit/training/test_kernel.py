@@ -14,6 +14,7 @@ from herglotz.training.kernel import kernel_of
 from herglotz.training.parameter_vector import ParameterVector
 from herglotz.training.problems.grid import segment_grid
 from herglotz.training.problems.shooting import ShootingProblem
+from herglotz.training.sums import Sums
 
 PENDULUM = ModelConfig(angles=(True,), level="forced", stiffness=(0.0,), alike=True, potential_width=0, damping_width=0,
                        features=("cos(q1)", "sin(2q1)"), drag=("|v1| v1",))  # fmt: skip
@@ -94,9 +95,14 @@ def test_compiled_equations_are_those_of_torch(config, freedom):
 def test_pieces_add_up_to_the_whole(length, monkeypatch):
     # fails if a segment that is cut into pieces loses a sample, its state or its derivatives
     problem, x = problem_of(MODELS["joints"], length=length)
+    assert problem.compiled is not None
     whole = problem.normal_equations(x)
     monkeypatch.setattr(flow, "CHUNK", 8 * 2 * 40 * 7)  # seven samples at most
     pieces = problem.normal_equations(x)
+    theta, starts = problem.unpack(x)
+    sums = Sums.zeros(problem.P, problem.grid.segments, problem.d, x)
+    motions = [problem.compiled.run(theta, problem.with_s(starts), problem._observed(), of) for of in (sums, None)]
+    assert torch.equal(*motions)
     assert float((dense(whole[1]) - dense(pieces[1])).abs().max()) <= 1e-12 * float(dense(whole[1]).abs().max())
     assert float((whole[2] - pieces[2]).abs().max()) <= 1e-12 * float(whole[2].abs().max())
 
